@@ -1,0 +1,1 @@
+"""The systems the paper compares with, composed from shared parts."""

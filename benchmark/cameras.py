@@ -1,0 +1,154 @@
+"""Pinhole cameras. Inside: OpenCV world-to-camera. At the edge: nerfstudio, COLMAP and Mitsuba conventions.
+
+| convention | pose | camera axes | pixel centres |
+|---|---|---|---|
+| ours, OpenCV, COLMAP | world to camera | +x right, +y down, +z forward | +0.5 |
+| nerfstudio / Blender / OpenGL | camera to world | +x right, +y up, -z forward | +0.5 |
+| Mitsuba `perspective` | camera to world | +x left, +y up, +z forward | +0.5 |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+
+Float64 = NDArray[np.float64]
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes
+_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # flips x and y between OpenCV and Mitsuba camera axes
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated pinhole camera: x_cam = R x_world + t (OpenCV axes), pixel centres at +0.5.
+
+    R is [3, 3], t is [3], float64, metres. fx, fy, cx, cy are in pixels; cx = width / 2 is the middle.
+    """
+
+    id: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    R: Float64
+    t: Float64
+
+    @property
+    def K(self) -> Float64:
+        """Intrinsic matrix [3, 3]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def w2c(self) -> Float64:
+        """World-to-camera matrix [4, 4]."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.R, self.t
+        return m
+
+    @property
+    def c2w(self) -> Float64:
+        """Camera-to-world matrix [4, 4], OpenCV axes."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.R.T, self.center
+        return m
+
+    @property
+    def center(self) -> Float64:
+        """Centre of projection [3] in world coordinates."""
+        return -self.R.T @ self.t
+
+    def project(self, points: Float64) -> tuple[Float64, Float64]:
+        """World points [N, 3] -> pixel coordinates [N, 2] and depths z [N] (z <= 0 is behind the camera)."""
+        p = np.asarray(points, dtype=np.float64) @ self.R.T + self.t
+        z = p[:, 2]
+        return np.stack([self.fx * p[:, 0] / z + self.cx, self.fy * p[:, 1] / z + self.cy], axis=-1), z
+
+    def unproject(self, uv: Float64, z: Float64) -> Float64:
+        """Pixel coordinates [N, 2] and depths z [N] -> world points [N, 3]."""
+        p = np.stack([(uv[:, 0] - self.cx) / self.fx * z, (uv[:, 1] - self.cy) / self.fy * z, z], axis=-1)
+        return (p - self.t) @ self.R
+
+
+def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: float, width: int, height: int) -> Camera:
+    """A camera at `origin` that looks at `target`, square pixels, principal point in the middle."""
+    forward = np.asarray(target, dtype=np.float64) - origin
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    return Camera(id, width, height, focal, focal, width / 2, height / 2, R, -R @ np.asarray(origin, dtype=np.float64))
+
+
+def to_nerfstudio(camera: Camera) -> dict[str, Any]:
+    """Per-frame nerfstudio keys (fl_x ... transform_matrix), OpenGL camera-to-world."""
+    return {
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+        "transform_matrix": (camera.c2w @ _OPENGL).tolist(),
+    }
+
+
+def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -> Camera:
+    """Camera from per-frame nerfstudio keys. Raises UserError where a key is missing or the pose is no rigid motion."""
+    try:
+        m = np.array(frame["transform_matrix"], dtype=np.float64) @ _OPENGL
+        values = [float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy")]
+        width, height = int(frame["w"]), int(frame["h"])
+    except (KeyError, TypeError, ValueError) as e:
+        keys = "fl_x, fl_y, cx, cy, w, h and a 4x4 transform_matrix"
+        raise problem(where, f"{keys} for camera {id}", repr(e), "write the scene again") from None
+    check_rotation(m[:3, :3], f"{where}, camera {id}")
+    R = m[:3, :3].T
+    return Camera(id, width, height, *values, R, -R @ m[:3, 3])
+
+
+def check_rotation(R: Float64, where: str) -> None:
+    """Raise UserError unless R [3, 3] is a proper rotation to 1e-6."""
+    error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.isfinite(R).all() else float("inf")
+    if error > 1e-6 or np.linalg.det(R) < 0:
+        found = f"a matrix off by {error:.1e}, determinant {np.linalg.det(R) if error < 1e9 else 'undefined'}"
+        raise problem(where, "a rotation matrix", found, "check the pose's convention (scene.json says which is used)")
+
+
+def mitsuba_to_world(camera: Camera) -> Float64:
+    """The `to_world` matrix [4, 4] of Mitsuba's `perspective` sensor for this pose."""
+    return np.asarray(camera.c2w @ _MITSUBA)
+
+
+def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
+    """Intrinsics of Mitsuba's `perspective` sensor (fov along x in degrees, principal point offsets).
+
+    Mitsuba's offsets are relative to the film size and count opposite to ours: cx = W (0.5 - offset_x).
+    Raises UserError for non-square pixels, which the sensor cannot model.
+    """
+    if abs(camera.fx - camera.fy) > 1e-9 * camera.fx:
+        raise problem(
+            f"camera {camera.id}", "fx = fy", f"{camera.fx} and {camera.fy}", "use square pixels for rendering"
+        )
+    return {
+        "fov_axis": "x",
+        "fov": float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
+        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+    }
+
+
+def from_mitsuba(
+    id: str, to_world: Float64, x_fov: float, offset: tuple[float, float], size: tuple[int, int]
+) -> Camera:
+    """Camera from Mitsuba's `to_world` [4, 4], `x_fov` (degrees), principal point offsets and (width, height)."""
+    width, height = size
+    f = 0.5 * width / np.tan(np.radians(x_fov) / 2)
+    m = np.asarray(to_world, dtype=np.float64) @ _MITSUBA
+    R = m[:3, :3].T
+    return Camera(id, width, height, f, f, width * (0.5 - offset[0]), height * (0.5 - offset[1]), R, -R @ m[:3, 3])

@@ -1,0 +1,206 @@
+"""The scene folder, format `spike4dgs-scene/1`: what every method reads and every generator writes.
+
+Orientation, rate and camera identity come from scene.json, never from a guess. Every file is checked against the
+manifest before it is used, so a damaged stream is refused by whoever reads it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera, from_nerfstudio
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.images import read_exr, read_mask
+from spike4dgs.benchmark.manifest import Manifest, read_manifest
+from spike4dgs.benchmark.spikes import SpikeStream, open_stream
+
+SCHEMA = "spike4dgs-scene/1"
+
+
+@dataclass(frozen=True, order=True)
+class Target:
+    """One scored image: a held-out camera at a tick."""
+
+    camera: str
+    tick: int
+
+    @property
+    def name(self) -> str:
+        """The image's path below `images/` or a predictions folder, without suffix: `cam_04/000120`."""
+        return f"{self.camera}/{self.tick:06d}"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingScene:
+    """What a method may see: the training cameras and their streams, and the clock. No ground truth, no test stream."""
+
+    id: str
+    revision: str
+    cameras: tuple[Camera, ...]
+    streams: tuple[SpikeStream, ...]
+    rate_hz: float
+    n_ticks: int
+    radiance_gain: float  # spikes per tick of a pixel that sees radiance 1 (white)
+
+    @property
+    def duration_us(self) -> float:
+        """Length of the clip in microseconds."""
+        return self.n_ticks * 1e6 / self.rate_hz
+
+    def tick(self, t_us: float) -> int:
+        """The tick that contains the time `t_us`, clipped to the clip."""
+        return int(min(max(t_us * self.rate_hz * 1e-6, 0), self.n_ticks - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An opened scene folder. Images are gray linear radiance, [H, W] float32, 1.0 = white."""
+
+    root: Path
+    meta: dict[str, Any]  # scene.json
+    cameras: dict[str, Camera]
+    targets: tuple[Target, ...]
+    manifest: Manifest
+
+    @property
+    def id(self) -> str:
+        """Identifier, such as `car-0-small`."""
+        return str(self.meta["id"])
+
+    @property
+    def revision(self) -> str:
+        """SHA-256 of the manifest: it changes whenever any file of the scene changes."""
+        return self.manifest.revision
+
+    @property
+    def n_ticks(self) -> int:
+        """Length of the clip in ticks."""
+        return int(self.meta["n_ticks"])
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks per second."""
+        return float(self.meta["rate_hz"])
+
+    @property
+    def radiance_gain(self) -> float:
+        """Spikes per tick of a pixel that sees radiance 1 (white)."""
+        return float(self.meta["radiance_gain"])
+
+    @property
+    def train(self) -> tuple[str, ...]:
+        """Training cameras of the default split."""
+        return tuple(self.meta["splits"][self.meta["default_split"]]["train"])
+
+    @property
+    def test(self) -> tuple[str, ...]:
+        """Held-out cameras of the default split."""
+        return tuple(self.meta["splits"][self.meta["default_split"]]["test"])
+
+    def t_us(self, tick: int) -> float:
+        """Time at which a tick starts, in microseconds."""
+        return tick * 1e6 / self.rate_hz
+
+    def stream(self, camera: str) -> SpikeStream:
+        """The packed stream of a camera, checked and memory-mapped."""
+        path = self.manifest.path(self.meta["streams"][camera])
+        c = self.cameras[camera]
+        bottom_up = bool(self.meta["sensor"]["rows_bottom_up"])
+        return open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks)
+
+    def ground_truth(self, target: Target) -> NDArray[np.float32]:
+        """Radiance of a target, [H, W] float32."""
+        return read_exr(self.manifest.path(f"images/{target.name}.exr"))
+
+    def moving(self, target: Target) -> NDArray[np.bool_]:
+        """The moving region of a target, [H, W] bool: where the `*_dynamic` metrics look."""
+        return read_mask(self.manifest.path(f"masks/{target.name}.png"))
+
+    @cached_property
+    def training(self) -> TrainingScene:
+        """The part of the scene that methods see."""
+        cameras = tuple(self.cameras[c] for c in self.train)
+        streams = tuple(self.stream(c) for c in self.train)
+        return TrainingScene(self.id, self.revision, cameras, streams, self.rate_hz, self.n_ticks, self.radiance_gain)
+
+
+def open_scene(root: Path | str, allow_gaps: bool = False) -> Scene:
+    """Read and validate a scene folder.
+
+    Raises UserError where the folder, scene.json, the cameras or the targets are missing, foreign, damaged or
+    inconsistent, and where a recording has gaps unless `allow_gaps`.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise problem(root, "a scene folder", "no such folder", "make one with `spike4dgs make-dataset`")
+    meta = read_json(root / "scene.json", f"a {SCHEMA} description")
+    check_meta(meta, root / "scene.json")
+    manifest = read_manifest(root)
+    for name in ("scene.json", "transforms_train.json", "transforms_test.json", "targets.json"):
+        manifest.path(name)
+    cameras = _read_cameras(root)
+    _check_splits(meta, cameras, root / "scene.json")
+    targets = _read_targets(root / "targets.json", meta, cameras)
+    if meta["gaps"] and not allow_gaps:
+        found = f"{len(meta['gaps'])} gap(s), the first {json.dumps(meta['gaps'][0])}"
+        raise problem(
+            root / "scene.json", "a recording without gaps", found, "pass --allow-gaps to read it all the same"
+        )
+    return Scene(root, meta, cameras, targets, manifest)
+
+
+def check_meta(meta: dict[str, Any], path: Path) -> None:
+    """Validate scene.json against the shipped JSON Schema. Raises UserError with the first difference."""
+    if meta.get("schema") != SCHEMA:
+        found = f"schema {meta.get('schema')!r}"
+        raise problem(path, f"schema '{SCHEMA}'", found, "it is not a scene of this format: make or import one")
+    from jsonschema import Draft202012Validator
+
+    schema = json.loads((package_files("spike4dgs.benchmark") / "scene.schema.json").read_text())
+    for error in sorted(Draft202012Validator(schema).iter_errors(meta), key=str):
+        where = "/".join(str(p) for p in error.absolute_path) or "the top level"
+        raise problem(
+            path, "a valid description", f"at {where}: {error.message[:200]}", "make or import the scene again"
+        )
+
+
+def _read_cameras(root: Path) -> dict[str, Camera]:
+    cameras: dict[str, Camera] = {}
+    for name in ("transforms_train.json", "transforms_test.json"):
+        for frame in read_json(root / name, "camera poses").get("frames", []):
+            camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
+            cameras.setdefault(camera.id, camera)
+    return cameras
+
+
+def _check_splits(meta: dict[str, Any], cameras: dict[str, Camera], path: Path) -> None:
+    if meta["default_split"] not in meta["splits"]:
+        raise problem(path, "default_split among the splits", repr(meta["default_split"]), "correct scene.json")
+    for split, parts in meta["splits"].items():
+        both = set(parts["train"]) & set(parts["test"])
+        unknown = (set(parts["train"]) | set(parts["test"])) - (set(cameras) & set(meta["streams"]))
+        if both or unknown:
+            found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
+            raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
+
+
+def _read_targets(path: Path, meta: dict[str, Any], cameras: dict[str, Camera]) -> tuple[Target, ...]:
+    try:
+        targets = tuple(
+            Target(str(t["camera"]), int(t["tick"])) for t in read_json(path, "the scored images")["targets"]
+        )
+    except (KeyError, TypeError, ValueError) as e:
+        raise problem(path, "a list of {camera, tick}", repr(e), "restore it or make the scene again") from None
+    for t in targets:
+        if t.camera not in cameras or not 0 <= t.tick < meta["n_ticks"]:
+            raise problem(path, "cameras and ticks of this scene", f"{t.camera} at tick {t.tick}", "restore the file")
+    return targets

@@ -1,0 +1,146 @@
+"""Write the description files of a scene folder around streams and images that a generator or recorder has written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera, to_nerfstudio
+from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.manifest import Manifest, write_manifest
+from spike4dgs.benchmark.scene import SCHEMA, Target, check_meta
+
+_POSES = (
+    "transforms_*.json: camera to world, OpenGL axes; sparse/0: world to camera, OpenCV axes; pixel centres at +0.5"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDescription:
+    """Everything in scene.json, transforms, targets and the COLMAP model that is not a stream or an image."""
+
+    id: str
+    title: str
+    licence: str
+    cameras: tuple[Camera, ...]
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    rate_hz: float
+    n_ticks: int
+    radiance_gain: float
+    targets: tuple[Target, ...]
+    sensor: dict[str, Any]  # "model" and "rows_bottom_up" are required
+    source: dict[str, Any]  # "kind" is required: "mitsuba", "recorder" or "spikecv"
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))  # [N, 3] known surface points
+    clock: dict[str, Any] = field(default_factory=lambda: {"t0_ns": 0, "source": "simulation"})
+    sync: dict[str, Any] = field(default_factory=lambda: {"method": "exact", "max_error_us": 0})
+    gaps: tuple[dict[str, Any], ...] = ()
+
+
+def stream_name(camera: str) -> str:
+    """Path of a camera's stream inside the scene folder."""
+    return f"spikes/{camera}.dat"
+
+
+def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
+    """Write scene.json, transforms, targets, the COLMAP model and README, then the manifest, last of all.
+
+    The streams, images and masks are already in `root`. A folder without manifest.json is an unfinished scene.
+    """
+    size = scene.cameras[0]
+    meta = {
+        "schema": SCHEMA,
+        "id": scene.id,
+        "title": scene.title,
+        "licence": scene.licence,
+        "units": "m",
+        "world_up": [0, 0, 1],
+        "rate_hz": scene.rate_hz,
+        "n_ticks": scene.n_ticks,
+        "width": size.width,
+        "height": size.height,
+        "clock": scene.clock,
+        "sync": scene.sync,
+        "pose_convention": _POSES,
+        "sensor": scene.sensor,
+        "radiance_gain": scene.radiance_gain,
+        "streams": {c.id: stream_name(c.id) for c in scene.cameras},
+        "splits": {"center": {"train": list(scene.train), "test": list(scene.test)}},
+        "default_split": "center",
+        "gaps": list(scene.gaps),
+        "source": scene.source,
+    }
+    check_meta(meta, root / "scene.json")
+    write_json(root / "scene.json", meta)
+    by_id = {c.id: c for c in scene.cameras}
+    train = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.train]
+    test = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.test]
+    test += [_frame(scene, by_id[t.camera], t.tick, f"images/{t.name}.exr") for t in scene.targets]
+    write_json(root / "transforms_train.json", {"camera_model": "PINHOLE", "frames": train})
+    write_json(root / "transforms_test.json", {"camera_model": "PINHOLE", "frames": test})
+    write_json(root / "targets.json", {"targets": [{"camera": t.camera, "tick": t.tick} for t in scene.targets]})
+    write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
+    write_text(root / "README.md", _readme(scene))
+    return write_manifest(root)
+
+
+def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -> dict[str, Any]:
+    timing = {"time": tick / scene.n_ticks, "tick": tick, "t_us": tick * 1e6 / scene.rate_hz}
+    return {"camera": camera.id, "file_path": file_path, **timing, **to_nerfstudio(camera)}
+
+
+def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.float64]) -> None:
+    """Write cameras.bin, images.bin and points3D.bin with pycolmap: one PINHOLE camera and one image per view."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for i, c in enumerate(cameras, start=1):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=i, model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy]
+            )
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
+        model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=c.id), pose)
+    for p in points:
+        model.add_point3D(p, pycolmap.Track(), np.full(3, 128, dtype=np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(str(folder))
+
+
+def read_colmap(folder: Path) -> tuple[Camera, ...]:
+    """Cameras of a COLMAP model of PINHOLE cameras, one per registered image, named by the image."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(folder))
+    cameras = []
+    for image in model.images.values():
+        c = model.cameras[image.camera_id]
+        pose = image.cam_from_world()
+        K = c.calibration_matrix()
+        values = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
+        cameras.append(Camera(image.name, c.width, c.height, *values, R, t))
+    return tuple(sorted(cameras, key=lambda c: c.id))
+
+
+def _readme(scene: SceneDescription) -> str:
+    c = scene.cameras[0]
+    ms = scene.n_ticks * 1000 / scene.rate_hz
+    return f"""# {scene.title}
+
+Scene `{scene.id}` in the format `{SCHEMA}`: {len(scene.cameras)} spike cameras of {c.width}x{c.height} pixels,
+{scene.n_ticks} ticks at {scene.rate_hz:g} Hz ({ms:g} ms). Licence: {scene.licence}.
+
+- `spikes/*.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per tick.
+- `images/CAMERA/TICK.exr`: gray linear radiance (half float, 1.0 = white) at the start of the tick; held-out cameras.
+- `masks/CAMERA/TICK.png`: the moving region of the same image.
+- `transforms_train.json`, `transforms_test.json`: poses and intrinsics; `sparse/0`: the same for COLMAP.
+- `targets.json`: what is scored. `manifest.json`: size and SHA-256 of every file.
+- A pixel that sees radiance L fires {scene.radiance_gain:g} * L spikes per tick on average, before gain and dark maps.
+"""

@@ -1,0 +1,1 @@
+"""Scene makers: Mitsuba worlds, camera rig, key frames and the spike simulator."""

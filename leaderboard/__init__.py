@@ -1,0 +1,1 @@
+"""Submissions, verification and the committed entries."""

@@ -1,0 +1,1 @@
+"""Spike4DGS: rasteriser back ends, Gaussians, deformation and the shared trainer."""
