@@ -102,14 +102,14 @@ def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -
     """Camera from per-frame nerfstudio keys. Raises UserError where a key is missing or the pose is no rigid motion."""
     try:
         m = np.array(frame["transform_matrix"], dtype=np.float64) @ _OPENGL
-        values = [float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy")]
+        fx, fy, cx, cy = (float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
         width, height = int(frame["w"]), int(frame["h"])
     except (KeyError, TypeError, ValueError) as e:
         keys = "fl_x, fl_y, cx, cy, w, h and a 4x4 transform_matrix"
         raise problem(where, f"{keys} for camera {id}", repr(e), "write the scene again") from None
     check_rotation(m[:3, :3], f"{where}, camera {id}")
     R = m[:3, :3].T
-    return Camera(id, width, height, *values, R, -R @ m[:3, 3])
+    return Camera(id, width, height, fx, fy, cx, cy, R, -R @ m[:3, 3])
 
 
 def check_rotation(R: Float64, where: str) -> None:

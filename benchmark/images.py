@@ -73,4 +73,4 @@ def encode_srgb(image: Float32) -> NDArray[np.uint8]:
     encoded = np.where(
         x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4, where=x > 0, out=np.zeros_like(x)) - 0.055
     )
-    return np.rint(encoded * 255).astype(np.uint8)
+    return np.asarray(np.rint(encoded * 255), dtype=np.uint8)

@@ -1,0 +1,32 @@
+# `make benchmark` and `make test` are all that a newcomer needs; each makes its own environment in .venv.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+SCENES := data/car-0-small data/turntable-0-small
+
+.PHONY: benchmark test check wheel clean
+
+# The main job: two small scenes, four recipes, table, sheets and leaderboard entries. Killed runs resume.
+benchmark: $(STAMP)
+	$(BIN)/spike4dgs make-dataset car turntable --profile small --out data
+	$(BIN)/spike4dgs run-benchmark $(SCENES) --out runs/small --leaderboard runs/small/leaderboard
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+wheel: $(STAMP)
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+clean:
+	rm -rf build dist *.egg-info
