@@ -1,0 +1,6 @@
+"""Gaussian splatting: one `render` call over a float64 reference, a CPU kernel and gsplat on CUDA."""
+
+from spike4dgs.method.splat.api import render
+from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+
+__all__ = ["RenderOutput", "Splats", "Views", "render"]

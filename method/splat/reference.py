@@ -1,0 +1,156 @@
+"""The slow, obvious renderer: float64, every pixel against every Gaussian, gradients by autograd.
+
+It defines the semantics that the other back ends are tested against (those of gsplat 1.5):
+
+    p = R m + t,  culled where p_z < near
+    S2 = J R S R^T J^T + eps2d I,  J the projection's Jacobian at p, at most 0.3 half images outside the image
+    alpha = min(0.999, o exp(-d^T S2^-1 d / 2)),  skipped where below 1/255
+    antialiased: o *= sqrt(|S2 - eps2d I| / |S2|)
+    front to back by float32 depth, ties by index:  C += T alpha c,  T *= 1 - alpha,  until T would fall to 1e-4
+
+Memory grows as pixels x Gaussians. Not differentiated: the visibility decisions and the order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, T_MIN, RenderOutput, Splats, Views
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """The M visible Gaussians of one view, front to back."""
+
+    index: Tensor  # [M] into the N Gaussians
+    center: Tensor  # [M, 2] px
+    cov: Tensor  # [M, 3] xx, xy, yy of the blurred 2D covariance, px^2
+    det: Tensor  # [M] its determinant
+    opacity: Tensor  # [M]
+    depth: Tensor  # [M]
+    radius: Tensor  # [M] px
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Quaternions wxyz [M, 4] of any length -> rotation matrices [M, 3, 3]."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def project(
+    splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], antialiased: bool, near: float, eps2d: float
+) -> Projection:
+    """Project float64 Gaussians into one view of size (width, height)."""
+    p = splats.means @ w2c[:3, :3].T + w2c[:3, 3]  # [N, 3]
+    index = torch.nonzero((p[:, 2] >= near) & (splats.quats.square().sum(-1) > 0))[:, 0]
+    index = index[torch.argsort(p[index, 2].detach().float(), stable=True)]
+    p, f, c = p[index], K[[0, 1], [0, 1]], K[:2, 2]
+    z = p[:, 2:]
+    slope = p[:, :2] / z  # [M, 2] tangent of the viewing angle
+    image = torch.tensor(size, dtype=p.dtype)
+    margin = FRUSTUM_MARGIN * 0.5 * image / f
+    inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
+    J = torch.cat([torch.diag_embed(f / z), (-f * inside / z)[:, :, None]], -1)  # [M, 2, 3]
+    half = J @ w2c[:3, :3] @ (rotation_matrices(splats.quats[index]) * splats.scales[index, None, :])
+    cov = half @ half.transpose(1, 2)  # [M, 2, 2]
+    # The determinant as a sum of squares (Cauchy-Binet): xx * yy - xy^2 would cancel for needles.
+    det_sharp = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+    xx, xy, yy = cov[:, 0, 0] + eps2d, cov[:, 0, 1], cov[:, 1, 1] + eps2d
+    det = det_sharp + eps2d * (cov[:, 0, 0] + cov[:, 1, 1]) + eps2d**2
+    opacity, center = splats.opacities[index], f * slope + c
+    keep = (opacity >= ALPHA_MIN) & (det > 0)
+    if antialiased:
+        keep &= opacity * (det_sharp / det).detach().sqrt() >= ALPHA_MIN
+    reach = 2 * (255 * opacity.detach() * ((det_sharp / det).detach().sqrt() if antialiased else 1)).clamp(min=1).log()
+    extent = (reach[:, None] * torch.stack([xx, yy], -1).detach()).sqrt()  # [M, 2] half sides of the visible box
+    first = torch.ceil(center.detach() - extent - 0.5).clamp(min=0)
+    last = torch.minimum(torch.floor(center.detach() + extent - 0.5), image - 1)
+    keep = torch.nonzero(keep & (first <= last).all(-1))[:, 0]
+    if antialiased:  # after the selection: the root's slope is infinite at 0
+        opacity = opacity.index_select(0, keep) * (det_sharp[keep] / det[keep]).sqrt()
+    else:
+        opacity = opacity[keep]
+    cov3 = torch.stack([xx, xy, yy], -1)[keep]
+    return Projection(index[keep], center[keep], cov3, det[keep], opacity, p[keep, 2], extent[keep].amax(-1))
+
+
+def alphas(view: Projection, center: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Unclamped alpha [M, H*W] of each Gaussian at each pixel, and whether it is composited there (bool)."""
+    width, height = size
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    xx, xy = view.cov[:, :1], view.cov[:, 1:2]
+    dx, dy = x.reshape(1, -1) - center[:, :1], y.reshape(1, -1) - center[:, 1:]
+    # d^T S2^-1 d by completing the square: the share of x, and that of y's distance from the ridge line
+    distance2 = dx**2 / xx + (dy - xy / xx * dx) ** 2 * xx / view.det[:, None]
+    raw = view.opacity[:, None] * torch.exp(-0.5 * distance2)
+    with torch.no_grad():
+        hit = raw >= ALPHA_MIN
+        after = torch.cumprod(torch.where(hit, 1 - raw.clamp(max=ALPHA_MAX), 1.0), 0)  # T behind each Gaussian
+    return raw, hit & (after > T_MIN)
+
+
+def composite(view: Projection, center: Tensor, colors: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Blend colors [M, F] front to back -> image [H, W, F], alpha [H, W]."""
+    raw, live = alphas(view, center, size)
+    alpha = torch.where(live, torch.where(raw > ALPHA_MAX, ALPHA_MAX, raw), 0.0)
+    after = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    image = torch.einsum("mp,mf->pf", before * alpha, colors)
+    opaque = 1 - after[-1] if len(colors) else torch.zeros(size[0] * size[1], dtype=colors.dtype)
+    return image.reshape(size[1], size[0], -1), opaque.reshape(size[1], size[0])
+
+
+def render_reference(
+    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
+) -> RenderOutput:
+    """Back end "reference": see `render` for the arguments. Computes in float64, answers in the dtype of colors."""
+    dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
+    wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))
+    w2c, K = views.w2c.double(), views.K.double()
+    seen = [project(wide, w2c[c], K[c], size, antialiased, near, eps2d) for c in range(len(views))]
+    blank = torch.zeros(n, 2, dtype=torch.float64)
+    means2d = torch.stack([blank.index_copy(0, s.index, s.center) for s in seen])
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    radii = torch.stack([torch.zeros(n).index_copy(0, s.index, s.radius.detach().float()) for s in seen])
+    images, opaque = [], []
+    for c, s in enumerate(seen):
+        layers = torch.cat([wide.colors[s.index], s.depth[:, None]], -1)
+        image, alpha = composite(s, means2d[c][s.index], layers, size)
+        images.append(image)
+        opaque.append(alpha)
+    stack = torch.stack(images).to(dtype)
+    far = stack[..., -1] if depth else None
+    return RenderOutput(stack[..., :-1], torch.stack(opaque).to(dtype), far, radii, means2d)
+
+
+@torch.no_grad()
+def cutoff_margin(
+    splats: Splats, views: Views, *, antialiased: bool = False, near: float = 0.01, eps2d: float = 0.3
+) -> Tensor:
+    """How close each pixel comes to a decision that float32 may take otherwise, [C, H, W] float64.
+
+    The smallest relative distance, over the Gaussians that reach the pixel, of alpha from 1/255 and of the next T
+    from 1e-4. Where it is below the precision of a back end, a whole Gaussian may be there or not.
+    """
+    size = (views.width, views.height)
+    wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))
+    out = torch.full((len(views), views.height, views.width), torch.inf, dtype=torch.float64)
+    for c in range(len(views)):
+        s = project(wide, views.w2c[c].double(), views.K[c].double(), size, antialiased, near, eps2d)
+        if not len(s.index):
+            continue
+        raw, live = alphas(s, s.center, size)
+        after = torch.cumprod(torch.where(raw >= ALPHA_MIN, 1 - raw.clamp(max=ALPHA_MAX), 1.0), 0)
+        reached = torch.cat([torch.ones_like(live[:1]), after[:-1] > T_MIN / 2])
+        gaps = torch.minimum((raw / ALPHA_MIN - 1).abs(), (after / T_MIN - 1).abs())
+        out[c] = torch.where(reached, gaps, torch.inf).amin(0).reshape(views.height, views.width)
+    return out

@@ -1,0 +1,114 @@
+"""What goes into a renderer and what comes out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import problem
+
+ALPHA_MIN = 1.0 / 255.0  # a Gaussian fainter than this at a pixel is skipped there
+ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becomes 0
+T_MIN = 1e-4  # a pixel is finished before the Gaussian that would bring T down to this
+FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians as a renderer needs them. F is any number of colour channels."""
+
+    means: Tensor  # [N, 3] world coordinates
+    quats: Tensor  # [N, 4] wxyz, any length but 0
+    scales: Tensor  # [N, 3] standard deviations, after exp
+    opacities: Tensor  # [N] after sigmoid
+    colors: Tensor  # [N, F]
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim else 0
+        channels = self.colors.shape[1] if self.colors.ndim == 2 else 0
+        wanted = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "scales": (n, 3),
+            "opacities": (n,),
+            "colors": (n, max(channels, 1)),
+        }
+        for name, shape in wanted.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise problem(
+                    f"Splats.{name}", f"shape {shape}", str(tuple(value.shape)), "pass N rows in every tensor"
+                )
+            if not value.is_floating_point() or value.device != self.means.device:
+                found = f"{value.dtype} on {value.device}"
+                raise problem(f"Splats.{name}", f"floats on {self.means.device}", found, "convert it first")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The four tensors that decide where a Gaussian is seen: means, quats, scales, opacities."""
+        return self.means, self.quats, self.scales, self.opacities
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """C pinhole cameras of one image size: OpenCV world-to-camera poses, pixel centres at +0.5."""
+
+    w2c: Tensor  # [C, 4, 4]
+    K: Tensor  # [C, 3, 3]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        n = self.w2c.shape[0] if self.w2c.ndim else 0
+        for name, shape in (("w2c", (n, 4, 4)), ("K", (n, 3, 3))):
+            found = tuple(getattr(self, name).shape)
+            if found != shape or n == 0:
+                raise problem(
+                    f"Views.{name}", f"shape {shape} with at least one camera", str(found), "stack the cameras"
+                )
+        if self.width < 1 or self.height < 1:
+            raise problem(
+                "Views", "a positive image size", f"{self.width}x{self.height}", "give width and height in px"
+            )
+
+    def __len__(self) -> int:
+        return self.w2c.shape[0]
+
+    @classmethod
+    def from_cameras(
+        cls, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
+    ) -> Views:
+        """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp."""
+        sizes = sorted({(c.width, c.height) for c in cameras})
+        if len(sizes) != 1:
+            raise problem("cameras", "one image size", f"{sizes}", "render the cameras of each size on their own")
+        w2c = torch.stack([torch.as_tensor(c.w2c, dtype=dtype) for c in cameras]).to(device)
+        K = torch.stack([torch.as_tensor(c.K, dtype=dtype) for c in cameras]).to(device)
+        return cls(w2c, K, *sizes[0])
+
+
+@dataclass(frozen=True, eq=False)
+class RenderOutput:
+    """Pictures of C views, and what densification wants to know of the N Gaussians in each.
+
+    `means2d` holds the projected centres in pixels (0 where invisible). Where the render is differentiated,
+    `means2d.grad` is dLoss/dmeans2d in the same units after `backward()`, on every back end.
+    """
+
+    image: Tensor  # [C, H, W, F]
+    alpha: Tensor  # [C, H, W] 1 - transmittance
+    depth: Tensor | None  # [C, H, W] sum of weight * z (not divided by alpha), or None where it was not asked for
+    radii: Tensor  # [C, N] px, larger half side of the visible ellipse's bounding box; 0 where invisible
+    means2d: Tensor  # [C, N, 2] px
+
+    @property
+    def visible(self) -> Tensor:
+        """[C, N] bool: near enough, opaque enough, and its ellipse covers at least one pixel centre."""
+        return self.radii > 0
