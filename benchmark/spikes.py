@@ -51,9 +51,9 @@ class SpikeStream:
         Raises UserError for a window that leaves the clip.
         """
         self._check(start, stop)
-        n = self.width * self.height
-        bits = np.unpackbits(self.packed[start:stop], axis=1, count=n, bitorder="little")
-        return self._upright(bits.reshape(-1, self.height, self.width))
+        from spike4dgs.benchmark import bits  # numba: imported where it is used, so that the command line starts fast
+
+        return bits.unpack(self.packed[start:stop], self.width, self.height, self.rows_bottom_up)
 
     def counts(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Spikes per pixel in ticks [start, stop) as [H, W] uint16, counted on the packed bits.

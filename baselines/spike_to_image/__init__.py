@@ -1,1 +1,11 @@
-"""Pictures from spike windows."""
+"""Spike-to-image methods: the table that a recipe's `images` part names an entry of."""
+
+from __future__ import annotations
+
+from spike4dgs.baselines.spike_to_image.images import ImageMaker
+from spike4dgs.baselines.spike_to_image.tfi import TFI
+from spike4dgs.baselines.spike_to_image.tfp import TFP
+
+IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (TFP, TFI)}
+
+__all__ = ["IMAGES", "ImageMaker"]

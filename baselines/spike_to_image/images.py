@@ -1,0 +1,40 @@
+"""The first of a recipe's four parts: what picture does a spike window give?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes import SpikeStream
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ImageMaker:
+    """A named way from spikes to pictures. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
+
+    >>> IMAGES["tfp"](stream, ticks=[100, 200], gain=0.6).shape  # doctest: +SKIP
+    (2, 250, 400)
+    """
+
+    name: str
+    definition: str
+    source: str
+    rate: Callable[[SpikeStream, int], Float32]
+
+    def __call__(self, stream: SpikeStream, ticks: Sequence[int], gain: float) -> Float32:
+        """Linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`; `gain`: spikes per tick of white.
+
+        Raises UserError for a tick outside the clip.
+        """
+        images = np.empty((len(ticks), stream.height, stream.width), np.float32)
+        for image, tick in zip(images, ticks, strict=True):
+            if not 0 <= tick < stream.n_ticks:
+                raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
+            image[:] = self.rate(stream, tick)
+        images /= gain
+        return images

@@ -1,0 +1,115 @@
+"""Kernels on packed spikes: count and unpack bits without a plain array of the whole clip in between.
+
+Two ideas carry everything. A table turns a byte into one machine word that holds its eight bits as eight numbers
+(`lanes`), so that one 64-bit addition adds eight pixels. And a vertical counter keeps bit k of every pixel's count in
+plane k, so that one bitwise operation on a plane serves every pixel of a vector register.
+
+The kernels release the GIL and work on plain arrays and memory maps. The ranges that threads work on never overlap in
+the output, so the number of threads changes no bit of it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+UInt8 = NDArray[np.uint8]
+UInt64 = NDArray[np.uint64]
+F = TypeVar("F", bound=Callable[..., Any])
+
+_BLOCK = 1024  # bytes of a tick counted at a time: eight planes and a carry of 1 KiB each stay in the L1 cache
+_SMALL = 1 << 21  # bytes of input below which starting threads costs more than it saves
+
+
+def kernel(function: F) -> F:
+    """Compile with numba: no GIL, cached on disk."""
+    return cast(F, numba.njit(nogil=True, cache=True)(function))
+
+
+def in_threads(function: Callable[..., None], n: int, *args: object, small: bool = False) -> None:
+    """Call `function(*args, start, stop)` on ranges that cover [0, n), one range per core; on one if `small`."""
+    parts = 1 if small else max(1, min(n, len(os.sched_getaffinity(0))))
+    edges = [n * i // parts for i in range(parts + 1)]
+    if parts == 1:
+        function(*args, 0, n)
+        return
+    with ThreadPoolExecutor(parts) as pool:
+        for job in [pool.submit(function, *args, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]:
+            job.result()
+
+
+def rows(packed: UInt8) -> UInt8:
+    """The same bytes as a plain, contiguous, read-only array: the one type that kernels are compiled for."""
+    view = np.ascontiguousarray(packed).view(np.ndarray)
+    view.flags.writeable = False
+    return view
+
+
+def lanes(width: int) -> UInt64:
+    """Table [256, width]: the eight bits of a byte as eight numbers in `width` words (uint8 for 1, uint16 for 2)."""
+    bits = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
+    return bits.astype(np.dtype(f"u{width}")).view(np.uint64)
+
+
+def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:
+    """Sum over ticks of each of the first `n_pixels` bits of rows [n, bytes] -> [n_pixels] uint16, n <= 65535."""
+    counts = np.zeros(packed.shape[1] * 8, np.uint16)
+    in_threads(_count, packed.shape[1], rows(packed), lanes(2), counts, small=packed.size < _SMALL)
+    return counts[:n_pixels]
+
+
+@kernel
+def _count(packed, table, counts, start, stop):  # type: ignore[no-untyped-def]
+    n = len(packed)
+    words = counts.view(np.uint64)  # four uint16 counts each
+    planes = np.empty((8, _BLOCK), np.uint8)
+    carry = np.empty(_BLOCK, np.uint8)
+    for first in range(start, stop, _BLOCK):
+        size = min(_BLOCK, stop - first)
+        for group in range(0, n, 255):  # eight planes count to 255
+            planes[:] = 0
+            for t in range(group, min(group + 255, n)):
+                carry[:size] = packed[t, first : first + size]
+                reached = t - group + 1  # no count is larger yet, so higher planes receive no carry
+                level = 0
+                while reached > 0:
+                    plane = planes[level]
+                    for j in range(size):
+                        p, c = plane[j], carry[j]
+                        plane[j] = p ^ c
+                        carry[j] = p & c
+                    reached >>= 1
+                    level += 1
+            for level in range(8):
+                for j in range(size):
+                    words[2 * (first + j)] += table[planes[level, j], 0] << np.uint64(level)
+                    words[2 * (first + j) + 1] += table[planes[level, j], 1] << np.uint64(level)
+
+
+def unpack(packed: UInt8, width: int, height: int, flip: bool) -> UInt8:
+    """Unpack rows [n, bytes] to [n, height, width] of 0 and 1, with the rows in reverse order if `flip`."""
+    out = np.empty((len(packed), height, width), np.uint8)
+    in_threads(_unpack, len(packed), rows(packed), lanes(1)[:, 0].copy(), flip, out, small=packed.size < _SMALL // 8)
+    return out
+
+
+@kernel
+def _unpack(packed, table, flip, out, start, stop):  # type: ignore[no-untyped-def]
+    height, width = out.shape[1:]
+    words = np.empty(width, np.uint64)  # eight rows are `width` bytes: whole bytes at any width
+    flat = words.view(np.uint8)
+    for t in range(start, stop):
+        for first in range(0, height, 8):
+            n_rows = min(8, height - first)
+            source = packed[t, first // 8 * width :]
+            for j in range((n_rows * width + 7) // 8):
+                words[j] = table[source[j]]
+            for r in range(n_rows):
+                y = height - 1 - first - r if flip else first + r
+                out[t, y] = flat[r * width : (r + 1) * width]
