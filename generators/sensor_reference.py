@@ -1,0 +1,59 @@
+"""The spike camera of `sensor` again: float64, one tick and one step after the other, slow and obvious."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.generators.sensor import THRESHOLD, Int32, Keys, Sensor
+
+Float64 = NDArray[np.float64]
+_GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
+
+
+def hermite(p1: Float64, p2: Float64, slope1: Float64, slope2: Float64, length: float, x: float) -> Float64:
+    """The cubic through p1 at x = 0 and p2 at x = length with these slopes per tick, at x."""
+    u = x / length
+    h00, h10 = (1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2
+    h01, h11 = u * u * (3 - 2 * u), u * u * (u - 1)
+    return h00 * p1 + h10 * length * slope1 + h01 * p2 + h11 * length * slope2
+
+
+def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[Float64]:
+    """Mean radiance [H, W] of ticks 0 .. n_ticks - 1: Catmull-Rom through the keys, clamped to the neighbouring two."""
+    last = len(key_ticks) - 1
+
+    def slope(k: int) -> Float64:
+        a, b = max(k - 1, 0), min(k + 1, last)
+        return (np.float64(keys[b]) - np.float64(keys[a])) / (key_ticks[b] - key_ticks[a])
+
+    for k in range(last):
+        start, length = key_ticks[k], key_ticks[k + 1] - key_ticks[k]
+        if start >= n_ticks:
+            return
+        p1, p2 = np.float64(keys[k]), np.float64(keys[k + 1])
+        slope1, slope2 = slope(k), slope(k + 1)
+        for tick in range(start, min(start + length, n_ticks)):
+            mean = sum(hermite(p1, p2, slope1, slope2, length, tick - start + x) for x in _GAUSS) / 2
+            yield np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2))
+
+
+def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
+    """Spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
+    level = charge / THRESHOLD
+    gain = 1.0 if sensor.gain is None else np.float64(sensor.gain)
+    dark = 0.0 if sensor.dark is None else np.float64(sensor.dark)
+    for mean in means:
+        level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1.0)
+        fired = level >= 1.0
+        yield fired, level
+        level = level - fired
+
+
+def simulate_reference(
+    keys: Keys, key_ticks: Sequence[int], n_ticks: int, sensor: Sensor, charge: Int32
+) -> NDArray[np.bool_]:
+    """Spikes [n_ticks, H, W], upright and unpacked: the arguments are those of `sensor.simulate`."""
+    return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge)])

@@ -1,0 +1,215 @@
+"""The simulator against its float64 twin, closed forms and the statistics of real spike cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.spikes import SpikeStream, pack
+from spike4dgs.generators.sensor import THRESHOLD, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor_maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor_reference import fire, simulate_reference, tick_means
+
+TICKS = 100_000
+
+
+class Lazy:
+    """Keys computed on demand: nobody may need them all at once."""
+
+    def __init__(self, n, image):
+        self.n, self.image = n, image
+
+    def __len__(self):
+        return self.n
+
+    def __getitem__(self, k):
+        return self.image(k)
+
+
+def stream(keys, ticks, n, sensor, charge, threads=1):
+    packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads)))
+    return SpikeStream(packed, charge.shape[1], charge.shape[0], 20000.0)
+
+
+def maps(height, width, on):
+    return Sensor(0.6, gain_map(height, width, 1, "cam_00"), dark_map(height, width, 1, "cam_00")) if on else Sensor()
+
+
+def checkpoints(s):
+    """Cumulative counts [H, W] at 1000, 51000 and 100000 ticks."""
+    return {1000: s.counts(0, 1000), 51_000: s.counts(0, 51_000)} | {
+        TICKS: s.counts(0, 51_000).astype(int) + s.counts(51_000, TICKS)
+    }
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_constant_light_has_no_drift(on):
+    light = np.linspace(0, 2.2, 9 * 15, dtype=np.float32).reshape(9, 15)  # up to saturation
+    sensor, charge = maps(9, 15, on), random_charge(9, 15, [3])
+    gain, dark = (1.0, 0.0) if not on else (sensor.gain.astype(float), sensor.dark.astype(float))
+    rate = np.clip(0.6 * gain * light.astype(float) + dark, 0, 1)
+    s = stream(Lazy(101, lambda k: light), np.arange(101) * 1000, TICKS, sensor, charge)
+    for n, counts in checkpoints(s).items():
+        exact = charge / THRESHOLD + n * rate
+        # integers only add their own rounding, 2^-31 a tick: 5e-5 after 10^5 ticks
+        assert (counts <= np.floor(exact + 1e-9)).all()
+        assert (counts >= np.floor(exact - n * 2.0**-31 - 1e-9)).all()
+
+
+@pytest.mark.parametrize("spacing", [8, 100])
+def test_linear_light_has_no_drift(spacing):
+    rng = np.random.default_rng(0)
+    first, last = rng.random((2, 9, 15)) * 1.5
+    sensor, charge = maps(9, 15, True), random_charge(9, 15, [3])
+    n_keys = TICKS // spacing + 1
+
+    def light(k):
+        return (first + (last - first) * (k / (n_keys - 1))).astype(np.float32)
+
+    s = stream(Lazy(n_keys, light), np.arange(n_keys) * spacing, TICKS, sensor, charge)
+    for n, counts in checkpoints(s).items():
+        mean = first + (last - first) * (n / 2 / TICKS)
+        exact = charge / THRESHOLD + n * (0.6 * sensor.gain * mean + sensor.dark)
+        assert np.abs(counts - np.floor(exact)).max() <= 1
+        assert (counts == np.floor(exact)).mean() > 0.95
+
+
+def near_threshold(keys, ticks, n, sensor, charge, tolerance=1e-4):
+    """[n, H, W]: where the exact charge lies so near the threshold that rounding may decide."""
+    levels = (level for _, level in fire(tick_means(keys, ticks, n), sensor, charge))
+    return np.stack([np.abs((level + 0.5) % 1 - 0.5) < tolerance for level in levels])
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    height=st.integers(1, 17),
+    width=st.integers(1, 23),
+    gaps=st.lists(st.integers(1, 24), min_size=1, max_size=8),
+    cut=st.integers(0, 5),
+    contrast=st.sampled_from([0.0, 0.01, 1.0, 30.0]),
+    on=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_equals_the_twin(height, width, gaps, cut, contrast, on, seed):
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum([0, *gaps])
+    n = max(1, int(ticks[-1]) - cut)
+    keys = (0.5 + contrast * rng.random((len(ticks), height, width))).astype(np.float32)
+    still = rng.random((height, width)) < 0.5
+    keys[:, still] = keys[0, still]
+    sensor, charge = maps(height, width, on), random_charge(height, width, [seed])
+    got = stream(keys, ticks, n, sensor, charge)
+    expected = simulate_reference(keys, ticks, n, sensor, charge)
+    differ = got.window(0, n) != expected
+    assert differ.mean() <= 0.01
+    assert not (differ & ~near_threshold(keys, ticks, n, sensor, charge)).any()
+    assert np.abs(got.counts(0, n).astype(int) - expected.sum(0)).max() <= 1
+    if not differ.any():
+        assert np.array_equal(got.packed, pack(expected))
+
+
+def scene(seed=0, height=31, width=45, n_keys=60):
+    keys = np.random.default_rng(seed).random((n_keys, height, width), dtype=np.float32)
+    keys[:, :, :20] = keys[0, :, :20]
+    return keys, np.arange(n_keys) * 5, (n_keys - 1) * 5
+
+
+def test_bytes_depend_on_the_seed_and_not_on_threads_or_batches(monkeypatch):
+    keys, ticks, n = scene()
+    sensor, charge = maps(31, 45, True), random_charge(31, 45, [0, 7])
+    once = stream(keys, ticks, n, sensor, charge, threads=1).packed
+    assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=2).packed)
+    monkeypatch.setattr("spike4dgs.generators.sensor._BATCH_BYTES", 4 * 31 * 45 * 7)
+    assert len(list(simulate(keys, ticks, n, sensor, charge))) > 5
+    assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=3).packed)
+    other = random_charge(31, 45, [1, 7])
+    assert not np.array_equal(once, stream(keys, ticks, n, sensor, other).packed)
+    assert np.array_equal(charge, random_charge(31, 45, [0, 7]))  # the caller's array is not changed
+
+
+def test_padding_bits_are_zero():
+    keys, ticks, n = scene(height=7, width=9)  # 63 pixels
+    packed = stream(keys * 0 + 5, ticks, n, Sensor(), random_charge(7, 9, [0])).packed
+    assert packed.shape == (n, 8)
+    assert (packed[:, -1] == 0x7F).all()
+
+
+def test_two_adjacent_intervals_in_constant_light():
+    """Real recordings: 95 % of pixels show two adjacent inter-spike intervals, because the rest of the charge is kept."""
+    light = np.random.default_rng(0).uniform(0.15, 1.4, (40, 60)).astype(np.float32)
+    s = stream(np.stack([light, light]), [0, 500], 500, maps(40, 60, True), random_charge(40, 60, [0]))
+    spikes = s.window(0, 500).reshape(500, -1)
+    isis = [np.unique(np.diff(np.flatnonzero(pixel))) for pixel in spikes.T]
+    assert all(i.max() - i.min() <= 1 for i in isis if len(i))
+    assert np.mean([len(i) == 2 for i in isis]) >= 0.95
+
+
+def test_count_variance_is_that_of_an_ideal_integrator():
+    """Counts in a window of constant light vary by f(1-f) only, f the fractional part of the expected count."""
+    light = np.random.default_rng(0).uniform(0.1, 1.0, (40, 60)).astype(np.float32)
+    s = stream(np.stack([light, light]), [0, 4000], 4000, Sensor(), random_charge(40, 60, [0]))
+    counts = np.stack([s.counts(a, a + 20) for a in range(0, 4000, 20)]).astype(float)
+    f = (0.6 * 20 * light) % 1
+    assert np.abs(counts.var(axis=0) - f * (1 - f)).mean() < 0.02
+
+
+def test_interpolation_meets_keys_and_never_overshoots():
+    rng = np.random.default_rng(0)
+    keys = rng.random((6, 4, 5))
+    ticks = [0, 400, 800, 1200, 1600, 2000]
+    means = np.stack(list(tick_means(keys, ticks, 2000)))
+    for k in range(5):
+        part = means[ticks[k] : ticks[k + 1]]
+        assert (part >= np.minimum(keys[k], keys[k + 1]) - 1e-12).all()
+        assert (part <= np.maximum(keys[k], keys[k + 1]) + 1e-12).all()
+        assert np.abs(part[0] - keys[k]).max() < 0.01  # a tick is 1/400 of the interval
+        assert np.abs(part[-1] - keys[k + 1]).max() < 0.01
+
+
+def test_interpolation_is_exact_for_linear_and_inner_quadratic_light():
+    t = np.arange(0, 101, 10.0)
+    for curve, integral, inner in (
+        (lambda x: 2 + 0.01 * x, lambda x: 2 * x + 0.005 * x**2, slice(0, 100)),
+        (lambda x: (x + 50) ** 2 / 1e4, lambda x: (x + 50) ** 3 / 3e4, slice(10, 90)),  # monotone: no clamp acts
+    ):
+        means = np.array([m[0, 0] for m in tick_means(curve(t)[:, None, None], t.astype(int), 100)])
+        exact = np.diff(integral(np.arange(101.0)))
+        assert np.allclose(means[inner], exact[inner], rtol=0, atol=1e-12)
+
+
+def test_saturated_pixels_fire_every_tick_and_recover_at_once():
+    keys = np.array([50, 50, 50, 0, 0, 0], np.float32)[:, None, None] * np.ones((1, 8, 8), np.float32)
+    s = stream(keys, np.arange(6) * 10, 50, Sensor(), random_charge(8, 8, [0]))
+    assert (s.window(0, 20) == 1).all()
+    assert (s.window(30, 50) == 0).all()
+
+
+def test_maps_have_the_spread_of_the_real_camera(tmp_path):
+    gain, dark = gain_map(250, 400, 0, "cam_00"), dark_map(250, 400, 0, "cam_00")
+    smooth = np.add.reduceat(np.add.reduceat(gain, np.arange(0, 250, 10), 0), np.arange(0, 400, 10), 1) / 100
+    local = gain / np.repeat(np.repeat(smooth, 10, 0), 10, 1)
+    assert gain.mean() == pytest.approx(1, abs=1e-5)
+    assert gain.std() == pytest.approx(0.058, abs=0.002)
+    assert local.std() == pytest.approx(0.032, abs=0.002)
+    assert np.median(dark) == pytest.approx(0.0045, rel=0.02)
+    assert np.percentile(dark, [1, 99]) == pytest.approx([0.0015, 0.0128], rel=0.1)
+    assert 40 < (dark > 5 * np.median(dark)).sum() < 160
+    assert np.array_equal(gain, gain_map(250, 400, 0, "cam_00"))
+    assert not np.array_equal(gain, gain_map(250, 400, 0, "cam_01"))
+    assert not np.array_equal(gain, gain_map(250, 400, 1, "cam_00"))
+    for name in ("a.npz", "b.npz"):
+        write_maps(tmp_path / name, {"gain": gain, "dark": None})
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert list(np.load(tmp_path / "a.npz")) == ["gain"]
+
+
+def test_bad_input_is_named():
+    keys, ticks, n = scene()
+    charge = random_charge(31, 45, [0])
+    for bad_ticks, bad_n in ((ticks[:-1], n), (ticks + 1, n), (ticks, n + 1), (ticks * 0, n)):
+        with pytest.raises(UserError, match=r"key frames: expected .*; correct"):
+            list(simulate(keys, bad_ticks, bad_n, Sensor(), charge))
+    with pytest.raises(UserError, match="gain map"):
+        list(simulate(keys, ticks, n, Sensor(gain=np.ones((2, 2), np.float32)), charge))
