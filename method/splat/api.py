@@ -8,10 +8,14 @@ from typing import Literal
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.splat.cpu import render_cpu
 from spike4dgs.method.splat.reference import render_reference
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
+
+
+_BACKENDS = {"reference": render_reference, "cpu": render_cpu, "auto": render_cpu}
 
 
 def render(
@@ -45,7 +49,7 @@ def render(
         raise problem("background", f"[{n}] or [C, {n}]", found, "give one value per colour channel")
     if not (near > 0 and eps2d >= 0):
         raise problem("render", "near > 0 and eps2d >= 0", f"near {near}, eps2d {eps2d}", "correct the argument")
-    out = render_reference(splats, views, depth=depth, antialiased=antialiased, near=near, eps2d=eps2d)
+    out = _BACKENDS[backend](splats, views, depth=depth, antialiased=antialiased, near=near, eps2d=eps2d)
     if background is None:
         return out
     behind = background.reshape(-1, 1, 1, background.shape[-1]) * (1 - out.alpha)[..., None]

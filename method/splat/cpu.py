@@ -1,0 +1,211 @@
+"""Back end "cpu": the numba kernels behind a torch autograd function.
+
+One view after another, each on all threads. Per view: project every Gaussian (float64), count and fill tile lists, sort
+and composite tile by tile (float32); backward replays the tiles front to back, then chains to the parameters.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.splat import project_gradient, project_kernels, tile_kernels
+from spike4dgs.method.splat.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
+from spike4dgs.method.splat.jit import announce_compilation
+from spike4dgs.method.splat.raster_kernels import AHEAD, MAX_BLOCKS, raster_kernels, record_width
+from spike4dgs.method.splat.threads import aligned, get_threads, run
+from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+from spike4dgs.method.splat.vector_ir import host_lanes
+
+Array = np.ndarray
+_busy = threading.Lock()  # the scratch memory is shared by all renders of the process
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What one call of `render` asks for, in the kernels' terms."""
+
+    width: int
+    height: int
+    near: float
+    eps2d: float
+    antialiased: bool
+    depth: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One rendered view and what its gradient needs again. P: Gaussian-tile pairs; L: kernel channels in all."""
+
+    camera: Array  # [16] float64, see camera_constants
+    records: Array  # [N * 8] float64
+    keys: Array  # [N] uint32
+    tiles: Array  # [N, 4] int32
+    slots: Array  # [N + 1] int32
+    order: Array  # [P + AHEAD] int32, tile by tile, nearest first
+    offsets: Array  # [tiles + 1] int64
+    colors: Array  # [chunks, N * channels] float32
+    processed: Array  # [chunks, tiles] int64
+    image: Array  # [L, H, W] float32
+    alpha: Array  # [H, W] float32
+
+
+@cache
+def _thread_memory(thread: int) -> tuple[Array, ...]:
+    """Scratch of one thread: projection rows, lanes, tile planes, block list (starts, xis, etas, ends), digits."""
+    rows = max(project_kernels.ROWS, project_gradient.ROWS) * project_kernels.BLOCK
+    planes = 8 * PLANE  # T, R, alpha gradient and up to 4 colours, and room for a vector that overhangs the last
+    block_list = (np.empty(MAX_BLOCKS, np.int32), np.empty(MAX_BLOCKS, np.float32), np.empty(MAX_BLOCKS, np.float32))
+    ends = np.empty(256, np.int32)
+    lanes = np.empty(project_kernels.BLOCK, np.int64)
+    digits = np.empty(1024, np.int32)
+    return np.empty(rows), lanes, aligned((planes,), np.float32), *block_list, ends, digits
+
+
+def _chunking(channels: int) -> tuple[int, int]:
+    """(channels per kernel pass, passes): kernels exist for 1, 2 and 4 channels."""
+    per_pass = channels if channels <= 2 else 4
+    return per_pass, -(-channels // per_pass)
+
+
+def _pack_colors(colors: Array, depths: Array | None) -> Array:
+    """[N, F] and depths [N] or None -> [chunks, N * channels] float32, padded with zeros."""
+    layers = colors.shape[1] + (depths is not None)
+    per_pass, passes = _chunking(layers)
+    if depths is None and passes == 1 and per_pass == layers and colors.dtype == np.float32:
+        return np.ascontiguousarray(colors).reshape(1, -1)
+    packed = np.zeros((passes, len(colors), per_pass), np.float32)
+    for channel in range(colors.shape[1]):
+        packed[channel // per_pass, :, channel % per_pass] = colors[:, channel]
+    if depths is not None:
+        packed[(layers - 1) // per_pass, :, (layers - 1) % per_pass] = depths
+    return packed.reshape(passes, -1)
+
+
+def _render_view(
+    geometry: tuple[Array, ...], colors: Array, camera: Array, s: Settings, centers: Array, radii: Array
+) -> Frame:
+    """Draw one view; fills centers [N, 2] and radii [N]."""
+    n, threads = len(colors), get_threads()
+    across, down = -(-s.width // TILE_WIDTH), -(-s.height // TILE_HEIGHT)
+    blocks = -(-n // project_kernels.BLOCK)
+    records, keys, depths = aligned((n, 8), np.float64), np.empty(n, np.uint32), np.empty(n, np.float32)
+    tiles, slots = np.empty((n, 4), np.int32), np.zeros(n + 1, np.int32)
+    histogram, invalid = np.empty((blocks, 1 + across * down), np.int32), np.empty(blocks, np.int64)
+    offsets = np.empty(across * down + 1, np.int64)
+    memory = [_thread_memory(t) for t in range(threads)]
+    arguments = (*geometry, camera, s.width, s.height, s.near, s.eps2d, s.antialiased)
+    outputs = (records, keys, depths, centers, radii, tiles, histogram, invalid)
+    announce_compilation(project_kernels.project_forward, "CPU splatting")
+    run(project_kernels.project_forward, (*arguments, *outputs), [(m[0],) for m in memory])
+    if n and invalid.max() >= 0:
+        found = f"NaN or infinity at Gaussian {invalid.max()}"
+        raise problem("splats", "finite parameters", found, "look for a diverging learning rate or a division by 0")
+    pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
+    run(tile_kernels.fill_tiles, (keys, tiles, across, histogram, slots, pairs), [()] * threads)
+    packed = _pack_colors(colors, depths if s.depth else None)
+    per_pass, passes = _chunking(colors.shape[1] + s.depth)
+    order = np.zeros(len(pairs) + AHEAD, np.int32)
+    image = np.empty((passes * per_pass, s.height, s.width), np.float32)
+    alpha, processed = np.empty((s.height, s.width), np.float32), np.empty((passes, across * down), np.int64)
+    forward, _ = raster_kernels(host_lanes(), per_pass)
+    longest = int(np.diff(offsets).max())
+    arguments = (records.reshape(-1), packed, pairs, order, offsets, s.width, s.height, image, alpha, processed)
+    run(forward, arguments, [(*m[2:8], np.empty(longest, np.uint64)) for m in memory])
+    return Frame(
+        camera, records.reshape(-1), keys, tiles, slots, order, offsets, packed, processed, image, alpha
+    )  # fmt: skip
+
+
+def _differentiate_view(
+    frame: Frame, geometry: tuple[Array, ...], s: Settings, d_image: Array, d_alpha: Array, outputs: tuple[Array, ...],
+    d_pose: Array,
+) -> None:  # fmt: skip
+    """Add one view's gradients to outputs (means, quats, scales, opacities, colors, centers); d_pose [4, 4] is set."""
+    n, channels = len(frame.keys), outputs[4].shape[1]
+    per_pass, passes = _chunking(channels + s.depth)
+    sums = aligned((passes, int(frame.slots[n]) * record_width(per_pass)), np.float32)
+    memory = [_thread_memory(t) for t in range(get_threads())]
+    _, backward = raster_kernels(host_lanes(), per_pass)
+    lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
+    pictures = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
+    run(backward, (*lists, *pictures, sums), [m[2:7] for m in memory])
+    blocks = -(-n // project_kernels.BLOCK) if d_pose.size else 0
+    block_pose = np.empty((blocks, 12))
+    arguments = (*geometry, frame.camera, s.width, s.height, s.eps2d, s.antialiased, channels if s.depth else -1)
+    record_sums = sums.reshape(passes, -1, record_width(per_pass))
+    run(
+        project_gradient.project_backward,
+        (*arguments, frame.keys, frame.slots, record_sums, *outputs, block_pose),
+        [m[:2] for m in memory],
+    )
+    if d_pose.size:
+        d_pose[:3] = block_pose.sum(0).reshape(3, 4)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Tensors in, layers [C, H, W, F (+ depth)] and alpha [C, H, W] out; `probe` only receives dL/dmeans2d."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, w2c: Tensor,
+        probe: Tensor, K: Tensor, settings: Settings, radii: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        geometry = tuple(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities))
+        poses, intrinsics = w2c.detach().double().numpy(), K.detach().double().numpy()
+        frames = []
+        with _busy:
+            for c in range(len(poses)):
+                K_entries = intrinsics[c, [0, 1, 0, 1], [0, 1, 2, 2]]
+                camera = np.concatenate([poses[c, :3, :3].reshape(-1), poses[c, :3, 3], K_entries])
+                centers, reach = probe.detach()[c].numpy(), radii[c].numpy()
+                frames.append(_render_view(geometry, colors.detach().numpy(), camera, settings, centers, reach))
+        ctx.frames, ctx.geometry, ctx.settings = frames, geometry, settings
+        ctx.pose_dtype, ctx.colors_dtype, ctx.channels = w2c.dtype, colors.dtype, colors.shape[1]
+        layers = colors.shape[1] + settings.depth
+        image = np.stack([f.image[:layers] for f in frames]) if len(frames) > 1 else frames[0].image[None, :layers]
+        alpha = np.stack([f.alpha for f in frames]) if len(frames) > 1 else frames[0].alpha[None]
+        return torch.from_numpy(image), torch.from_numpy(alpha)
+
+    @staticmethod
+    def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        n, dtype = len(ctx.geometry[0]), ctx.geometry[0].dtype
+        outputs = [np.zeros(a.shape, dtype) for a in ctx.geometry] + [np.zeros((n, ctx.channels), np.float32)]
+        d_centers = np.zeros((len(ctx.frames), n, 2), dtype)
+        d_w2c = np.zeros((len(ctx.frames), 4, 4) if ctx.needs_input_grad[5] else (len(ctx.frames), 0))
+        with _busy:
+            for c, frame in enumerate(ctx.frames):
+                layers = np.zeros(frame.image.shape, np.float32)
+                layers[: d_image.shape[1]] = d_image[c].numpy()
+                own = np.ascontiguousarray(d_alpha[c].numpy())
+                _differentiate_view(frame, ctx.geometry, ctx.settings, layers, own, (*outputs, d_centers[c]), d_w2c[c])
+        grads = [torch.from_numpy(a) for a in outputs]
+        grads[4] = grads[4].to(ctx.colors_dtype)
+        pose = torch.from_numpy(d_w2c).to(ctx.pose_dtype) if ctx.needs_input_grad[5] else None
+        return (*grads, pose, torch.from_numpy(d_centers), None, None, None)
+
+
+def render_cpu(
+    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
+) -> RenderOutput:
+    """Back end "cpu": see `render` for the arguments."""
+    dtype = torch.float32
+    if any(t.dtype == torch.float64 for t in splats.geometry):
+        dtype = torch.float64
+    geometry = [t.to(dtype) for t in splats.geometry]
+    inputs = (*splats.geometry, splats.colors, views.w2c)
+    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    means2d = torch.zeros(len(views), len(splats), 2, dtype=dtype, requires_grad=wanted)
+    radii = torch.zeros(len(views), len(splats))
+    settings = Settings(views.width, views.height, near, eps2d, antialiased, depth)
+    layers, alpha = _Rasterize.apply(*geometry, splats.colors, views.w2c, means2d, views.K, settings, radii)
+    layers = layers.permute(0, 2, 3, 1)
+    image, far = (layers[..., :-1], layers[..., -1]) if depth else (layers, None)
+    return RenderOutput(image, alpha, far, radii, means2d)

@@ -1,0 +1,71 @@
+"""A few threads of our own. Kernels release the GIL and take work items from an atomic counter until none is left.
+
+OpenMP (numba's prange, torch) makes waiting threads spin: on a busy machine that cost 63 ms where this costs 14.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+
+_threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
+_pool: ThreadPoolExecutor | None = None
+_lock = threading.Lock()
+
+
+def set_threads(count: int) -> None:
+    """Use this many threads for the CPU kernels (default: the cores this process may use, at most 16).
+
+    The results are the same bits for any number.
+    """
+    global _threads, _pool
+    if count < 1:
+        raise problem("set_threads", "at least 1", str(count), "pass the number of cores to use")
+    with _lock:
+        if _pool is not None:
+            _pool.shutdown()
+        _threads, _pool = count, None
+
+
+def get_threads() -> int:
+    """How many threads the CPU kernels use."""
+    return _threads
+
+
+def work_counter() -> np.ndarray:
+    """A fresh counter [1] int64 for one `run`, on a cache line of its own."""
+    return np.zeros(8, np.int64)
+
+
+def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """An uninitialised array that begins on a cache line."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = np.empty(size + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + size].view(dtype).reshape(shape)
+
+
+def run(kernel: Any, arguments: Sequence[Any], scratch: Sequence[Sequence[Any]]) -> None:
+    """Call `kernel(*arguments, counter, *scratch[t])` on len(scratch) threads, this one included, until all return.
+
+    A helper thread that has not started when the work is done is called off.
+    """
+    global _pool
+    counter = work_counter()
+    helpers: list[Future[None]] = []
+    if len(scratch) > 1:
+        with _lock:
+            if _pool is None:
+                _pool = ThreadPoolExecutor(max(_threads - 1, 1), thread_name_prefix="splat")
+            helpers = [_pool.submit(kernel, *arguments, counter, *own) for own in scratch[1:]]
+    kernel(*arguments, counter, *scratch[0])
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
