@@ -1,0 +1,130 @@
+"""Which Mitsuba variant to render with: the vectorised LLVM one where it works, else the scalar one.
+
+`llvm_ad_rgb` needs a system libLLVM that suits the CPU; a bad one kills the process. So it is tried in a child
+process, once, and the answer is remembered for this Mitsuba, this libLLVM and this CPU.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType
+
+from spike4dgs.benchmark.errors import problem
+
+FAST, SAFE = "llvm_ad_rgb", "scalar_rgb"
+SUPPORTED = (FAST, SAFE, "cuda_ad_rgb")
+OVERRIDE = "SPIKE4DGS_MITSUBA_VARIANT"
+
+_LLVM_PLACES = (
+    "/usr/lib/*/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/local/lib/libLLVM*",
+    "/opt/homebrew/opt/llvm/lib/libLLVM*",
+)
+_PROBE = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import numpy as np
+scene = mi.load_dict(mi.cornell_box())
+picture = np.array(mi.render(scene, spp=1, sensor=0))
+assert np.isfinite(picture).all() and picture.mean() > 0
+print("works")
+"""
+
+
+@lru_cache(maxsize=1)
+def pick_variant() -> str:
+    """The variant for this process: `SPIKE4DGS_MITSUBA_VARIANT` where set, else the probe's answer.
+
+    Says on stderr, in one line, why it fell back to the scalar variant and what would make rendering faster.
+    Raises UserError for an unknown name in the environment variable.
+    """
+    wanted = os.environ.get(OVERRIDE)
+    if wanted:
+        if wanted not in SUPPORTED:
+            raise problem(OVERRIDE, " or ".join(SUPPORTED), wanted, "unset it to let the program choose")
+        return wanted
+    why_not = _cached_probe()
+    if not why_not:
+        return FAST
+    print(
+        f"spike4dgs: rendering with {SAFE} because {FAST} does not work here ({why_not}); for 2-4x the speed install "
+        "libLLVM 19 (Debian: apt-get install libllvm19) or name one in DRJIT_LIBLLVM_PATH",
+        file=sys.stderr,
+    )
+    return SAFE
+
+
+def load_mitsuba() -> ModuleType:
+    """The mitsuba module with its variant set; the first caller decides for the whole process."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant(pick_variant())
+    return mi
+
+
+def _cached_probe() -> str:
+    """Why the fast variant fails ("" if it works), from the cache file or from a new probe."""
+    path = _cache_dir() / f"mitsuba-{_fingerprint()}.json"
+    try:
+        return str(json.loads(path.read_text())["why_not"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    why_not = _probe()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = path.with_suffix(f".{os.getpid()}.tmp")
+        scratch.write_text(json.dumps({"why_not": why_not}))
+        scratch.replace(path)
+    except OSError:
+        pass  # no writable cache: the next process probes again
+    return why_not
+
+
+def _probe(timeout_s: float = 180.0) -> str:
+    """Render a small picture in a child process; returns "" or one line that says what went wrong."""
+    try:
+        child = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        return f"no answer within {timeout_s:.0f} s"
+    if child.returncode == 0 and "works" in child.stdout:
+        return ""
+    complaint = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    if child.returncode < 0:
+        return f"killed by {signal.Signals(-child.returncode).name}" + (f", {complaint[0]}" if complaint else "")
+    return complaint[-1] if complaint else f"exit code {child.returncode}"
+
+
+def _fingerprint() -> str:
+    """Names this Mitsuba, the libLLVM files that it would find and the CPU."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH", "")
+    files = [named] if named else sorted({f for place in _LLVM_PLACES for f in glob.glob(place)})
+    stamps = [(f, os.stat(f).st_size if os.path.exists(f) else -1) for f in files]
+    facts = (version("mitsuba"), version("drjit"), stamps, platform.machine(), _cpu_name())
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
+
+
+def _cache_dir() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "spike4dgs"

@@ -1,0 +1,97 @@
+"""What a world is: plain data (numpy meshes, textures, poses) that knows nothing of the renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spike4dgs.generators.worlds.materials import Material
+from spike4dgs.generators.worlds.meshes import Mesh
+
+
+class Part(NamedTuple):
+    """One surface: a mesh and what it is made of."""
+
+    mesh: Mesh
+    material: Material
+
+
+@dataclass(frozen=True)
+class RigSpec:
+    """A 3x3 array of parallel-ish cameras.
+
+    Attributes:
+        center: position of the middle camera, world metres.
+        target: the point it looks at.
+        spacing_m: distance between neighbouring cameras (right, up).
+        toe_in: 0 = all optical axes parallel, 1 = all meet in `target`.
+        fov_x_deg: horizontal field of view, the same at every resolution.
+    """
+
+    center: tuple[float, float, float]
+    target: tuple[float, float, float]
+    spacing_m: tuple[float, float]
+    toe_in: float
+    fov_x_deg: float
+
+
+@dataclass(frozen=True)
+class WorldScene:
+    """One concrete world: static surfaces, rigid moving instances, light and cameras. Metres, Z up, X right, Y away.
+
+    Attributes:
+        name: key in `WORLDS`.
+        seed, variant, duration_s: the arguments it was built from; equal arguments give equal scenes.
+        static: surfaces that never move.
+        groups: rigid groups of surfaces in their own coordinates; an instance shows one group at a pose.
+        instances: instance name -> group name. Only these move.
+        emitters: Mitsuba emitter dictionaries (numbers, lists and numpy arrays only).
+        poses: time in seconds -> {instance name: [4, 4] float64 local-to-world}.
+        exposure: factor from rendered radiance to scene units, in which white paper in full light is 1.0.
+        rig: the camera array.
+        shadow_sources: [K, 4] homogeneous points of the main light (w = 0: at infinity); a surface point whose line to
+            one of them is crossed by a moving instance lies in its shadow.
+        depth_range: (near, far) metres that enclose everything the cameras see.
+        notes: physical facts worth recording with the data (speed, size), name -> number with the unit in the name.
+    """
+
+    name: str
+    seed: int
+    variant: int
+    duration_s: float
+    static: Mapping[str, Part]
+    groups: Mapping[str, tuple[Part, ...]]
+    instances: Mapping[str, str]
+    emitters: Mapping[str, dict[str, Any]]
+    poses: Callable[[float], dict[str, np.ndarray]]
+    exposure: float
+    rig: RigSpec
+    shadow_sources: np.ndarray
+    depth_range: tuple[float, float]
+    notes: Mapping[str, float]
+
+    def moving_points(self, t_s: float) -> np.ndarray:
+        """World positions of all moving vertices at `t_s`, always in the same order: [N, 3] float64."""
+        poses = self.poses(t_s)
+        chunks = []
+        for instance, group in self.instances.items():
+            local = np.concatenate([part.mesh.vertices for part in self.groups[group]])
+            chunks.append(local @ poses[instance][:3, :3].T + poses[instance][:3, 3])
+        return np.concatenate(chunks)
+
+
+@dataclass(frozen=True)
+class World:
+    """A named family of scenes: `build(seed, variant, duration_s)`; variant 0 is the public benchmark's."""
+
+    name: str
+    title: str
+    build: Callable[[int, int, float], WorldScene]
+
+
+def rng_for(name: str, seed: int, variant: int) -> np.random.Generator:
+    """The one random stream of a world, a function of its name, seed and variant."""
+    return np.random.default_rng([seed, variant, *name.encode()])

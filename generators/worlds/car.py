@@ -1,0 +1,76 @@
+"""World `car`: a rally car races along a street from left to right under a gantry of nine cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spike4dgs.generators.worlds import street, vehicle
+from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import rotation, translation
+
+_LIVERIES = (
+    vehicle.Livery((0.82, 0.56, 0.04), (0.03, 0.03, 0.035), "7"),
+    vehicle.Livery((0.80, 0.80, 0.78), (0.55, 0.05, 0.04), "12"),
+    vehicle.Livery((0.35, 0.62, 0.80), (0.80, 0.30, 0.04), "20"),
+    vehicle.Livery((0.50, 0.72, 0.30), (0.04, 0.10, 0.25), "4"),
+    vehicle.Livery((0.85, 0.38, 0.06), (0.04, 0.14, 0.40), "31"),
+)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What one variant draws: speed, lane, colours, light. Variant 0 keeps these values."""
+
+    speed_m_s: float = 32.0
+    lane_y_m: float = 2.75
+    livery: int = 0
+    light: street.Light = street.Light(azimuth_deg=-128.0, elevation_deg=46.0, sun=3.2, sky=0.75)
+
+
+def _draw(variant: int, rng: np.random.Generator) -> _Run:
+    if variant == 0:
+        return _Run()
+    light = street.Light(rng.uniform(-150, -40), rng.uniform(36, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
+    return _Run(rng.uniform(32.0, 36.0), rng.uniform(2.5, 3.2), int(rng.integers(len(_LIVERIES))), light)
+
+
+def build(seed: int, variant: int, duration_s: float) -> WorldScene:
+    """The car is in the middle of the frame at half of `duration_s`; in half a second it crosses the whole view."""
+    rng = rng_for("car", seed, variant)
+    run = _draw(variant, rng)
+    wheels = vehicle.wheel_positions()
+    livery = _LIVERIES[run.livery]
+
+    def poses(t_s: float) -> dict[str, np.ndarray]:
+        travelled = run.speed_m_s * (t_s - duration_s / 2)
+        body = translation(travelled, run.lane_y_m, 0.0)
+        roll = rotation("y", travelled / vehicle.WHEEL_RADIUS_M)
+        return {"body": body} | {f"rim{k}": body @ translation(*w) @ roll for k, w in enumerate(wheels)}
+
+    return WorldScene(
+        name="car",
+        seed=seed,
+        variant=variant,
+        duration_s=duration_s,
+        static=street.street(rng),
+        groups={"body": vehicle.body_parts(livery, rng), "rim": vehicle.rim_parts()},
+        instances={"body": "body"} | {f"rim{k}": "rim" for k in range(len(wheels))},
+        emitters=street.emitters(run.light, rng),
+        poses=poses,
+        exposure=0.95,
+        rig=RigSpec(
+            center=(0.0, -8.2, 7.4), target=(0.0, 2.55, 0.75), spacing_m=(0.6, 0.5), toe_in=0.7, fov_x_deg=48.0
+        ),
+        shadow_sources=np.append(run.light.to_sun, 0.0)[None],
+        depth_range=(5.0, 40.0),
+        notes={
+            "speed_m_s": run.speed_m_s,
+            "length_m": vehicle.LENGTH_M,
+            "wheel_turns_per_s": run.speed_m_s / (2 * np.pi * vehicle.WHEEL_RADIUS_M),
+        },
+    )
+
+
+WORLD = World("car", "A rally car crosses a street", build)
