@@ -18,10 +18,10 @@ exactly (the 1/12 and 1/4 are the tick's own width), and is then clamped to the 
 
 Numbers. Charge is an integer in units of 2^-31, so adding up loses nothing however long the clip; the sign bit of the
 32-bit sum is the spike. Increments of 64 neighbouring pixels that do not change over four keys are computed in float64
-and rounded down to 2^-31. Others are computed in float32: each is off by less than 2^-22 of the largest of the pixel's
-keys around it, hence over N ticks the charge differs from exact arithmetic by less than N 2^-22 (0.024 at N = 10^5), the
+and rounded down to 2^-31. Others are computed in float32, each off by less than 2^-22 of the largest key around it:
+over N ticks the charge differs from exact arithmetic by less than N 2^-22 (0.024 at N = 10^5) in unsaturated light, the
 count by at most one spike. No fused multiply-add is used, so every processor gives the same bits.
-`sensor_reference` is the slow twin.
+`sensor_reference` is the slow twin, `sensor_kernels` the inner loop.
 """
 
 from __future__ import annotations
@@ -33,24 +33,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes import UInt8, bytes_per_tick
+from spike4dgs.generators.sensor_kernels import BLOCK, STRIP, integrate
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
-THRESHOLD = 2**31  # charge units at which a pixel fires
 RADIANCE_GAIN = 0.6  # spikes per tick of a pixel that sees white
-_BLOCK = 64  # pixels whose spikes make one 64-bit word
-_STRIP = 16  # blocks that a thread takes through all intervals of a batch before the next
 _BATCH_BYTES = 16 << 20  # of key frames in memory at a time
-_BELOW_THRESHOLD = 2147483520.0  # largest float32 below THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +76,8 @@ def simulate(
     height, width = charge.shape
     _check(keys, ticks, n_ticks, sensor, charge)
     threads = threads or len(os.sched_getaffinity(0))
-    blocks = -(-height * width // _BLOCK)
-    state = np.zeros(blocks * _BLOCK, dtype=np.int32)
+    blocks = -(-height * width // BLOCK)
+    state = np.zeros(blocks * BLOCK, dtype=np.int32)
     _store(charge, state)
     gain, dark = _stored_map(sensor.gain, 1.0, blocks), _stored_map(sensor.dark, 0.0, blocks)
     per_batch = max(1, _BATCH_BYTES // (4 * len(state)))
@@ -107,7 +101,7 @@ def simulate(
                 words,
             )
             bounds = _shares(blocks, threads)
-            list(pool.map(lambda a, b, w=work: _integrate(*w, a, b), bounds[:-1], bounds[1:]))  # list: raise errors
+            list(pool.map(lambda a, b, w=work: integrate(*w, a, b), bounds[:-1], bounds[1:]))  # list: raise errors
             yield words.view(np.uint8)[:, : bytes_per_tick(width, height)]
 
 
@@ -130,8 +124,8 @@ def _store(image: NDArray[Any], out: NDArray[Any]) -> None:
 def _stored_map(image: Float32 | None, off: float, blocks: int) -> Float32:
     """A map in file order; one block of constants, which never leaves the first-level cache, where it is off."""
     if image is None:
-        return np.full(_BLOCK, off, dtype=np.float32)
-    stored = np.zeros(blocks * _BLOCK, dtype=np.float32)
+        return np.full(BLOCK, off, dtype=np.float32)
+    stored = np.zeros(blocks * BLOCK, dtype=np.float32)
     _store(image, stored)
     return stored
 
@@ -159,117 +153,5 @@ def _tangent_weights(ticks: NDArray[np.int64]) -> Float32:
 
 def _shares(blocks: int, threads: int) -> list[int]:
     """Bounds of the threads' ranges of blocks, at whole strips so that no cache line has two writers."""
-    strips = -(-blocks // _STRIP)
-    return [min(blocks, strips * t // threads * _STRIP) for t in range(threads + 1)]
-
-
-@intrinsic
-def _sign_bits(typing_context: Any, values: Any) -> Any:
-    """Sign bits of an int32 array's first 64 entries as one uint64, entry 0 in the lowest bit.
-
-    Written as vector IR because no compiler finds this from a loop; it becomes a few mask instructions.
-    """
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = ir.VectorType(ir.IntType(32), _BLOCK)
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        loaded = builder.load(builder.bitcast(data, vector.as_pointer()), align=4)
-        return builder.bitcast(builder.icmp_signed("<", loaded, ir.Constant(vector, None)), ir.IntType(64))
-
-    return types.uint64(values), codegen
-
-
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
-def _integrate(  # type: ignore[no-untyped-def]
-    window, ticks, tangents, radiance_gain, gain, dark, charge, words, first_block, last_block
-):
-    """Fill words[:, first_block:last_block] and advance `charge`: strips outer, intervals, blocks, ticks inner.
-
-    window [S + 3, P], ticks [S + 1], tangents [S, 2], gain and dark [P] or [64], charge [P], words [T, P / 64].
-    """
-    c = np.empty(_BLOCK, np.int32)
-    w = np.empty(6 * _BLOCK, np.float32)
-    for strip in range(first_block, last_block, _STRIP):
-        for s in range(len(ticks) - 1):
-            n = ticks[s + 1] - ticks[s]
-            start = ticks[s] - ticks[0]
-            stop = min(start + n, len(words))
-            for block in range(strip, min(strip + _STRIP, last_block)):
-                p = block * _BLOCK
-                k = window[s : s + 4, p : p + _BLOCK]
-                g = gain[p : p + _BLOCK] if len(gain) > _BLOCK else gain
-                d = dark[p : p + _BLOCK] if len(dark) > _BLOCK else dark
-                c[:] = charge[p : p + _BLOCK]
-                if _still(k):
-                    _constant(k[1], g, d, radiance_gain, c, words[start:stop, block])
-                else:
-                    _prepare(k, tangents[s, 0], tangents[s, 1], g, d, np.float32(radiance_gain), n, w)
-                    _changing(w, n, c, words[start:stop, block])
-                charge[p : p + _BLOCK] = c
-
-
-@njit(nogil=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator, unused-ignore]
-def _still(k):  # type: ignore[no-untyped-def]
-    same = True
-    for i in range(_BLOCK):
-        same &= (k[0, i] == k[1, i]) & (k[1, i] == k[2, i]) & (k[2, i] == k[3, i])
-    return same
-
-
-@njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
-def _constant(k, g, d, radiance_gain, c, words):  # type: ignore[no-untyped-def]
-    """Ticks of 64 pixels whose radiance does not change: one integer addition each."""
-    increment = np.empty(_BLOCK, np.int32)
-    for i in range(_BLOCK):
-        x = (np.float64(g[i]) * radiance_gain * np.float64(k[i]) + np.float64(d[i])) * THRESHOLD
-        x = 0.0 if x < 0.0 else x
-        increment[i] = np.int32(THRESHOLD - 1.0 if x > THRESHOLD - 1.0 else x)
-    for j in range(len(words)):
-        for i in range(_BLOCK):
-            c[i] = (c[i] & np.int32(0x7FFFFFFF)) + increment[i]
-        words[j] = _sign_bits(c)
-    for i in range(_BLOCK):
-        c[i] &= np.int32(0x7FFFFFFF)
-
-
-@njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
-def _prepare(k, weight1, weight2, g, d, radiance_gain, n, w):  # type: ignore[no-untyped-def]
-    """Polynomial in u (rows 0..3 of `w` [6 * 64]) and limits (rows 4, 5) of the increment, in charge units."""
-    unit, top, zero = np.float32(THRESHOLD), np.float32(_BELOW_THRESHOLD), np.float32(0.0)
-    width2, width3 = np.float32(1.0 / (12.0 * n * n)), np.float32(1.0 / (4.0 * n * n))
-    for i in range(_BLOCK):
-        scale = g[i] * radiance_gain * unit
-        d2 = k[2, i] - k[1, i]
-        m1 = weight1 * (k[2, i] - k[0, i])
-        m2 = weight2 * (k[3, i] - k[1, i])
-        a2 = scale * (np.float32(3.0) * d2 - np.float32(2.0) * m1 - m2)
-        a3 = scale * (m1 + m2 - np.float32(2.0) * d2)
-        level = scale * k[1, i] + d[i] * unit
-        level2 = scale * k[2, i] + d[i] * unit
-        w[i] = level + a2 * width2
-        w[_BLOCK + i] = scale * m1 + a3 * width3
-        w[2 * _BLOCK + i] = a2
-        w[3 * _BLOCK + i] = a3
-        low = level if level < level2 else level2
-        high = level2 if level < level2 else level
-        low = low if low < top else top
-        w[4 * _BLOCK + i] = low if low > zero else zero
-        high = high if high < top else top
-        w[5 * _BLOCK + i] = high if high > zero else zero
-
-
-@njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
-def _changing(w, n, c, words):  # type: ignore[no-untyped-def]
-    """Ticks of 64 pixels along the polynomials that `_prepare` left in `w`."""
-    for j in range(len(words)):
-        u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
-        for i in range(_BLOCK):
-            cubic = w[2 * _BLOCK + i] + u * w[3 * _BLOCK + i]
-            x = w[i] + u * (w[_BLOCK + i] + u * cubic)
-            low, high = w[4 * _BLOCK + i], w[5 * _BLOCK + i]
-            x = low if x < low else x
-            x = high if x > high else x
-            c[i] = (c[i] & np.int32(0x7FFFFFFF)) + np.int32(x)
-        words[j] = _sign_bits(c)
-    for i in range(_BLOCK):
-        c[i] &= np.int32(0x7FFFFFFF)
+    strips = -(-blocks // STRIP)
+    return [min(blocks, strips * t // threads * STRIP) for t in range(threads + 1)]

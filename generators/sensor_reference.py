@@ -7,10 +7,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.sensor import THRESHOLD, Int32, Keys, Sensor
+from spike4dgs.generators.sensor import Float32, Int32, Keys, Sensor
+from spike4dgs.generators.sensor_kernels import THRESHOLD
 
 Float64 = NDArray[np.float64]
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
+
+
+def _exact(image: Float32) -> Float64:
+    return np.asarray(image, dtype=np.float64)
 
 
 def hermite(p1: Float64, p2: Float64, slope1: Float64, slope2: Float64, length: float, x: float) -> Float64:
@@ -27,24 +32,24 @@ def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[F
 
     def slope(k: int) -> Float64:
         a, b = max(k - 1, 0), min(k + 1, last)
-        return (np.float64(keys[b]) - np.float64(keys[a])) / (key_ticks[b] - key_ticks[a])
+        return (_exact(keys[b]) - _exact(keys[a])) / (key_ticks[b] - key_ticks[a])
 
     for k in range(last):
         start, length = key_ticks[k], key_ticks[k + 1] - key_ticks[k]
         if start >= n_ticks:
             return
-        p1, p2 = np.float64(keys[k]), np.float64(keys[k + 1])
+        p1, p2 = _exact(keys[k]), _exact(keys[k + 1])
         slope1, slope2 = slope(k), slope(k + 1)
         for tick in range(start, min(start + length, n_ticks)):
-            mean = sum(hermite(p1, p2, slope1, slope2, length, tick - start + x) for x in _GAUSS) / 2
-            yield np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2))
+            a, b = (hermite(p1, p2, slope1, slope2, length, tick - start + x) for x in _GAUSS)
+            yield np.clip((a + b) / 2, np.minimum(p1, p2), np.maximum(p1, p2))
 
 
 def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
     """Spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
     level = charge / THRESHOLD
-    gain = 1.0 if sensor.gain is None else np.float64(sensor.gain)
-    dark = 0.0 if sensor.dark is None else np.float64(sensor.dark)
+    gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
+    dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
     for mean in means:
         level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1.0)
         fired = level >= 1.0

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes import SpikeStream, pack
-from spike4dgs.generators.sensor import THRESHOLD, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor import Sensor, random_charge, simulate
+from spike4dgs.generators.sensor_kernels import THRESHOLD
 from spike4dgs.generators.sensor_maps import dark_map, gain_map, write_maps
 from spike4dgs.generators.sensor_reference import fire, simulate_reference, tick_means
 
@@ -137,7 +139,7 @@ def test_padding_bits_are_zero():
 
 
 def test_two_adjacent_intervals_in_constant_light():
-    """Real recordings: 95 % of pixels show two adjacent inter-spike intervals, because the rest of the charge is kept."""
+    """Real recordings show two adjacent intervals at 95 % of pixels, because the rest of the charge is kept."""
     light = np.random.default_rng(0).uniform(0.15, 1.4, (40, 60)).astype(np.float32)
     s = stream(np.stack([light, light]), [0, 500], 500, maps(40, 60, True), random_charge(40, 60, [0]))
     spikes = s.window(0, 500).reshape(500, -1)
