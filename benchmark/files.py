@@ -55,16 +55,20 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     Raises UserError where the file is missing, is not JSON, or is not an object.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise problem(path, what, "no such file", "check the path") from None
     except IsADirectoryError:
         raise problem(path, what, "a folder", "check the path") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as e:
+    except (ValueError, RecursionError) as e:  # bad syntax, bad UTF-8, NaN or infinity
         raise problem(path, f"{what} (JSON)", f"damaged text ({e})", "restore the file or make it again") from None
     if not isinstance(value, dict):
         raise problem(path, f"{what} (a JSON object)", type(value).__name__, "check that it is the right file")
     return value
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON number")
 
 
 def sha256_file(path: Path) -> str:

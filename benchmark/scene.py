@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.images import read_exr, read_mask
 from spike4dgs.benchmark.manifest import Manifest, read_manifest
+from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.spikes import SpikeStream, open_stream
 
 SCHEMA = "spike4dgs-scene/1"
@@ -163,14 +163,7 @@ def check_meta(meta: dict[str, Any], path: Path) -> None:
     if meta.get("schema") != SCHEMA:
         found = f"schema {meta.get('schema')!r}"
         raise problem(path, f"schema '{SCHEMA}'", found, "it is not a scene of this format: make or import one")
-    from jsonschema import Draft202012Validator
-
-    schema = json.loads((package_files("spike4dgs.benchmark") / "scene.schema.json").read_text())
-    for error in sorted(Draft202012Validator(schema).iter_errors(meta), key=str):
-        where = "/".join(str(p) for p in error.absolute_path) or "the top level"
-        raise problem(
-            path, "a valid description", f"at {where}: {error.message[:200]}", "make or import the scene again"
-        )
+    check_schema(meta, load_schema("spike4dgs.benchmark", "scene.schema.json"), path, "make or import the scene again")
 
 
 def _read_cameras(root: Path) -> dict[str, Camera]:

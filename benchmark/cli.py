@@ -1,0 +1,174 @@
+"""The `spike4dgs` command line.
+
+The tables below are the one place where rooms meet: commands are named by import strings and loaded only when they run,
+so `--help` imports nothing heavy and no room imports another for the command line's sake.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+from spike4dgs.benchmark.errors import UserError, problem
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: where its function is, what it does, and a command line that people can copy."""
+
+    target: str  # module:function
+    summary: str
+    example: str
+
+
+COMMANDS: dict[str, Command] = {
+    "make-dataset": Command(
+        "spike4dgs.generators.make_dataset:make_dataset",
+        "render a world and simulate its spike cameras",
+        "make-dataset car --profile small --out data/car",
+    ),
+    "run-benchmark": Command(
+        "spike4dgs.benchmark.run:run_benchmark",
+        "fit methods on scenes, score them, enter them into a leaderboard",
+        "run-benchmark data/car data/turntable --methods tfp+4dgs nearest-view --out runs/first --seed 0 --device cpu",
+    ),
+    "score": Command(
+        "spike4dgs.benchmark.score:score",
+        "score a predictions folder of any program",
+        "score runs/first/predictions/tfp+4dgs data/car data/turntable --out result.json",
+    ),
+    "submit": Command(
+        "spike4dgs.leaderboard.submit:submit",
+        "verify a result record and enter it into the leaderboard",
+        "submit result.json --predictions runs/first/predictions/tfp+4dgs --scenes data/car data/turntable",
+    ),
+    "inspect": Command(
+        "spike4dgs.baselines.inspect:inspect",
+        "show a scene or a raw spike stream: rates, bad pixels, pictures",
+        "inspect recording.dat --width 400 --height 250 --fps 20000",
+    ),
+    "verify": Command(
+        "spike4dgs.benchmark.verify:verify",
+        "check every file of a scene against its manifest",
+        "verify data/car",
+    ),
+    "import-spikecv": Command(
+        "spike4dgs.benchmark.spikecv:import_spikecv",
+        "make a scene folder from a SpikeCV folder",
+        "import-spikecv --help",
+    ),
+    "export-spikecv": Command(
+        "spike4dgs.benchmark.spikecv:export_spikecv",
+        "write a scene's streams as a SpikeCV folder",
+        "export-spikecv --help",
+    ),
+    "spacing": Command(
+        "spike4dgs.generators.spacing:spacing",
+        "report key-frame spacing against error and render time",
+        "spacing --help",
+    ),
+}
+
+# Speed measurements take the rest of the command line as a list of strings.
+SPEED: dict[str, Command] = {
+    "splat": Command(
+        "spike4dgs.method.speed:splat", "render and differentiate Gaussians, beside a torch reference", "speed splat"
+    ),
+    "ssim": Command("spike4dgs.method.speed:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
+    "simulate": Command(
+        "spike4dgs.generators.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
+    ),
+    "decode": Command(
+        "spike4dgs.benchmark.speed_decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
+    ),
+    "tfi": Command("spike4dgs.baselines.speed:tfi", "pictures from spike intervals, whole stack", "speed tfi"),
+    "tfp": Command("spike4dgs.baselines.speed:tfp", "pictures from spike counts, whole stack", "speed tfp"),
+}
+
+
+def load(name: str) -> Callable[..., Any]:
+    """The function of a command, such as "submit"."""
+    return _import(COMMANDS[name])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 130: interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except UserError as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    except SystemExit as e:  # tyro: 0 after --help, 2 after bad arguments, whose message it has printed
+        return e.code if isinstance(e.code, int) else 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _dispatch(arguments: list[str]) -> int:
+    name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    if name in ("-h", "--help"):
+        speed = Command("", "measure the speed of a part beside a plain one", "")
+        print(_overview("spike4dgs", COMMANDS | {"speed": speed}))
+        return 0
+    if name == "--version":
+        print(version("spike4dgs"))
+        return 0
+    if name == "speed":
+        return _speed(rest)
+    command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
+
+    import tyro
+
+    function = _import(command)
+    return int(
+        tyro.cli(function, args=rest, prog=f"spike4dgs {name}", description=_description(function, command)) or 0
+    )
+
+
+def _speed(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview("spike4dgs speed", SPEED))
+        return 0
+    return int(_import(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
+
+
+def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
+    if name not in table:
+        near = difflib.get_close_matches(name, table, 1)
+        fix = f"did you mean `{prog} {near[0]}`?" if near else f"see `{prog} --help`"
+        raise problem(prog, f"one of {', '.join(table)}", repr(name), fix)
+    return table[name]
+
+
+def _import(command: Command) -> Callable[..., Any]:
+    module, _, function = command.target.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
+
+
+def _overview(prog: str, table: Mapping[str, Command]) -> str:
+    width = max(map(len, table))
+    lines = [f"  {name:<{width}}  {command.summary}" for name, command in table.items()]
+    usage = [f"usage: {prog} COMMAND ...", "", "commands:", *lines, ""]
+    return "\n".join([*usage, f"`{prog} COMMAND --help` shows a command's arguments and an example."])
+
+
+def _description(function: Callable[..., Any], command: Command) -> str:
+    """The function's docstring without its section of arguments, which tyro shows itself, and the example."""
+    text = (inspect.getdoc(function) or command.summary).partition("\nArgs:")[0].strip()
+    return f"{text}\n\nExample:\n  spike4dgs {command.example}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""What ran: versions, machine, commit. Recorded beside every number, so that a number can be made again."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+
+# The libraries whose version can change a score or a speed.
+_PACKAGES = (
+    "spike4dgs torch numpy scipy numba mitsuba drjit OpenEXR scikit-image"
+    " opencv-contrib-python-headless pycolmap gsplat"
+)
+
+
+def environment(device: str) -> dict[str, Any]:
+    """Python, platform, package versions, CPU, and the GPU if `device` is one (null otherwise)."""
+    gpu, cuda = _gpu() if device_type(device) == "cuda" else (None, None)
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: found for name in _PACKAGES.split() if (found := _version(name))},
+        "cpu": _cpu(),
+        "gpu": gpu,
+        "cuda": cuda,
+    }
+
+
+def harness() -> dict[str, Any]:
+    """Version of this package; commit and dirty flag where it runs from a git checkout, null where it is installed."""
+    here = Path(__file__).resolve()
+    commit, dirty = None, None
+    # An environment inside a checkout is not the checkout: only a tracked file tells the commit it came from.
+    if _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None:
+        commit = _git(here.parent, "rev-parse", "HEAD")
+        changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no", ":/")
+        dirty = None if changes is None else bool(changes)
+    return {"version": _version("spike4dgs") or "0", "commit": commit, "dirty": dirty}
+
+
+def command_line() -> str:
+    """The command as typed, with the program's name without its folder."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def utc_now() -> str:
+    """The time as ISO 8601 in UTC, such as 2026-01-31T12:00:00Z."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def device_type(device: str) -> str:
+    """`cuda` for `cuda:1`, `cpu` for `cpu`."""
+    return device.partition(":")[0]
+
+
+def choose_device(device: str) -> str:
+    """Resolve `auto` and check that the device exists. Raises UserError where it does not."""
+    kind = device_type(device)
+    if kind not in ("auto", "cpu", "cuda"):
+        raise problem("--device", "auto, cpu or cuda", repr(device), "choose one of them")
+    if kind == "cpu":
+        return device
+    import torch
+
+    if kind == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    index = device.partition(":")[2] or "0"
+    if not index.isdigit() or int(index) >= torch.cuda.device_count():
+        raise problem("--device", "a CUDA device of this machine", repr(device), "use --device cpu")
+    return device
+
+
+def reset_peak_memory(device: str) -> None:
+    """Start a new measurement of `peak_memory_mb`."""
+    if device_type(device) == "cuda":
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+        return
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # Linux: sets the high-water mark back to the present size
+    except OSError:
+        return
+
+
+def peak_memory_mb(device: str) -> float | None:
+    """Peak memory since the reset in MB: of the GPU for a CUDA device, of the whole process otherwise.
+
+    None where the system does not tell (only Linux does for a process).
+    """
+    if device_type(device) == "cuda":
+        import torch
+
+        return float(torch.cuda.max_memory_allocated(device) / 1e6)
+    try:
+        found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    except OSError:
+        return None
+    return int(found[1]) * 1024 / 1e6 if found else None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _cpu() -> str:
+    try:
+        found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        found = None
+    return f"{found[1].strip() if found else platform.machine()}, {len(os.sched_getaffinity(0))} cores"
+
+
+def _gpu() -> tuple[str, str | None]:
+    import torch
+
+    return torch.cuda.get_device_name(), torch.version.cuda
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,0 +1,188 @@
+"""What people look at after a run: the table, the picture sheets, the scatter of quality against time."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.images import encode_srgb, read_exr
+from spike4dgs.benchmark.metrics import METRICS
+from spike4dgs.benchmark.result import Cell, Record
+from spike4dgs.benchmark.scene import Scene, Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ERROR_MAX = 0.3  # the error maps' white: larger errors look the same
+_COSTS = {
+    "fit_seconds": ("fit\ns", "{:.1f}"),
+    "render_fps": ("render\nfps", "{:.1f}"),
+    "peak_memory_mb": ("peak\nMB", "{:.0f}"),
+}
+
+
+def make_console() -> Console:
+    """A console; where the output is no terminal, one that is wide enough for the table."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=140)
+
+
+def results_table(records: Sequence[Record]) -> Table:
+    """All records as a table: one block per scene and one for the mean; the best value of a block is bold."""
+    table = Table(title="Results", caption="higher is better; a dash is a value that does not exist", box=None)
+    table.add_column("scene")
+    table.add_column("method")
+    for m in METRICS.values():
+        table.add_column(m.id.replace("_", "\n"), justify="right")
+    for title, _ in _COSTS.values():
+        table.add_column(title, justify="right")
+    scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
+    for scene in scenes:
+        cells = [(r["method"]["name"], r["scenes"][scene]) for r in records if scene in r["scenes"]]
+        _add_block(table, scene, [(name, cell["metrics"], cell) for name, cell in cells])
+    if len(scenes) > 1:
+        _add_block(table, "mean", [(r["method"]["name"], r["mean"], {}) for r in records])
+    return table
+
+
+def _add_block(table: Table, title: str, rows: list[tuple[str, dict[str, float | None], Mapping[str, Any]]]) -> None:
+    best: dict[str, float] = {}
+    for m in METRICS.values():
+        values = [v for _, metrics, _ in rows if (v := metrics[m.id]) is not None]
+        if values:
+            best[m.id] = max(values) if m.higher_is_better else min(values)
+    for i, (name, metrics, cell) in enumerate(rows):
+        texts = []
+        for m in METRICS.values():
+            text = m.format(metrics[m.id])
+            texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and metrics[m.id] == best.get(m.id, "") else text)
+        costs = ["" if cell.get(k) is None else form.format(cell[k]) for k, (_, form) in _COSTS.items()]
+        status = cell.get("status", "ok")
+        shown = escape(name) + (f" [red]({status})[/red]" if status != "ok" else "")
+        table.add_row(escape(title) if i == 0 else "", shown, *texts, *costs, end_section=i == len(rows) - 1)
+
+
+def cell_summary(cell: Cell) -> str:
+    """One line about a cell."""
+    if cell["status"] != "ok":
+        return f"{cell['status']}: {cell['error']}"
+    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic")]
+    costs = [("fit", "fit_seconds", "s"), ("render", "render_fps", "images/s"), ("peak", "peak_memory_mb", "MB")]
+    shown += [f"{name} {cell[k]:.1f} {unit}" for name, k, unit in costs if cell[k] is not None]
+    return ", ".join(shown)
+
+
+def write_sheet(path: Path, scene: Scene, folders: Mapping[str, Path], records: Sequence[Record]) -> None:
+    """Write a PNG: ground truth and every method side by side at a few ticks, error maps below, motion outlined.
+
+    `folders` maps a method to its predictions of this scene; a method without values gets a panel that says why.
+    """
+    names = list(folders)
+    cells = {r["method"]["name"]: r["scenes"][scene.id] for r in records}
+    targets = pick_targets(scene)
+    camera = scene.cameras[targets[0].camera]
+    width = 2.7
+    height = width * camera.height / camera.width
+    size = (width * (len(names) + 1), len(targets) * (2 * height + 0.62) + 0.75)
+    figure = _figure(size)
+    axes = figure.subplots(2 * len(targets), len(names) + 1, squeeze=False)
+    for row, target in enumerate(targets):
+        truth, moving = scene.ground_truth(target), scene.moving(target)
+        top, below = axes[2 * row], axes[2 * row + 1]
+        _show(top[0], encode_srgb(truth), moving)
+        top[0].set_title(f"ground truth, {scene.t_us(target.tick) / 1000:.1f} ms", fontsize=9)
+        bar = below[0]
+        for ax, ax_below, name in zip(top[1:], below[1:], names, strict=True):
+            cell = cells[name]
+            if cell["status"] != "ok":
+                _say(ax, name, f"{cell['status']}: {cell['error']}")
+                ax_below.axis("off")
+                continue
+            prediction = read_exr(folders[name] / f"{target.name}.exr")
+            _show(ax, encode_srgb(prediction), moving)
+            values = cell["per_image"][target.name]
+            psnr, dynamic = METRICS["psnr"], METRICS["psnr_dynamic"]
+            text = f"{psnr.format(values['psnr'])} dB, moving {dynamic.format(values['psnr_dynamic'])} dB"
+            ax.set_title(f"{name}\n{text}", fontsize=9)
+            error = np.abs(np.clip(prediction, 0, 1) - np.clip(truth, 0, 1))
+            _show(ax_below, error, moving, cmap="magma", vmax=_ERROR_MAX)
+        _error_scale(bar)
+    figure.suptitle(f"{scene.id}: camera {targets[0].camera}, moving region outlined", fontsize=11)
+    _save(figure, path)
+
+
+def pick_targets(scene: Scene, count: int = 3) -> list[Target]:
+    """Targets of the first held-out camera, spread over the clip without its ends."""
+    targets = sorted(t for t in scene.targets if t.camera == min(t.camera for t in scene.targets))
+    positions = (np.arange(min(count, len(targets))) + 0.5) / min(count, len(targets)) * len(targets)
+    return [targets[int(p)] for p in positions]
+
+
+def write_scatter(path: Path, records: Sequence[Record]) -> None:
+    """Write a PNG: PSNR of the whole image and of the moving region against fit time, a point per method and scene."""
+    figure = _figure((10.5, 4.4))
+    scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
+    for ax, metric in zip(figure.subplots(1, 2), ("psnr", "psnr_dynamic"), strict=True):
+        for i, record in enumerate(records):
+            for scene, marker in zip(scenes, "osD^vP*X" * len(scenes), strict=False):
+                cell = record["scenes"].get(scene)
+                if cell and cell["metrics"][metric] is not None and cell["fit_seconds"] is not None:
+                    label = record["method"]["name"]
+                    seconds = max(cell["fit_seconds"], 1e-3)  # a logarithm needs more than zero
+                    point = ax.scatter(seconds, cell["metrics"][metric], color=f"C{i % 10}", marker=marker, s=60)
+                    point.set_label(f"{label}, {scene}")
+        ax.set_xscale("log")
+        ax.set_xlabel("fit time, s")
+        ax.set_ylabel(f"{METRICS[metric].title}, {METRICS[metric].unit}")
+        ax.grid(alpha=0.3)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside right upper", fontsize=8)
+    _save(figure, path)
+
+
+def _figure(size: tuple[float, float]) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic_path(path) as part:
+        figure.savefig(part, metadata={"Software": None})
+
+
+def _show(ax: Axes, image: Any, moving: Any, cmap: str = "gray", vmax: float = 255) -> None:
+    ax.imshow(image, cmap=cmap, vmin=0, vmax=vmax, interpolation="nearest")
+    if moving.any() and not moving.all():
+        ax.contour(moving, levels=[0.5], colors="tab:cyan", linewidths=0.7)
+    ax.set_xticks([])
+    ax.set_yticks([])
+
+
+def _say(ax: Axes, name: str, text: str) -> None:
+    ax.set_title(name, fontsize=9)
+    ax.text(0.5, 0.5, textwrap.fill(text[:240], 36), ha="center", va="center", fontsize=7, transform=ax.transAxes)
+    ax.axis("off")
+
+
+def _error_scale(ax: Axes) -> None:
+    """The error maps' colours, in the place where the ground truth's error map would be."""
+    ax.axis("off")
+    scale = ax.inset_axes((0.08, 0.45, 0.84, 0.14))
+    scale.imshow(np.linspace(0, 1, 256)[None], cmap="magma", aspect="auto", extent=(0, _ERROR_MAX, 0, 1))
+    scale.set_yticks([])
+    scale.tick_params(labelsize=7)
+    scale.set_xlabel("absolute error (1 = white)", fontsize=8)

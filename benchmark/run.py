@@ -1,0 +1,239 @@
+"""`run-benchmark`: every method on every scene, then scores, table, pictures and leaderboard entries.
+
+OUT/predictions/METHOD/SCENE/   what was rendered: the only thing a later run resumes by (its content key)
+OUT/results/METHOD.json         the result records, scored from those files
+OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
+OUT/work/KEY/                   the checkpoint of an unfinished fit
+OUT/sheet_SCENE.png, OUT/scatter.png, OUT/leaderboard/
+"""
+
+from __future__ import annotations
+
+import fcntl
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.cell import Job, is_done, run_job
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.recipes import Budget, Method, find_methods
+from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
+from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
+from spike4dgs.benchmark.scene import Scene
+from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all cells of a run share."""
+
+    out: Path
+    seed: int = 0
+    device: str = "cpu"
+    budget: Budget = Budget()
+
+
+def predictions_folder(out: Path, method: str, scene: str) -> Path:
+    """Where a run keeps the predictions of a cell."""
+    return out / "predictions" / method / scene
+
+
+def run_matrix(
+    scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings, console: Console
+) -> list[Record]:
+    """Run, or resume, every method on every scene, and score everything from the files. One record per method.
+
+    A cell that fails does not stop the others: its reason is in the record and its traceback in a log file.
+    Raises UserError for scenes that are damaged or given twice, before any work begins.
+    """
+    if len({s.id for s in scenes}) < len(scenes):
+        raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    for method in methods:
+        check_method_name(method.name)
+    for scene in scenes:
+        _check_inputs(scene)
+    records = []
+    with _lock(settings.out), _Display(console, len(scenes) * len(methods)) as display:
+        for method in methods:
+            cells: dict[str, Cell] = {}
+            for scene in scenes:
+                job = Job(method, scene, settings.seed, settings.device, settings.budget)
+                cells[scene.id] = _run_cell(job, settings.out, display)
+            record = build_record(job.info, scenes, cells, settings.device)
+            write_record(settings.out / "results" / f"{method.name}.json", record)
+            records.append(record)
+    return records
+
+
+def _run_cell(job: Job, out: Path, display: _Display) -> Cell:
+    folder = predictions_folder(out, job.method.name, job.scene.id)
+    log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
+    with display.cell(f"{job.method.name} on {job.scene.id}") as shown:
+        try:
+            if is_done(job, folder):
+                shown.note("predictions are there: scored from the files")
+            else:
+                run_job(job, folder, out / "work" / job.key[:16], shown.progress, shown.note)
+            cell = score_scene(open_for(folder, job.scene), job.scene)
+            log.unlink(missing_ok=True)
+        except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
+            write_text(log, traceback.format_exc())
+            reason = str(e) if isinstance(e, UserError) else f"{type(e).__name__}: {e}"
+            cell = missing_cell("failed", f"{reason} (see logs/{log.name})"[:2000])
+        shown.note(cell_summary(cell))
+    return cell
+
+
+def _check_inputs(scene: Scene) -> None:
+    """Hash every file that the run will read. Raises UserError at the first damaged one."""
+    if not scene.targets:
+        raise problem(scene.root, "a scene with targets", "none in targets.json", "use a scene that has ground truth")
+    _ = scene.training
+    for t in scene.targets:
+        scene.manifest.path(f"images/{t.name}.exr")
+        scene.manifest.path(f"masks/{t.name}.png")
+
+
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    """Keep a second run out of the folder. The system lifts the lock when the process ends, however it ends."""
+    out.mkdir(parents=True, exist_ok=True)
+    with open(out / ".lock", "w") as f:
+        try:
+            fcntl.flock(f, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise problem(out, "a folder that no other run uses", "a run in progress", "wait for it") from None
+        yield
+
+
+class _Display:
+    """Progress on the console: bars with an estimate on a terminal, lines with one elsewhere."""
+
+    def __init__(self, console: Console, cells: int) -> None:
+        self._console, self._cells, self._done, self._start = console, cells, 0, time.perf_counter()
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+        self._bars = Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)
+        self._all = self._bars.add_task("all cells", total=cells)
+
+    def __enter__(self) -> _Display:
+        if self._console.is_terminal:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    @contextmanager
+    def cell(self, title: str) -> Iterator[_ShownCell]:
+        """Show one cell; yields what it reports to."""
+        task = self._bars.add_task(title, total=None)
+        label = f"[{self._done + 1}/{self._cells}] {title}"
+        self._console.print(label, highlight=False, markup=False)
+
+        def progress(done: int, total: int, note: str = "") -> None:
+            self._bars.update(task, completed=done, total=total, description=f"{title} {note}")
+            self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
+
+        def note(text: str) -> None:
+            self._console.print(f"    {text}", highlight=False, markup=False)
+
+        yield _ShownCell(progress, note)
+        self._done += 1
+        self._bars.remove_task(task)
+        self._bars.update(self._all, completed=self._done)
+        if left := self._cells - self._done:
+            elapsed = time.perf_counter() - self._start
+            note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
+
+
+@dataclass(frozen=True)
+class _ShownCell:
+    progress: Callable[..., None]
+    note: Callable[[str], None]
+
+
+def run_benchmark(
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    methods: tuple[str, ...] = (),
+    out: Path = Path("runs/benchmark"),
+    seed: int = 0,
+    device: str = "auto",
+    budget: float = 1.0,
+    leaderboard: Path | None = None,
+    replace: bool = False,
+    allow_gaps: bool = False,
+) -> int:
+    """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it was.
+
+    Args:
+        scenes: Scene folders.
+        methods: Methods by name; all that are installed if left out.
+        out: Folder for predictions, results, pictures and logs.
+        seed: Seed that every fit gets.
+        device: auto, cpu or cuda.
+        budget: Multiple of each method's published number of steps.
+        leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
+        replace: Replace entries of the same name in that leaderboard.
+        allow_gaps: Accept recordings with gaps.
+    """
+    known = find_methods()
+    if unknown := [m for m in methods if m not in known]:
+        raise problem("--methods", f"names among {', '.join(sorted(known))}", ", ".join(unknown), "correct the names")
+    if not known:
+        raise problem("--methods", "an installed method", "none", "install a package that registers one")
+    if not budget > 0 or budget == float("inf"):
+        raise problem("--budget", "a positive number", str(budget), "use 1 for the published setting")
+    chosen = [known[name] for name in dict.fromkeys(methods or known)]
+    settings = Settings(out, seed, choose_device(device), Budget(budget))
+    console = make_console()
+    opened = open_scenes(scenes, allow_gaps)
+    records = run_matrix(opened, chosen, settings, console)
+    console.print(results_table(records))
+    write_pictures(opened, records, out)
+    console.print(f"pictures: {out}/sheet_*.png and {out}/scatter.png", highlight=False, markup=False)
+    refused = _submit(records, scenes, settings, leaderboard, replace)
+    failed = [f"{r['method']['name']} on {s}" for r in records for s, c in r["scenes"].items() if c["status"] != "ok"]
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed or refused else 0
+
+
+def write_pictures(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
+    """Write sheet_SCENE.png for each scene, and scatter.png."""
+    for scene in scenes:
+        folders = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
+        write_sheet(out / f"sheet_{scene.id}.png", scene, folders, records)
+    write_scatter(out / "scatter.png", records)
+
+
+def _submit(
+    records: Sequence[Record], scenes: tuple[Path, ...], settings: Settings, leaderboard: Path | None, replace: bool
+) -> bool:
+    """Submit every record. True where the leaderboard refused one: the run's results stand all the same."""
+    from spike4dgs.benchmark.cli import load  # the leaderboard is another room: only the command line knows it
+
+    submit, refused = load("submit"), False
+    for name in (r["method"]["name"] for r in records):
+        try:
+            submit(
+                settings.out / "results" / f"{name}.json",
+                predictions=settings.out / "predictions" / name,
+                scenes=scenes,
+                leaderboard=leaderboard or settings.out / "leaderboard",
+                replace=replace or leaderboard is None,
+            )
+        except UserError as e:
+            print(f"error: {e}", file=sys.stderr)
+            refused = True
+    return refused

@@ -1,0 +1,45 @@
+"""Validation against the JSON Schemas that ship with the packages: one error form for every kind of file."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from spike4dgs.benchmark.errors import problem
+
+if TYPE_CHECKING:
+    from referencing.jsonschema import SchemaRegistry
+
+
+@cache
+def load_schema(package: str, name: str) -> dict[str, Any]:
+    """The JSON Schema `name` of a package of ours, such as ("spike4dgs.benchmark", "result.schema.json")."""
+    schema: dict[str, Any] = json.loads((package_files(package) / name).read_text(encoding="utf-8"))
+    return schema
+
+
+@cache
+def _registry() -> SchemaRegistry:
+    """The schemas of this package by file name, so that one may refer to parts of another."""
+    from referencing import Registry, Resource
+
+    resources: SchemaRegistry = Registry()
+    for entry in package_files("spike4dgs.benchmark").iterdir():
+        if entry.name.endswith(".schema.json"):
+            schema = load_schema("spike4dgs.benchmark", entry.name)
+            resources = resources.with_resource(entry.name, Resource.from_contents(schema))
+    return resources
+
+
+def check_schema(value: Any, schema: dict[str, Any], where: str | Path, fix: str) -> None:
+    """Raise UserError that names the first place where `value` differs from `schema` and its title."""
+    from jsonschema import Draft202012Validator
+
+    validator = Draft202012Validator(schema, registry=_registry())
+    errors = sorted(validator.iter_errors(value), key=lambda e: (list(map(str, e.absolute_path)), e.message))
+    for error in errors:
+        place = "/".join(str(p) for p in error.absolute_path) or "the top level"
+        raise problem(where, f"a valid {schema['title']}", f"at {place}: {error.message[:200]}", fix)

@@ -1,0 +1,142 @@
+"""Score a predictions folder. Reads only files: the images, the scene's ground truth and masks; never a model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.images import Float32
+from spike4dgs.benchmark.metrics import Mask, check_images, fit_gain, measure, scene_means
+from spike4dgs.benchmark.predictions import SUMS, MethodInfo, Predictions, open_predictions
+from spike4dgs.benchmark.report import make_console, results_table
+from spike4dgs.benchmark.result import Cell, Record, build_record, missing_cell, write_record
+from spike4dgs.benchmark.scene import Scene, Target, open_scene
+
+
+def score_scene(predictions: Predictions, scene: Scene) -> Cell:
+    """Score predictions against the ground truth of `scene`: one cell of a result record.
+
+    Raises UserError for damaged images on either side.
+    """
+    info = predictions.info
+    gain = fit_gain((truth, image) for _, truth, image, _ in _images(predictions, scene))
+    per_image = {
+        target.name: measure(truth, image, moving, gain, f"{predictions.root / target.name}.exr")
+        for target, truth, image, moving in _images(predictions, scene)
+    }
+    metrics, notes = scene_means(per_image)
+    return {
+        "status": "ok",
+        "metrics": metrics,
+        "notes": notes,
+        "per_image": per_image,
+        "gain_aligned": gain,
+        "predictions_sha256": predictions.sha256,
+        "fit_seconds": info.fit_seconds,
+        "render_fps": info.render_fps,
+        "peak_memory_mb": info.peak_memory_mb,
+        "budget": info.budget,
+        "device": info.device,
+        "fitted_with": {"harness": info.harness, "environment": info.environment},
+        "error": None,
+    }
+
+
+def open_for(root: Path, scene: Scene) -> Predictions:
+    """Open a predictions folder and check that it was made for this revision of this scene."""
+    if not scene.targets:
+        raise problem(scene.root, "a scene with targets", "none in targets.json", "score a scene that has ground truth")
+    predictions = open_predictions(root, scene.targets)
+    for what, found, expected in (
+        ("scene", predictions.info.scene, scene.id),
+        ("scene revision", predictions.info.scene_revision, scene.revision),
+    ):
+        if found is not None and found != expected:
+            fix = "run the method on this scene, or score with the scene it was run on"
+            raise problem(root, f"predictions for {what} {expected[:24]}", found[:24], fix)
+    return predictions
+
+
+def _images(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, Float32, Float32, Mask]]:
+    """(target, truth, prediction, moving), checked; read anew each time, so that no clip is held in memory."""
+    for target in scene.targets:
+        truth, image, moving = scene.ground_truth(target), predictions.read(target), scene.moving(target)
+        check_images(truth, image, moving, f"{predictions.root / target.name}.exr")
+        yield target, truth, image, moving
+
+
+def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
+    """Where each scene's predictions are: `root` itself for a single scene, or subfolders named by scene id."""
+    if (root / SUMS).is_file() or len(scenes) == 1 and not (root / scenes[0].id).is_dir():
+        if len(scenes) > 1:
+            fix = "give the folder that holds one predictions folder per scene id"
+            raise problem(root, f"predictions for {len(scenes)} scenes", "predictions for one", fix)
+        return {scenes[0].id: root}
+    return {s.id: root / s.id for s in scenes}
+
+
+def score_all(root: Path, scenes: Sequence[Scene]) -> Record:
+    """Score one method on several scenes. A scene without a folder counts as skipped.
+
+    Raises UserError for bad predictions, and where the folders are of different methods.
+    """
+    if not root.is_dir():
+        raise problem(root, "a predictions folder", "no such folder", "check the path or run the method")
+    if len({s.id for s in scenes}) < len(scenes):
+        raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    cells: dict[str, Cell] = {}
+    methods: dict[str, MethodInfo] = {}
+    for scene_id, folder in prediction_folders(root, scenes).items():
+        scene = next(s for s in scenes if s.id == scene_id)
+        if folder.is_dir():
+            predictions = open_for(folder, scene)
+            cells[scene_id] = score_scene(predictions, scene)
+            methods[scene_id] = predictions.info.method
+        else:
+            cells[scene_id] = missing_cell("skipped", f"no predictions folder {folder.name}")
+    if not methods:
+        names = ", ".join(s.id for s in scenes)
+        raise problem(root, f"a predictions folder for {names}", "none", "check the paths of predictions and scenes")
+    return build_record(_one_method(methods, root), scenes, cells, "cpu")
+
+
+def _one_method(methods: dict[str, MethodInfo], root: Path) -> MethodInfo:
+    first = next(iter(methods.values()))
+    for scene, method in methods.items():
+        if method != first:
+            fix = "give all scenes the same method, version, parameters and seed"
+            raise problem(root, f"one method ({first.name})", f"another or another setting for {scene}", fix)
+    return first
+
+
+def open_scenes(paths: Sequence[Path], allow_gaps: bool = False) -> list[Scene]:
+    """Open the scenes of a command line. Raises UserError where there is none."""
+    if not paths:
+        raise problem("scenes", "at least one scene folder", "none", "make one with `spike4dgs make-dataset`")
+    return [open_scene(p, allow_gaps) for p in paths]
+
+
+def score(
+    predictions: Positional[Path],
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    out: Path | None = None,
+    allow_gaps: bool = False,
+) -> int:
+    """Score predictions, of any program, from their files.
+
+    Args:
+        predictions: Predictions folder (images, SHA256SUMS, prediction.json); for several scenes, the folder that
+            holds one predictions folder per scene id.
+        scenes: Scene folders.
+        out: Write the result record to this file.
+        allow_gaps: Accept recordings with gaps.
+    """
+    record = score_all(predictions, open_scenes(scenes, allow_gaps))
+    make_console().print(results_table([record]))
+    if out:
+        write_record(out, record)
+    return 0
