@@ -5,6 +5,7 @@ The predictions are what a run keeps and resumes by; scores are always computed 
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,8 +114,7 @@ def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callab
                 created=utc_now(),
             )
         )
-    for leftover in (checkpoint, clock.path):
-        leftover.unlink(missing_ok=True)
+    shutil.rmtree(work)
 
 
 def _render(model: Model, camera: Camera, t_us: float, where: str) -> NDArray[np.float32]:

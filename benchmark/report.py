@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -92,8 +92,8 @@ def write_sheet(path: Path, scene: Scene, folders: Mapping[str, Path], records: 
     camera = scene.cameras[targets[0].camera]
     width = 2.7
     height = width * camera.height / camera.width
-    size = (width * (len(names) + 1), len(targets) * (2 * height + 0.62) + 0.75)
-    figure = _figure(size)
+    size = (width * (len(names) + 1), len(targets) * (2 * height + 0.5) + 0.6)
+    figure = _figure(size, "compressed")
     axes = figure.subplots(2 * len(targets), len(names) + 1, squeeze=False)
     for row, target in enumerate(targets):
         truth, moving = scene.ground_truth(target), scene.moving(target)
@@ -150,11 +150,11 @@ def write_scatter(path: Path, records: Sequence[Record]) -> None:
     _save(figure, path)
 
 
-def _figure(size: tuple[float, float]) -> Figure:
+def _figure(size: tuple[float, float], layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    figure = Figure(figsize=size, dpi=110, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 

@@ -225,10 +225,11 @@ def _submit(
 
     submit, refused = load("submit"), False
     for name in (r["method"]["name"] for r in records):
+        predictions = settings.out / "predictions" / name
         try:
             submit(
                 settings.out / "results" / f"{name}.json",
-                predictions=settings.out / "predictions" / name,
+                predictions=predictions if predictions.is_dir() else None,
                 scenes=scenes,
                 leaderboard=leaderboard or settings.out / "leaderboard",
                 replace=replace or leaderboard is None,
