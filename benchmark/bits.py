@@ -4,6 +4,8 @@ Two ideas carry everything. A table turns a byte into one machine word that hold
 (`lanes`), so that one 64-bit addition adds eight pixels. And a vertical counter keeps bit k of every pixel's count in
 plane k, so that one bitwise operation on a plane serves every pixel of a vector register.
 
+Three habits keep LLVM's vectoriser at work: inner loops are small functions over one-dimensional arrays, with unsigned
+indices (no test for negative ones), and they load before they choose (`a if fired else b` on values, not on elements).
 The kernels release the GIL and work on plain arrays and memory maps. The ranges that threads work on never overlap in
 the output, so the number of threads changes no bit of it.
 """
@@ -28,8 +30,8 @@ _SMALL = 1 << 21  # bytes of input below which starting threads costs more than 
 
 
 def kernel(function: F) -> F:
-    """Compile with numba: no GIL, cached on disk."""
-    return cast(F, numba.njit(nogil=True, cache=True)(function))
+    """Compile with numba: no GIL, cached on disk; 1 / 0 is infinity, as in numpy, because a test would stop vectors."""
+    return cast(F, numba.njit(nogil=True, cache=True, error_model="numpy")(function))
 
 
 def in_threads(function: Callable[..., None], n: int, *args: object, small: bool = False) -> None:
@@ -65,7 +67,7 @@ def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:
 
 
 @kernel
-def _count(packed, table, counts, start, stop):  # type: ignore[no-untyped-def]
+def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int, stop: int) -> None:
     n = len(packed)
     words = counts.view(np.uint64)  # four uint16 counts each
     planes = np.empty((8, _BLOCK), np.uint8)
@@ -95,21 +97,45 @@ def _count(packed, table, counts, start, stop):  # type: ignore[no-untyped-def]
 def unpack(packed: UInt8, width: int, height: int, flip: bool) -> UInt8:
     """Unpack rows [n, bytes] to [n, height, width] of 0 and 1, with the rows in reverse order if `flip`."""
     out = np.empty((len(packed), height, width), np.uint8)
-    in_threads(_unpack, len(packed), rows(packed), lanes(1)[:, 0].copy(), flip, out, small=packed.size < _SMALL // 8)
+    small = packed.size < _SMALL // 8
+    if width % 8 == 0:
+        in_threads(_unpack_bytes, len(packed), rows(packed), lanes(1)[:, 0], flip, out.view(np.uint64), small=small)
+    else:
+        in_threads(_unpack_any, len(packed), rows(packed), lanes(1)[:, 0], flip, out, small=small)
     return out
 
 
 @kernel
-def _unpack(packed, table, flip, out, start, stop):  # type: ignore[no-untyped-def]
-    height, width = out.shape[1:]
-    words = np.empty(width, np.uint64)  # eight rows are `width` bytes: whole bytes at any width
-    flat = words.view(np.uint8)
+def _unpack_bytes(packed: UInt8, table: UInt64, flip: bool, out: UInt64, start: int, stop: int) -> None:
+    height, words = out.shape[1:]
     for t in range(start, stop):
-        for first in range(0, height, 8):
-            n_rows = min(8, height - first)
-            source = packed[t, first // 8 * width :]
-            for j in range((n_rows * width + 7) // 8):
-                words[j] = table[source[j]]
-            for r in range(n_rows):
-                y = height - 1 - first - r if flip else first + r
-                out[t, y] = flat[r * width : (r + 1) * width]
+        for y in range(height):  # in the order of the output: writing downwards takes twice as long
+            r = height - 1 - y if flip else y
+            expand(packed[t, r * words : (r + 1) * words], table, out[t, y])
+
+
+@kernel
+def _unpack_any(packed: UInt8, table: UInt64, flip: bool, out: UInt8, start: int, stop: int) -> None:
+    height, width = out.shape[1:]
+    words = np.empty(packed.shape[1], np.uint64)  # one tick, because here rows do not begin on whole bytes
+    for t in range(start, stop):
+        expand(packed[t], table, words)
+        _copy_rows(words.view(np.uint8), flip, out[t])
+
+
+@kernel
+def expand(source: UInt8, table: UInt64, words: UInt64) -> None:
+    """Set words[j] = table[source[j]]: bytes [n] to words [n] of eight lanes each."""
+    for j in range(len(source)):
+        words[np.uint64(j)] = table[source[np.uint64(j)]]
+
+
+@kernel
+def _copy_rows(flat: UInt8, flip: bool, image: UInt8) -> None:
+    """Copy stored pixels [>= H * W] to an image [H, W], in reverse order of rows if `flip`."""
+    height, width = image.shape
+    for y in range(height):
+        first = (height - 1 - y if flip else y) * width
+        row = image[y]
+        for x in range(width):
+            row[np.uint64(x)] = flat[np.uint64(first + x)]

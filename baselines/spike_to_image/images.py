@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes import SpikeStream
 
