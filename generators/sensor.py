@@ -26,6 +26,7 @@ count by at most one spike. No fused multiply-add is used, so every processor gi
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -83,25 +84,18 @@ def simulate(
     per_batch = max(1, _BATCH_BYTES // (4 * len(state)))
     n_intervals = int(np.searchsorted(ticks, n_ticks))
     window = np.zeros((per_batch + 3, len(state)), dtype=np.float32)
-    tangents = _tangent_weights(ticks)
+    tangents, bounds = _tangent_weights(ticks), _shares(blocks, threads)
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
             last = min(first + per_batch, n_intervals)
             _fill(window, keys, first, last, len(ticks))
             end = min(int(ticks[last]), n_ticks)
             words = np.empty((end - ticks[first], blocks), dtype=np.uint64)
-            work = (
-                window,
-                ticks[first : last + 1],
-                tangents[first:last],
-                sensor.radiance_gain,
-                gain,
-                dark,
-                state,
-                words,
-            )
-            bounds = _shares(blocks, threads)
-            list(pool.map(lambda a, b, w=work: integrate(*w, a, b), bounds[:-1], bounds[1:]))  # list: raise errors
+            batch = window, ticks[first : last + 1], tangents[first:last]
+            camera = sensor.radiance_gain, gain, dark, state
+            jobs = [pool.submit(integrate, *batch, *camera, words, a, b) for a, b in itertools.pairwise(bounds)]
+            for job in jobs:
+                job.result()
             yield words.view(np.uint8)[:, : bytes_per_tick(width, height)]
 
 
