@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ def environment(device: str) -> dict[str, Any]:
     }
 
 
+@cache
 def harness() -> dict[str, Any]:
     """Version of this package; commit and dirty flag where it runs from a git checkout, null where it is installed."""
     here = Path(__file__).resolve()
