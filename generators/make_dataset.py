@@ -1,0 +1,166 @@
+"""`make-dataset`: render worlds, simulate their spike cameras, write scene folders."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from spike4dgs.generators.scene_maker import Job
+
+T = TypeVar("T")
+_LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
+
+
+def make_dataset(
+    worlds: Positional[tuple[str, ...]],
+    *,
+    profile: str = "small",
+    out: Path = Path("data"),
+    seed: int = 0,
+    variant: int = 0,
+    seconds: float | None = None,
+    gain_map: bool = True,
+    dark_map: bool = True,
+    replace: bool = False,
+) -> int:
+    """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
+
+    A killed run goes on where it was when the same command is given again. A scene that is there already is checked
+    and kept. OUT/ID.report.json tells what the stages took. Equal arguments give equal bytes.
+
+    Example: spike4dgs make-dataset car turntable --profile small --out data
+
+    Args:
+        worlds: Names of worlds: car, turntable.
+        profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
+        out: Folder in which the scene folders appear.
+        seed: Seed of everything random: the world's details, the rendering, the sensors.
+        variant: Variant of the world; 0 is the public benchmark.
+        seconds: Length of the clip if not the profile's, in whole milliseconds.
+        gain_map: Give every pixel its own sensitivity.
+        dark_map: Give every pixel its own dark rate.
+        replace: Make scenes again that are there with other settings or damaged.
+    """
+    from rich.console import Console
+
+    from spike4dgs.benchmark.files import write_json
+    from spike4dgs.generators.scene_maker import Maker
+
+    console = Console(highlight=False, soft_wrap=True)
+    jobs = [_job(w, profile, seed, variant, seconds, (gain_map, dark_map)) for w in dict.fromkeys(worlds)]
+    if not jobs:
+        raise problem("worlds", "at least one world", "none", f"choose among {_names()}")
+    if seed < 0 or variant < 0:
+        raise problem("--seed and --variant", "numbers from 0 up", f"{seed}, {variant}", "correct them")
+    todo = [job for job in jobs if not _is_done(job, out, replace)]
+    for job in jobs:
+        if job not in todo:
+            console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}", markup=False)
+    for job in todo:
+        start = time.perf_counter()
+        with _stages(console, job.id) as watch:
+            maker = Maker(job, out, watch)
+            folder = maker.make()
+        total = time.perf_counter() - start
+        report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}
+        write_json(out / f"{job.id}.report.json", report)
+        console.print(f"{job.id}: {total:.0f} s, written to {folder}", markup=False)
+    return 0
+
+
+def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, maps: tuple[bool, bool]) -> Job:
+    from spike4dgs.generators.scene_maker import Job
+    from spike4dgs.generators.worlds import WORLDS
+
+    if world not in WORLDS:
+        raise problem("world", f"one of {_names()}", repr(world), "correct the name")
+    if profile not in PROFILES:
+        raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(profile), "correct the name")
+    length = PROFILES[profile].seconds if seconds is None else seconds
+    ticks = length * RATE_HZ if math.isfinite(length) else -1.0
+    if ticks < 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
+        fix = "give seconds such as 0.02"
+        raise problem("--seconds", "whole milliseconds, at least 0.002", str(seconds), fix)
+    length = round(ticks) / RATE_HZ
+    return Job(world, variant, seed, profile, PROFILES[profile], length, *maps)
+
+
+def _names() -> str:
+    from spike4dgs.generators.worlds import WORLDS
+
+    return ", ".join(WORLDS)
+
+
+def _is_done(job: Job, out: Path, replace: bool) -> bool:
+    """Whether the scene is there, whole, with these settings.
+
+    Raises UserError where something else has its name, and, unless `replace`, for a damaged scene or other settings.
+    """
+    from spike4dgs.benchmark.files import read_json
+    from spike4dgs.benchmark.manifest import read_manifest
+    from spike4dgs.benchmark.scene import SCHEMA
+
+    folder = out / job.id
+    if not folder.exists():
+        return False
+    meta = read_json(folder / "scene.json", "a scene") if (folder / "scene.json").is_file() else {}
+    if meta.get("schema") != SCHEMA or meta.get("id") != job.id:
+        raise problem(folder, f"scene {job.id} or nothing", "something else", "move it away or choose another --out")
+    if replace:
+        return False
+    source = meta.get("source", {})
+    different = [k for k, v in job.settings.items() if source.get(k) != v]
+    if different:
+        found = ", ".join(f"{k} {source.get(k)!r} instead of {job.settings[k]!r}" for k in different)
+        raise problem(folder, "a scene with these settings", found, "pass --replace to make it again")
+    for line in read_manifest(folder).problems():
+        raise problem(folder, "an undamaged scene", line, "pass --replace to make it again")
+    return True
+
+
+@contextmanager
+def _stages(console: Any, title: str) -> Iterator[Any]:
+    """Show stages with their remaining time: bars on a terminal, now and then a line elsewhere."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as Left
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("left"), Left(), console=console, disable=not console.is_terminal) as bars:
+
+        def watch(stage: str, steps: Iterable[T], total: int) -> Iterator[T]:
+            return _bar(bars, f"{title}: {stage}", steps, total)
+
+        def lines(stage: str, steps: Iterable[T], total: int) -> Iterator[T]:
+            return _lines(console, f"{title}: {stage}", steps, total)
+
+        yield watch if console.is_terminal else lines
+
+
+def _bar(bars: Progress, title: str, steps: Iterable[T], total: int) -> Iterator[T]:
+    task = bars.add_task(title, total=total)
+    for step in steps:
+        yield step
+        bars.advance(task)
+
+
+def _lines(console: Any, title: str, steps: Iterable[T], total: int) -> Iterator[T]:
+    start = shown = time.perf_counter()
+    for done, step in enumerate(steps, start=1):
+        yield step
+        now = time.perf_counter()
+        if done == total or now - shown > _LINE_EVERY_S:
+            shown = now
+            left = (now - start) / done * (total - done)
+            console.print(f"{title} {done}/{total}, {now - start:.0f} s, about {left:.0f} s left", markup=False)
