@@ -1,0 +1,56 @@
+"""The floor `nearest-view`: the picture that the nearest training camera takes at that time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.recipes import Budget, Progress
+from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.method.fit import ImageMaker
+
+
+@dataclass(frozen=True, eq=False)
+class NearestViewModel:
+    """Nothing is fitted: pictures are made from the training streams when they are asked for."""
+
+    scene: TrainingScene
+    images: ImageMaker
+
+    def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
+        """The picture [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
+        distances = [float(np.linalg.norm(c.center - camera.center)) for c in self.scene.cameras]
+        # Rounded to a micrometre: equals on paper must not be told apart by the last bit.
+        nearest = int(np.argmin(np.round(distances, 6)))
+        return self.images(self.scene.streams[nearest], [self.scene.tick(t_us)], self.scene.radiance_gain)[0]
+
+
+@dataclass
+class NearestView:
+    """`benchmark.recipes.Method` without any reconstruction: what a method must beat to be worth its time."""
+
+    name: str
+    images: ImageMaker
+    images_name: str
+    params: dict[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.params = {"name": self.name, "images": self.images_name}
+
+    def fit(
+        self,
+        scene: TrainingScene,
+        budget: Budget,
+        device: str,
+        seed: int,
+        progress: Progress,
+        checkpoint: Path | None = None,
+    ) -> NearestViewModel:
+        """Return the model at once; `budget`, `device`, `seed` and `checkpoint` have nothing to act on."""
+        progress(1, 1)
+        return NearestViewModel(scene, self.images)

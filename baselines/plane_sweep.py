@@ -1,0 +1,152 @@
+"""Depth maps of a calibrated array by plane sweep, and the points on which several views agree.
+
+For a reference view, planes parallel to its image are swept over inverse depth; the other views' pictures are warped
+onto each plane and compared by zero-mean normalised cross-correlation. No depth range is given: it is found by a
+coarse sweep from infinity to the parallax at which the views would hardly overlap any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+WINDOW = 5  # px, side of the correlation window: small enough for thin things at 125x200
+NOISE = 4e-4  # variance of a picture's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
+PARALLAX_STEP = 1.0  # px of parallax of the widest pair between planes; peaks are refined below it
+MAX_PARALLAX = 0.6  # of the image's width, of the widest pair: nearer things are seen by too few views to match
+MIN_SCORE = 0.4  # mean correlation over the other views below which a depth is not believed
+AGREE_PX = 1.5  # px of parallax between two views' depths of one point that still counts as agreement
+MIN_AGREE = 2  # other views that must agree
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A reference view's inverse depth [H, W] in 1/m and how well the other views match there [H, W], -1 to 1."""
+
+    inverse: Float32
+    score: Float32
+
+
+def widest_baseline(cameras: Sequence[Camera]) -> float:
+    """Largest distance between two cameras, m."""
+    centers = np.stack([c.center for c in cameras])
+    return float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+
+
+def inverse_depth_step(cameras: Sequence[Camera]) -> float:
+    """Difference of inverse depth, 1/m, that shifts a point by `PARALLAX_STEP` px in the widest pair."""
+    return PARALLAX_STEP / (cameras[0].fx * widest_baseline(cameras))
+
+
+def full_range(cameras: Sequence[Camera]) -> Float64:
+    """Inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
+    step = inverse_depth_step(cameras)
+    planes = int(MAX_PARALLAX * cameras[0].width / PARALLAX_STEP)
+    return step * np.arange(planes + 1)
+
+
+def narrow_range(maps: Sequence[DepthMap], planes: Float64) -> Float64:
+    """The part of `planes` in which the depths that are believed lie, with a margin of four planes."""
+    found = np.concatenate([m.inverse[m.score > MIN_SCORE] for m in maps])
+    if not len(found):
+        return planes
+    low, high = np.quantile(found, [0.002, 0.998])
+    step = planes[1] - planes[0]
+    return planes[(planes >= low - 4 * step) & (planes <= high + 4 * step)]
+
+
+def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> Float64:
+    """Pixels of `reference`, seen on the plane z = 1 / inverse_depth of its frame, to pixels of `other`: [3, 3].
+
+    x' ~ K' (R + t w n^T) K^-1 x with the relative pose (R, t), w the inverse depth and n the optical axis.
+    Coordinates have pixel centres at +0.5.
+    """
+    R = other.R @ reference.R.T
+    t = other.t - R @ reference.t
+    return other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K)
+
+
+def sweep(cameras: Sequence[Camera], pictures: Float32, index: int, planes: Float64) -> DepthMap:
+    """Depth of view `index` from all other views; pictures [C, H, W], inverse depths `planes` ascending."""
+    reference, height, width = pictures[index], *pictures.shape[1:]
+    mean = _box(reference)
+    variance = _box(reference * reference) - mean * mean
+    scores = np.zeros((len(planes), height, width), np.float32)
+    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
+    for plane, w in enumerate(planes):
+        total, seen = scores[plane], np.zeros((height, width), np.float32)
+        for other in range(len(cameras)):
+            if other == index:
+                continue
+            H = np.linalg.inv(centre) @ plane_homography(cameras[index], cameras[other], float(w)) @ centre
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            warped = cv2.warpPerspective(
+                pictures[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
+            )
+            inside = warped >= 0
+            total += np.maximum(_correlation(reference, mean, variance, warped), 0) * inside
+            seen += inside
+        total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
+    return _peak(scores, planes)
+
+
+def _box(image: Float32) -> Float32:
+    return cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT)
+
+
+def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32) -> Float32:
+    mean_b = _box(b)
+    variance_b = _box(b * b) - mean_b * mean_b
+    both = _box(a * b) - mean_a * mean_b
+    return both / np.sqrt((variance_a + NOISE) * (variance_b + NOISE))
+
+
+def _peak(scores: Float32, planes: Float64) -> DepthMap:
+    """Best plane per pixel with a parabola through its neighbours."""
+    best = scores.argmax(axis=0)
+    inner = np.clip(best, 1, len(planes) - 2)
+
+    def at(i: NDArray[np.intp]) -> Float32:
+        return np.take_along_axis(scores, i[None], axis=0)[0]
+
+    left, middle, right = at(inner - 1), at(inner), at(inner + 1)
+    curvature = left - 2 * middle + right
+    shift = np.where(curvature < -1e-6, 0.5 * (left - right) / np.minimum(curvature, -1e-6), 0.0)
+    position = np.where(inner == best, inner + np.clip(shift, -0.5, 0.5), best)
+    inverse = planes[0] + position * (planes[1] - planes[0])
+    return DepthMap(inverse.astype(np.float32), at(best))
+
+
+def lift(camera: Camera, inverse: Float32, pixels: NDArray[np.bool_]) -> Float64:
+    """World points [N, 3] of the masked pixels, at their inverse depths."""
+    v, u = np.nonzero(pixels)
+    depth = 1 / np.maximum(inverse[v, u].astype(np.float64), 1e-9)
+    return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
+
+
+def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> NDArray[np.bool_]:
+    """Pixels [H, W] of view `index` whose depth at least `MIN_AGREE` other views see at the same place."""
+    camera, own = cameras[index], maps[index]
+    believed = (own.score > MIN_SCORE) & (own.inverse > 0)
+    points = lift(camera, own.inverse, believed)
+    votes = np.zeros(len(points), np.int64)
+    tolerance = AGREE_PX / PARALLAX_STEP * inverse_depth_step(cameras)
+    for other, other_map in enumerate(maps):
+        if other == index:
+            continue
+        uv, z = cameras[other].project(points)
+        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [cameras[other].width, cameras[other].height]).all(axis=1)
+        u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+        inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+        votes += inside & (np.abs(other_map.inverse[v, u] - inverse) < tolerance)
+    believed[believed] = votes >= MIN_AGREE
+    return believed

@@ -1,0 +1,147 @@
+"""The initialisation `rig`: the calibrated poses, and points by plane sweep over the training views.
+
+Static pixels are matched on the mean of the whole clip, where the spikes' quantisation noise has averaged out. Pixels
+that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
+ends those that are quiet just then, which is the background that something moving hides in the middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from spike4dgs.baselines.plane_sweep import DepthMap, agreed, full_range, lift, narrow_range, sweep
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.fit import Start
+
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
+CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
+CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
+
+
+def rig(scene: TrainingScene, seed: int) -> Start:
+    """First points of a scene; see the module. Nothing is random, `seed` is not used."""
+    mean = np.stack([_rate(s, 0, scene.n_ticks) for s in scene.streams]) / np.float32(scene.radiance_gain)
+    windows = _windows(scene.n_ticks)
+    counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
+    moving = [_moving(np.stack(c)) for c in counts]
+    planes = full_range(scene.cameras)
+    maps = _sweep_all(scene.cameras, mean, planes)
+    planes = narrow_range(maps, planes)
+    clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
+    if any(m.any() for m in moving):
+        for place in (len(windows) // 2, 0, len(windows) - 1):
+            pictures = np.stack([c[place] for c in counts]) / np.float32(scene.radiance_gain * WINDOW_TICKS)
+            pixels = moving
+            if place != len(windows) // 2:
+                near = slice(max(0, place - 1), place + 2)
+                pixels = [m & ~_moving(np.stack(c[near])) for m, c in zip(moving, counts, strict=True)]
+            short = _sweep_all(scene.cameras, pictures.astype(np.float32), planes)
+            clouds.append(_points(scene.cameras, short, pictures, pixels))
+    points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
+    points, values = _thin(scene.cameras, points, values)
+    points, values = _fill(scene.cameras, mean, points, values)
+    return Start(scene.cameras, points.astype(np.float32), values.astype(np.float32))
+
+
+def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
+    """Mean spikes per tick [H, W]; clips of any length are counted in parts."""
+    parts = range(start, stop, 65535)
+    total = sum(stream.counts(a, min(a + 65535, stop)).astype(np.float64) for a in parts)
+    return (total / (stop - start)).astype(np.float32)
+
+
+def _windows(n_ticks: int) -> list[tuple[int, int]]:
+    count = max(1, n_ticks // WINDOW_TICKS)
+    return [(i * WINDOW_TICKS, min((i + 1) * WINDOW_TICKS, n_ticks)) for i in range(count)]
+
+
+def _moving(counts: NDArray[np.int64]) -> Mask:
+    """Pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
+    changed = (counts.max(axis=0) - counts.min(axis=0) >= CHANGE).astype(np.uint8)
+    opened = cv2.medianBlur(changed, 3)  # single pixels are noise
+    return cv2.dilate(opened, np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def _sweep_all(cameras: Sequence[Camera], pictures: Float32, planes: NDArray[np.float64]) -> list[DepthMap]:
+    return [sweep(cameras, pictures, i, planes) for i in range(len(cameras))]
+
+
+def _points(
+    cameras: Sequence[Camera], maps: Sequence[DepthMap], pictures: Float32, pixels: Sequence[Mask]
+) -> tuple[NDArray[np.float64], Float32]:
+    """World points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
+    points, values = [], []
+    for i, camera in enumerate(cameras):
+        chosen = agreed(cameras, maps, i) & pixels[i]
+        points.append(lift(camera, maps[i].inverse, chosen))
+        values.append(pictures[i][chosen])
+    return np.concatenate(points), np.concatenate(values)
+
+
+def middle_camera(cameras: Sequence[Camera]) -> Camera:
+    """A camera between all others: their mean centre and the rotation nearest to their mean rotation."""
+    u, _, vt = np.linalg.svd(np.mean([c.R for c in cameras], axis=0))
+    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    first = cameras[0]
+    center = np.mean([c.center for c in cameras], axis=0)
+    return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
+
+
+def _thin(
+    cameras: Sequence[Camera], points: NDArray[np.float64], values: Float32
+) -> tuple[NDArray[np.float64], Float32]:
+    """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
+    uv, z = middle_camera(cameras).project(points)
+    step = full_range(cameras)[1] * 2  # 2 px of parallax in the widest pair
+    keep = z > 0
+    cells = np.column_stack([np.floor(uv[keep] / CELL_PX), np.floor(1 / (z[keep] * step))]).astype(np.int64)
+    _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+
+    def mean(x: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.bincount(inverse, weights=x, minlength=len(count)) / count
+
+    merged = np.stack([mean(axis) for axis in points[keep].T], axis=-1)
+    believed = count >= 2  # seen from one view only: not worth a Gaussian
+    return merged[believed], mean(values[keep])[believed].astype(np.float32)
+
+
+def _fill(
+    cameras: Sequence[Camera], mean: Float32, points: NDArray[np.float64], values: Float32
+) -> tuple[NDArray[np.float64], Float32]:
+    """Add points where the middle camera sees none, at the inverse depth of the nearest point in its image."""
+    camera = middle_camera(cameras)
+    uv, z = camera.project(points)
+    # The picture's border too: outer views see beyond the middle one.
+    margin = 0.1 * np.array([camera.width, camera.height])
+    axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    if not len(points):
+        far = full_range(cameras)[1]
+        return camera.unproject(grid, np.full(len(grid), 1 / far)), np.full(len(grid), mean.mean(), np.float32)
+    distance, nearest = cKDTree(uv).query(grid, k=5)
+    empty = distance[:, 0] > 2.0
+    depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
+    added = camera.unproject(grid[empty], depth)
+    seen = np.stack([_look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
+    visible = np.isfinite(seen).any(axis=0)
+    added, seen = added[visible], seen[:, visible]
+    return np.concatenate([points, added]), np.concatenate([values, np.nanmedian(seen, axis=0).astype(np.float32)])
+
+
+def _look_up(camera: Camera, picture: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gray value [N] of the pixel that sees each point; NaN outside the picture."""
+    uv, z = camera.project(points)
+    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+    u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    return np.where(inside, picture[v, u], np.nan)

@@ -1,0 +1,165 @@
+"""The Gaussians of a scene: raw parameters, activations, and edits that change their number.
+
+An edit says for each new row which old row its optimiser state continues (`source`, -1 starts afresh), so that every
+way of adding and removing Gaussians keeps Adam's moments consistent by one rule (`optimizer.apply_edit`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.splat import Splats
+from spike4dgs.method.splat.reference import rotation_matrices
+
+SPLIT_SHRINK = 1.6  # a split Gaussian's two halves are this much smaller (3DGS)
+MAX_COPIES = 51  # the relocation formula's alternating sum is evaluated up to this many copies (MCMC)
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians as raw parameters, which an optimiser may push anywhere: activations make them valid."""
+
+    means: Tensor  # [N, 3] m
+    log_scales: Tensor  # [N, 3] natural logarithm of the standard deviations in m
+    quats: Tensor  # [N, 4] wxyz, any length but 0
+    logits: Tensor  # [N] opacity before the sigmoid
+    colors: Tensor  # [N, 1] gray linear radiance, 1.0 = white, no activation
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The parameters by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def rows(self, index: Tensor) -> Gaussians:
+        """The Gaussians of `index` (integers or a mask), detached."""
+        return Gaussians(**{k: v.detach()[index] for k, v in self.tensors().items()})
+
+    def trainable(self) -> Gaussians:
+        """Detached copies that require gradients."""
+        return Gaussians(
+            **{k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()}
+        )
+
+    def splats(self) -> Splats:
+        """Activated values for the renderer."""
+        return Splats(self.means, self.quats, self.log_scales.exp(), self.logits.sigmoid(), self.colors)
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """The Gaussians after a change; `source` [M] is the old row whose optimiser moments a new row keeps, or -1."""
+
+    gaussians: Gaussians
+    source: Tensor
+
+
+def concatenate(parts: list[Gaussians]) -> Gaussians:
+    """Gaussians one after another."""
+    return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
+
+
+def from_points(
+    points: NDArray[np.float32], values: NDArray[np.float32], *, opacity: float, device: str = "cpu"
+) -> Gaussians:
+    """Round Gaussians at points [N, 3] with gray values [N], as wide as the mean distance of their 3 nearest points.
+
+    Raises UserError for fewer than 4 points or values that are not finite.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) < 4 or not (np.isfinite(points).all() and np.isfinite(values).all()):
+        finite = int(np.isfinite(points).all(axis=1).sum())
+        raise problem("initialization", "at least 4 finite points", f"{finite}", "check the poses and the streams")
+    distance = cKDTree(points).query(points, k=4)[0][:, 1:].mean(axis=1)  # [N]
+    distance = np.maximum(distance, 1e-6 * float(np.ptp(points, axis=0).max()) + 1e-9)  # coincident points
+    n = len(points)
+
+    def tensor(a: NDArray[np.floating]) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32, device=device)
+
+    return Gaussians(
+        means=tensor(points),
+        log_scales=tensor(np.repeat(np.log(distance)[:, None], 3, axis=1)),
+        quats=tensor(np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (n, 1))),
+        logits=tensor(np.full(n, math.log(opacity / (1 - opacity)))),
+        colors=tensor(values[:, None]),
+    )
+
+
+def prune(gaussians: Gaussians, keep: Tensor) -> Edit:
+    """Keep the Gaussians of the mask `keep` [N]."""
+    index = torch.nonzero(keep)[:, 0]
+    return Edit(gaussians.rows(index), index)
+
+
+def densify(gaussians: Gaussians, clone: Tensor, split: Tensor, generator: torch.Generator) -> Edit:
+    """Duplicate the Gaussians of the mask `clone` [N]; replace those of `split` [N] by two drawn from them.
+
+    Clones start at the same place and are driven apart by the optimiser; the halves of a split are samples of the
+    Gaussian with scales divided by 1.6 (3DGS). Old rows keep their order and moments, new rows follow.
+    """
+    keep, cloned, halved = (torch.nonzero(m)[:, 0] for m in (~split, clone & ~split, split))
+    twice = gaussians.rows(halved.repeat(2))
+    scales = twice.log_scales.exp()
+    noise = torch.randn(scales.shape, generator=generator).to(scales)
+    offset = torch.einsum("nij,nj->ni", rotation_matrices(twice.quats), noise * scales)
+    halves = Gaussians(
+        twice.means + offset, twice.log_scales - math.log(SPLIT_SHRINK), twice.quats, twice.logits, twice.colors
+    )
+    source = torch.cat([keep, keep.new_full((len(cloned) + len(halves),), -1)])
+    return Edit(concatenate([gaussians.rows(keep), gaussians.rows(cloned), halves]), source)
+
+
+def relocate(gaussians: Gaussians, dead: Tensor, generator: torch.Generator) -> Edit:
+    """Move the Gaussians of the mask `dead` [N] onto living ones, drawn in proportion to their opacity.
+
+    A living Gaussian that receives copies shares its opacity and scale with them such that the sum looks as it did
+    before (`share`). Its moments and theirs start afresh. The number of Gaussians does not change.
+    """
+    gone, living = torch.nonzero(dead)[:, 0], torch.nonzero(~dead)[:, 0]
+    source = torch.arange(len(gaussians), device=dead.device)
+    values = gaussians.rows(source)
+    if not len(gone) or not len(living):
+        return Edit(values, source)
+    weights = values.logits[living].sigmoid().cpu()
+    drawn = living[torch.multinomial(weights, len(gone), replacement=True, generator=generator).to(living.device)]
+    copies = torch.bincount(drawn, minlength=len(gaussians)) + 1  # [N] Gaussians that now share each place
+    opacity, shrink = share(values.logits[drawn].sigmoid(), copies[drawn])
+    moved = values.rows(drawn)
+    logits, log_scales = torch.logit(opacity), moved.log_scales + shrink.log()[:, None]
+    for index in (gone, drawn):
+        values.logits[index], values.log_scales[index] = logits, log_scales
+    for name in ("means", "quats", "colors"):
+        getattr(values, name)[gone] = getattr(moved, name)
+    source[gone], source[drawn] = -1, -1
+    return Edit(values, source)
+
+
+def share(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity [K] and scale factor [K] of `copies` [K] coincident Gaussians that replace one of `opacity` [K].
+
+    With n copies (Kheradmand et al. 2024, eq. 9): o' = 1 - (1 - o)^(1/n) keeps the opacity at the centre, and
+    s'/s = o / sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) keeps the integral along a line.
+    """
+    n = copies.clamp(1, MAX_COPIES)
+    o = opacity.double().clamp(1e-6, 1 - 1e-6)
+    new = 1 - (1 - o) ** (1 / n)
+    # Swapping the sums leaves one: sum over i of binom(i-1, k) for i <= n is binom(n, k+1).
+    k = torch.arange(MAX_COPIES, dtype=torch.float64, device=o.device)
+    binomial = _log_binomial(n.double()[:, None], k + 1)
+    terms = torch.where(k < n[:, None], torch.exp(binomial + (k + 1) * new.log()[:, None]), 0.0)  # [K, MAX_COPIES]
+    total = (terms * (-1) ** k / (k + 1).sqrt()).sum(-1)
+    return new.to(opacity.dtype), (o / total).to(opacity.dtype)
+
+
+def _log_binomial(n: Tensor, k: Tensor) -> Tensor:
+    return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp(min=0) + 1)

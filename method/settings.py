@@ -1,0 +1,83 @@
+"""The trainer's numbers, each with its reason. A recipe overrides them by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Hyper-parameters of a fit. Learning rates are Adam's; `*_last` is reached log-linearly at a stage's end."""
+
+    # Steps. One step renders several views at one time, where 4DGS takes one image: 1 step here is about 8 there.
+    coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
+    fine_steps: int = 700  # deforming stage (4DGS: 14000 single images)
+    views_per_step: int = 8  # all training views of a 9-camera array; they share one deformation and one time
+    ramp: float = 0.5  # share of the fine stage in which the times open up from the middle to the whole clip
+
+    # Times at which pictures are made from the spikes.
+    time_spacing_ticks: int = 10  # 0.5 ms at 20 kHz: half a ground-truth interval
+    edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their pictures belong to a later time
+    max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
+    coarse_share: float = 0.2  # middle share of the clip that the coarse stage of a moving scene sees
+
+    # Loss.
+    ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs
+
+    # Gaussians.
+    initial_opacity: float = 0.5  # points from a plane sweep lie on surfaces; 0.1 suits sparse clouds
+    means_rate: float = 1.6e-4  # x scene scale, as 3DGS
+    means_rate_last: float = 1.6e-5
+    scales_rate: float = 1e-2
+    quats_rate: float = 2e-3
+    logits_rate: float = 0.05
+    colors_rate: float = 5e-3
+    beta1: float = 0.9
+    beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
+
+    # Density control.
+    refine_every: int = 100
+    refine_until: float = 0.6  # share of a stage
+    grow_gradient: float = 2e-4  # mean screen-space gradient (half-image units) above which a Gaussian is densified
+    split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
+    min_opacity: float = 0.005  # fainter ones are removed
+    max_per_pixel: float = 0.5  # Gaussians per pixel of one view
+
+    # Deformation.
+    cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
+    levels: int = 2  # multires 1, 2
+    cell_ticks: float = 16.0  # time cell
+    features: int = 16  # per plane and level, 4DGS's dynerf preset
+    mlp_width: int = 64
+    grid_rate: float = 1e-2
+    grid_rate_last: float = 1e-3
+    deformation_rate: float = 1e-3
+    deformation_rate_last: float = 1e-4
+    tv_weight: float = 2e-4  # the three weights of 4DGS's dynerf preset
+    smooth_weight: float = 1e-3
+    sparse_weight: float = 1e-4
+
+    def scaled(self, scale: float) -> TrainSettings:
+        """The same settings with the step counts multiplied by a budget's scale."""
+        return replace(
+            self,
+            coarse_steps=max(1, round(self.coarse_steps * scale)),
+            fine_steps=max(1, round(self.fine_steps * scale)),
+        )
+
+
+def make_settings(overrides: Mapping[str, Any], where: str) -> TrainSettings:
+    """The defaults with `overrides` by name. Raises UserError for an unknown name or a value of another type."""
+    defaults = TrainSettings()
+    known = {f.name for f in fields(TrainSettings)}
+    for name, value in overrides.items():
+        if name not in known:
+            raise problem(where, f"settings among {', '.join(sorted(known))}", repr(name), "correct the name")
+        kind = type(getattr(defaults, name))
+        if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+            raise problem(where, f"{name} as {kind.__name__}", repr(value), "correct the value")
+    return replace(defaults, **overrides)

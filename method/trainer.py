@@ -1,0 +1,215 @@
+"""The one trainer of all recipes: a static stage, then a deforming one; several views of one time per step.
+
+Everything random is drawn from generators seeded by (seed, step), so that the step number is the whole random state
+and a fit that resumes from a checkpoint gives the bits of one that never stopped (on the CPU).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.recipes import Progress
+from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.density import Pressure, refine
+from spike4dgs.method.gaussians import Gaussians
+from spike4dgs.method.motion import Motion
+from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.splat import RenderOutput, Views, render
+from spike4dgs.method.supervision import Sample, Supervision
+
+GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """What a fit looks at: pictures of all training views at some times."""
+
+    views: Views
+    ticks: tuple[int, ...]  # ascending
+    pictures: Tensor  # [T, C, H, W] linear radiance
+    n_ticks: int  # length of the clip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stretch of steps with its own optimiser and schedule."""
+
+    first: int
+    steps: int
+    deforms: bool
+
+    def fraction(self, step: int) -> float:
+        """Position of a step within the stage, in [0, 1)."""
+        return (step - self.first) / self.steps
+
+
+def stages(settings: TrainSettings, moves: bool) -> list[Stage]:
+    """The static stage, followed by the deforming one where the motion model moves."""
+    coarse = Stage(0, settings.coarse_steps, deforms=False)
+    return [coarse, Stage(coarse.steps, settings.fine_steps, deforms=True)] if moves else [coarse]
+
+
+def choose_time(settings: TrainSettings, stage: Stage, step: int, times: int, moves: bool) -> int:
+    """Index of the step's time among `times`.
+
+    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians, and opens up to the
+    whole clip: motion is then followed from known into unknown times. A static scene sees all times throughout.
+    """
+    share = 1.0
+    if moves and not stage.deforms:
+        share = settings.coarse_share
+    elif moves:
+        opened = min(1.0, stage.fraction(step) / settings.ramp) if settings.ramp else 1.0
+        share = settings.coarse_share + (1 - settings.coarse_share) * opened
+    at = 0.5 + share * ((step * GOLDEN) % 1.0 - 0.5)
+    return min(times - 1, int(at * times))
+
+
+def seeded(seed: int, step: int) -> torch.Generator:
+    """The random numbers of one step."""
+    return torch.Generator().manual_seed((seed * 1_000_003 + step) % 2**63)
+
+
+class Trainer:
+    """A fit in progress. `scale` is the scene's size in metres, which relates learning rates to the world."""
+
+    def __init__(
+        self,
+        footage: Footage,
+        gaussians: Gaussians,
+        motion: Motion,
+        supervision: Supervision,
+        settings: TrainSettings,
+        *,
+        scale: float,
+        seed: int,
+    ) -> None:
+        self.footage, self.motion, self.supervision = footage, motion, supervision
+        self.settings, self.scale, self.seed = settings, scale, seed
+        self.plan = stages(settings, motion.moves)
+        self.total = sum(s.steps for s in self.plan)
+        self.step = 0
+        self.gaussians = gaussians.trainable()
+        self._begin(self.plan[0])
+
+    @property
+    def stage(self) -> Stage:
+        """The stage of the current step."""
+        return next(s for s in reversed(self.plan) if s.first <= self.step)
+
+    def _begin(self, stage: Stage) -> None:
+        """Start a stage as 4DGS does: a fresh optimiser, and nothing gathered for densification."""
+        s = self.settings
+        own = self.motion.groups() if stage.deforms else {}
+        self.rates = {
+            "means": Decay(s.means_rate * self.scale, s.means_rate_last * self.scale),
+            "log_scales": Decay(s.scales_rate, s.scales_rate),
+            "quats": Decay(s.quats_rate, s.quats_rate),
+            "logits": Decay(s.logits_rate, s.logits_rate),
+            "colors": Decay(s.colors_rate, s.colors_rate),
+            **{name: rate for name, (_, rate) in own.items()},
+        }
+        groups = {name: [leaf] for name, leaf in self.gaussians.tensors().items()}
+        self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
+        self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
+
+    def sample(self) -> Sample:
+        """The current step's views and time."""
+        footage, count = self.footage, len(self.footage.views)
+        index = choose_time(self.settings, self.stage, self.step, len(footage.ticks), self.motion.moves)
+        views = torch.arange(count)
+        if self.settings.views_per_step < count:
+            order = torch.randperm(count, generator=seeded(self.seed, self.step))
+            views = order[: self.settings.views_per_step].sort().values
+        tick = footage.ticks[index]
+        pictures = footage.pictures[index][views]
+        return Sample(tick / footage.n_ticks, tick, tuple(views.tolist()), pictures)
+
+    def train_step(self) -> Tensor:
+        """One step; returns the loss."""
+        stage, sample = self.stage, self.sample()
+        if self.step == stage.first and self.step:
+            self._begin(stage)
+        chosen = list(sample.views)
+        views = Views(self.footage.views.w2c[chosen], self.footage.views.K[chosen], *self._size())
+        outputs: list[RenderOutput] = []
+
+        def draw(t: float) -> Tensor:
+            moved = self.motion.deform(self.gaussians, t) if stage.deforms else self.gaussians
+            outputs.append(render(moved.splats(), views))
+            return outputs[-1].image[..., 0]
+
+        set_rates(self.adam, self.rates, stage.fraction(self.step))
+        self.adam.zero_grad(set_to_none=True)
+        loss = self.supervision(draw, sample)
+        (loss + self.motion.regularizer() if stage.deforms else loss).backward()
+        self.adam.step()
+        for out in outputs:
+            self.pressure.add(out)
+        self.step += 1
+        self._refine(stage)
+        return loss.detach()
+
+    def _size(self) -> tuple[int, int]:
+        return self.footage.views.width, self.footage.views.height
+
+    def _refine(self, stage: Stage) -> None:
+        s, done = self.settings, self.step - stage.first
+        if done % s.refine_every or done > s.refine_until * stage.steps:
+            return
+        width, height = self._size()
+        limit = round(s.max_per_pixel * width * height)
+        rng = seeded(self.seed, self.step)
+        for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
+            self.gaussians = apply_edit(self.adam, edit)
+        self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
+
+    def run(
+        self, progress: Progress, checkpoint: Path | None = None, fit: str = "", checkpoint_s: float = 15.0
+    ) -> None:
+        """Train to the end, from `checkpoint` where it exists; it is written every `checkpoint_s` seconds.
+
+        `fit` identifies the fit. Raises UserError for a damaged checkpoint or one of another fit.
+        """
+        saved = load_checkpoint(checkpoint, fit) if checkpoint else None
+        if saved:
+            self.restore(saved)
+        written = time.monotonic()
+        while self.step < self.total:
+            loss = self.train_step()
+            if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == self.total):
+                save_checkpoint(checkpoint, self.state(), fit)
+                written = time.monotonic()
+            if self.step % 10 == 0 or self.step == self.total:
+                progress(self.step, self.total, f"loss {loss.item():.4f}, {len(self.gaussians)} Gaussians")
+
+    def state(self) -> Checkpoint:
+        """Everything that later steps depend on."""
+        parts = {
+            "gaussians": self.gaussians.tensors(),
+            "motion": self.motion.state_dict(),
+            "adam": export_state(self.adam),
+            "pressure": {"gradient": self.pressure.gradient, "seen": self.pressure.seen},
+        }
+        return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint of the same fit."""
+        device = self.gaussians.means.device
+        on = {part: {k: v.to(device) for k, v in saved.part(part).items()} for part in ("gaussians", "pressure")}
+        self.step = saved.step
+        self.gaussians = Gaussians(**on["gaussians"]).trainable()
+        self.motion.load_state_dict(saved.part("motion"))
+        # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.
+        stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
+        self._begin(stage)
+        import_state(self.adam, saved.part("adam"))
+        self.pressure = Pressure(on["pressure"]["gradient"], on["pressure"]["seen"])
+
+
