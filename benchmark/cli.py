@@ -61,7 +61,7 @@ COMMANDS: dict[str, Command] = {
     "import-spikecv": Command(
         "spike4dgs.benchmark.spikecv:import_spikecv",
         "make a scene folder from a SpikeCV folder",
-        "import-spikecv --help",
+        "import-spikecv motVidarReal2020/rotation1 --out data/rotation1 --rate-hz 20000",
     ),
     "export-spikecv": Command(
         "spike4dgs.benchmark.spikecv:export_spikecv",

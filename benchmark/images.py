@@ -42,7 +42,7 @@ def read_exr(path: Path) -> Float32:
                     path, "a gray image (channel Y)", f"channels {sorted(channels)}", "write one gray channel"
                 )
             return np.asarray(channels["Y"].pixels, dtype=np.float32)
-    except RuntimeError as e:
+    except (RuntimeError, ValueError) as e:  # cut-off files raise either
         raise problem(path, "an EXR image", f"damaged data ({e})", "render or restore it") from None
 
 

@@ -169,7 +169,10 @@ def check_meta(meta: dict[str, Any], path: Path) -> None:
 def _read_cameras(root: Path) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     for name in ("transforms_train.json", "transforms_test.json"):
-        for frame in read_json(root / name, "camera poses").get("frames", []):
+        frames = read_json(root / name, "camera poses").get("frames")
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise problem(root / name, "a list `frames` of objects", "none", "make or import the scene again")
+        for frame in frames:
             camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
             cameras.setdefault(camera.id, camera)
     return cameras
@@ -193,7 +196,11 @@ def _read_targets(path: Path, meta: dict[str, Any], cameras: dict[str, Camera]) 
         )
     except (KeyError, TypeError, ValueError) as e:
         raise problem(path, "a list of {camera, tick}", repr(e), "restore it or make the scene again") from None
-    for t in targets:
-        if t.camera not in cameras or not 0 <= t.tick < meta["n_ticks"]:
-            raise problem(path, "cameras and ticks of this scene", f"{t.camera} at tick {t.tick}", "restore the file")
+    held_out = meta["splits"][meta["default_split"]]["test"]
+    for i, t in enumerate(targets):
+        found = f"{t.camera} at tick {t.tick}"
+        if t.camera not in cameras or t.camera not in held_out or not 0 <= t.tick < meta["n_ticks"]:
+            raise problem(path, "held-out cameras and ticks of this scene", found, "restore the file")
+        if t in targets[:i]:
+            raise problem(path, "distinct targets", f"{found} twice", "restore the file")
     return targets
