@@ -119,7 +119,7 @@ def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path) as data:
+        with open(path, "rb") as f, np.load(f) as data:
             return {name: data[name] for name in names}
     except FileNotFoundError:
         raise problem(path, "a key frame", "no such file", "run the same command again") from None

@@ -318,3 +318,6 @@ def _alone(path: Path) -> Iterator[None]:
         except BlockingIOError:
             raise problem(path.stem, "a scene that nobody else makes", "a run in progress", "wait for it") from None
         yield
+    path.unlink(missing_ok=True)  # reached only where the scene is done
+    if not any(path.parent.iterdir()):
+        path.parent.rmdir()

@@ -29,7 +29,8 @@ def gain_map(height: int, width: int, seed: int, camera: str) -> Float32:
     y, x = np.linspace(0, np.pi, height)[:, None], np.linspace(0, np.pi, width)[None]
     waves = [(i, j) for i in range(3) for j in range(3) if 0 < i + j <= 2]
     shading = sum(rng.normal() * np.cos(i * y) * np.cos(j * x) for i, j in waves)
-    shading *= np.sqrt(GAIN_SPREAD**2 - GAIN_LOCAL_SPREAD**2) / np.std(shading)
+    shading = shading - np.mean(shading)
+    shading *= np.sqrt(GAIN_SPREAD**2 - GAIN_LOCAL_SPREAD**2) / max(np.std(shading), 1e-9)
     gain = np.exp(shading) * (1 + GAIN_LOCAL_SPREAD * np.clip(rng.normal(size=(height, width)), -6, 6))
     return np.asarray(gain / gain.mean(), dtype=np.float32)
 
@@ -44,9 +45,10 @@ def dark_map(height: int, width: int, seed: int, camera: str) -> Float32:
 
 
 def write_maps(path: Path, maps: dict[str, Float32 | None]) -> None:
-    """Write the maps that are on as `.npz` (equal maps give equal bytes)."""
-    with atomic_path(path) as part:
-        np.savez(part, **{name: m for name, m in maps.items() if m is not None})  # type: ignore[arg-type, unused-ignore]
+    """Write the maps that are on as `.npz` (equal maps give equal bytes); no file where none is."""
+    if on := {name: m for name, m in maps.items() if m is not None}:
+        with atomic_path(path) as part:
+            np.savez(part, allow_pickle=False, **on)
 
 
 def _rng(name: str, seed: int, camera: str) -> np.random.Generator:
