@@ -31,22 +31,22 @@ COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
         "spike4dgs.generators.make_dataset:make_dataset",
         "render a world and simulate its spike cameras",
-        "make-dataset car --profile small --out data/car",
+        "make-dataset car turntable --profile small --out data",
     ),
     "run-benchmark": Command(
         "spike4dgs.benchmark.run:run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
-        "run-benchmark data/car data/turntable --methods tfp+4dgs nearest-view --out runs/first --seed 0 --device cpu",
+        "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
     ),
     "score": Command(
         "spike4dgs.benchmark.score:score",
         "score a predictions folder of any program",
-        "score runs/first/predictions/tfp+4dgs data/car data/turntable --out result.json",
+        "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
     ),
     "submit": Command(
         "spike4dgs.leaderboard.submit:submit",
         "verify a result record and enter it into the leaderboard",
-        "submit result.json --predictions runs/first/predictions/tfp+4dgs --scenes data/car data/turntable",
+        "submit r.json --predictions runs/small/predictions/tfp+4dgs --scenes data/car-0-small data/turntable-0-small",
     ),
     "inspect": Command(
         "spike4dgs.baselines.inspect:inspect",
@@ -56,7 +56,7 @@ COMMANDS: dict[str, Command] = {
     "verify": Command(
         "spike4dgs.benchmark.verify:verify",
         "check every file of a scene against its manifest",
-        "verify data/car",
+        "verify data/car-0-small",
     ),
     "import-spikecv": Command(
         "spike4dgs.benchmark.spikecv:import_spikecv",
@@ -66,7 +66,7 @@ COMMANDS: dict[str, Command] = {
     "export-spikecv": Command(
         "spike4dgs.benchmark.spikecv:export_spikecv",
         "write a scene's streams as a SpikeCV folder",
-        "export-spikecv --help",
+        "export-spikecv data/car-0-small --out car-spikecv",
     ),
     "spacing": Command(
         "spike4dgs.generators.spacing:spacing",

@@ -62,7 +62,11 @@ class Model(Protocol):
 
 
 class Method(Protocol):
-    """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed."""
+    """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
+
+    Two attributes may be added: `version` (the package's if absent; also part of the key), and `trained_on`, the names
+    of the data sets that learned parts have seen.
+    """
 
     name: str
     params: dict[str, Any]
@@ -83,11 +87,16 @@ class Method(Protocol):
 def find_methods() -> dict[str, Method]:
     """All methods of all installed packages, by name. Each entry point names a mapping from name to method.
 
-    Raises UserError where two packages use one name.
+    Raises UserError where two packages use one name, and where one cannot be imported.
     """
     methods: dict[str, Method] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
-        for name, method in entry.load().items():
+        try:
+            found = entry.load()
+        except Exception as e:  # somebody else's package
+            fix = "repair or uninstall the package that registers it"
+            raise problem(f"entry point {entry.name}", entry.value, f"{type(e).__name__}: {e}", fix) from e
+        for name, method in found.items():
             if name in methods:
                 raise problem(f"entry point {entry.name}", "a new method name", f"'{name}' twice", "rename one of them")
             methods[name] = method

@@ -301,6 +301,23 @@ def test_bad_arguments_are_user_errors(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load() -> None:
+        raise ImportError("no libfoo")
+
+    entry = SimpleNamespace(name="theirs", value="theirs.recipes:METHODS", load=load)
+    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+    with pytest.raises(UserError, match="entry point theirs: expected theirs.recipes:METHODS, found ImportError"):
+        recipes.find_methods()
+
+
+def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [SimpleNamespace(name=n, load=lambda: {"same": CountMethod("same")}) for n in "ab"]
+    monkeypatch.setattr(recipes, "entry_points", lambda group: entries)
+    with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
+        recipes.find_methods()
+
+
 def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
