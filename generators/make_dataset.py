@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
 
 if TYPE_CHECKING:
     from rich.progress import Progress
-
-    from spike4dgs.generators.scene_maker import Job
 
 T = TypeVar("T")
 _LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
@@ -81,7 +79,6 @@ def make_dataset(
 
 
 def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, maps: tuple[bool, bool]) -> Job:
-    from spike4dgs.generators.scene_maker import Job
     from spike4dgs.generators.worlds import WORLDS
 
     if world not in WORLDS:

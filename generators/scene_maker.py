@@ -14,7 +14,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -34,7 +34,7 @@ from spike4dgs.benchmark.spikes import SpikeWriter, bytes_per_tick
 from spike4dgs.generators.keyframes import KeyStore
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.motion import key_ticks, max_image_speed
-from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Profile
+from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.render import MultiViewRenderer
 from spike4dgs.generators.rig import HELD_OUT_VIEW, cameras
 from spike4dgs.generators.sensor import Sensor, random_charge, simulate
@@ -48,52 +48,6 @@ _MASK_CHANGE = 0.1  # relative change of radiance that counts as moving light
 
 T = TypeVar("T")
 Watch = Callable[[str, Iterable[T], int], Iterator[T]]  # (stage, steps, number of steps) -> the steps, shown
-
-
-@dataclass(frozen=True)
-class Job:
-    """One scene to make."""
-
-    world: str
-    variant: int
-    seed: int
-    profile_name: str
-    profile: Profile
-    seconds: float
-    gain_map: bool = True
-    dark_map: bool = True
-
-    @property
-    def id(self) -> str:
-        """Such as `car-0-small`; a length that is not the profile's is added: `car-0-paper-500ms`."""
-        usual = self.seconds == self.profile.seconds
-        return f"{self.world}-{self.variant}-{self.profile_name}" + ("" if usual else f"-{self.seconds * 1000:g}ms")
-
-    @property
-    def n_ticks(self) -> int:
-        """Length of the clip in ticks."""
-        return round(self.seconds * RATE_HZ)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that decides about the bytes of the scene, except the versions of the programs."""
-        profile = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self.profile).items()}
-        return {
-            "kind": "mitsuba",
-            "world": self.world,
-            "variant": self.variant,
-            "seed": self.seed,
-            "profile": self.profile_name,
-            "seconds": self.seconds,
-            "sampling": profile,
-            "gain_map": self.gain_map,
-            "dark_map": self.dark_map,
-        }
-
-    @property
-    def target_ticks(self) -> range:
-        """Ticks with ground truth: every millisecond strictly inside the clip."""
-        return range(TARGET_EVERY, self.n_ticks - TARGET_EVERY + 1, TARGET_EVERY)
 
 
 @dataclass

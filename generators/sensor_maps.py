@@ -28,8 +28,10 @@ def gain_map(height: int, width: int, seed: int, camera: str) -> Float32:
     rng = _rng("gain", seed, camera)
     y, x = np.linspace(0, np.pi, height)[:, None], np.linspace(0, np.pi, width)[None]
     waves = [(i, j) for i in range(3) for j in range(3) if 0 < i + j <= 2]
-    shading = sum(rng.normal() * np.cos(i * y) * np.cos(j * x) for i, j in waves)
-    shading = shading - np.mean(shading)
+    shading = np.zeros((height, width))
+    for i, j in waves:
+        shading += rng.normal() * np.cos(i * y) * np.cos(j * x)
+    shading -= np.mean(shading)
     shading *= np.sqrt(GAIN_SPREAD**2 - GAIN_LOCAL_SPREAD**2) / max(np.std(shading), 1e-9)
     gain = np.exp(shading) * (1 + GAIN_LOCAL_SPREAD * np.clip(rng.normal(size=(height, width)), -6, 6))
     return np.asarray(gain / gain.mean(), dtype=np.float32)

@@ -19,8 +19,8 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.generators import make_dataset as command
 from spike4dgs.generators import scene_maker
-from spike4dgs.generators.profiles import PROFILES
-from spike4dgs.generators.scene_maker import Job, Maker, moving_region
+from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.scene_maker import Maker, moving_region
 from spike4dgs.generators.worlds import WORLDS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
