@@ -25,7 +25,7 @@ _PACKAGES = (
 
 def environment(device: str) -> dict[str, Any]:
     """Python, platform, package versions, CPU, and the GPU if `device` is one (null otherwise)."""
-    gpu, cuda = _gpu() if device_type(device) == "cuda" else (None, None)
+    gpu, cuda = _gpu(device) if device_type(device) == "cuda" else (None, None)
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -86,6 +86,7 @@ def reset_peak_memory(device: str) -> None:
     if device_type(device) == "cuda":
         import torch
 
+        torch.cuda.init()  # before the first use of the device there is nothing to reset, which is an error
         torch.cuda.reset_peak_memory_stats(device)
         return
     try:
@@ -125,10 +126,10 @@ def _cpu() -> str:
     return f"{found[1].strip() if found else platform.machine()}, {len(os.sched_getaffinity(0))} cores"
 
 
-def _gpu() -> tuple[str, str | None]:
+def _gpu(device: str) -> tuple[str, str | None]:
     import torch
 
-    return torch.cuda.get_device_name(), torch.version.cuda
+    return torch.cuda.get_device_name(device), torch.version.cuda
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
