@@ -86,7 +86,8 @@ def reset_peak_memory(device: str) -> None:
     if device_type(device) == "cuda":
         import torch
 
-        torch.cuda.init()  # before the first use of the device there is nothing to reset, which is an error
+        # Before the first use of the device there is nothing to reset, which would be an error.
+        torch.cuda.init()  # type: ignore[no-untyped-call]
         torch.cuda.reset_peak_memory_stats(device)
         return
     try:
