@@ -180,8 +180,9 @@ def _render(
 
 def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure = Figure(figsize=(15, 4.8), layout="constrained")
+    figure = Figure(figsize=(15, 5.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     for name, style in (("Catmull-Rom", "o-"), ("linear", "s--")):
         part = [r for r in rows if r.interpolation == name]
@@ -198,7 +199,11 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
         )
     for r in (r for r in rows if r.interpolation == "Catmull-Rom"):
         right.annotate(
-            f"{r.motion_px:.2g} px", (r.render_s_per_ms, r.counts_off), (0, -14), textcoords="offset points", fontsize=8
+            f"{r.motion_px:.2g} px",
+            (r.render_s_per_ms, r.counts_off),
+            (-8, -14),
+            textcoords="offset points",
+            fontsize=8,
         )
     for r in (r for r in rows if r.interpolation == _PHASE):
         middle.axhline(r.counts_off, color="0.5", linestyle=":", label=_PHASE)
@@ -212,8 +217,15 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
         axes.set(xlabel="motion of the fastest point between keys (px)")
     for axes in (left, middle, right):
         axes.set(xscale="log", yscale="log")
-        axes.grid(True, which="both", color="0.93")
-        axes.legend(fontsize=8)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
+        axes.grid(True, color="0.9")
+    low, high = left.get_ylim()
+    left.set_ylim(low, high * 40)  # room for the legend
+    for axes in (left, middle, right):
+        axes.legend(fontsize=8, loc="upper right" if axes is right else "upper left")
     figure.suptitle(title)
     with atomic_path(path) as part_path:
         figure.savefig(part_path)
@@ -224,7 +236,8 @@ def _show(rows: Sequence[Row], console: Any) -> None:
 
     table = Table(box=None, title="errors in % where something moves")
     for f in fields(Row):
-        table.add_column(f.name.replace("_", " "), justify="left" if f.name == "interpolation" else "right")
+        text = f.name == "interpolation"
+        table.add_column(f.name.replace("_", " "), justify="left" if text else "right", no_wrap=text)
     for r in rows:
         table.add_row(*(v if isinstance(v, str) else f"{v:.3g}" for v in asdict(r).values()))
     console.print(table)

@@ -1,0 +1,70 @@
+"""The key-frame spacing report and `speed simulate`."""
+
+from __future__ import annotations
+
+import csv
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators import spacing, speed
+
+
+def drifting(n, px_per_tick, height=12, width=40):
+    """Frames [n + 1, H, W] of a smooth pattern that drifts."""
+    x = np.arange(width) - px_per_tick * np.arange(n + 1)[:, None, None]
+    y = np.arange(height)[:, None]
+    return (0.5 + 0.3 * np.sin(x / 1.5) * np.cos(y / 4)).astype(np.float32)
+
+
+def test_errors_grow_with_the_spacing_and_the_curve_beats_the_line():
+    rows = spacing.compare(drifting(128, 0.05), speed_px_s=1000.0, seconds_per_key=0.5, spacings=[2, 8, 32])
+    curves = [r for r in rows if r.interpolation == "Catmull-Rom"]
+    lines = [r for r in rows if r.interpolation == "linear"]
+    assert [r.motion_px for r in curves] == pytest.approx([0.1, 0.4, 1.6])
+    assert [r.render_s_per_ms for r in curves] == pytest.approx([5.0, 1.25, 0.3125])
+    for rs in (curves, lines):
+        for name in ("tick_error_mean", "integral_error_mean", "counts_off"):
+            values = [getattr(r, name) for r in rs]
+            assert values == sorted(values)
+    assert all(a.tick_error_mean < b.tick_error_mean for a, b in zip(curves, lines, strict=True))
+    assert rows[-1].interpolation == "another initial phase"
+    assert 20 < rows[-1].counts_off < 50
+
+
+def test_light_that_changes_linearly_in_time_has_no_error():
+    t = np.arange(65)[:, None, None] / 64
+    frames = (0.2 + 0.5 * t * np.linspace(0, 1, 30).reshape(5, 6)).astype(np.float32)
+    rows = spacing.compare(frames, speed_px_s=1.0, seconds_per_key=1.0, spacings=[2, 64])
+    assert max(r.tick_error_p999 for r in rows) < 1e-4
+    assert max(r.counts_off for r in rows[:-1]) == 0
+
+
+def test_report_writes_a_table_and_a_plot(tmp_path, monkeypatch, capsys):
+    world = SimpleNamespace(build=lambda *a: None)
+    monkeypatch.setattr("spike4dgs.generators.worlds.WORLDS", {"car": world})
+    monkeypatch.setattr(spacing, "_render", lambda *a: (drifting(64, 0.03), 600.0, 0.1))
+    assert spacing.spacing("car", out=tmp_path, ticks=64) == 0
+    with open(tmp_path / "car.csv") as f:
+        rows = list(csv.DictReader(f))
+    assert len(rows) == 2 * 6 + 1
+    assert float(rows[0]["motion_px"]) == pytest.approx(0.06)
+    assert (tmp_path / "car.png").stat().st_size > 20_000
+    assert "Catmull-Rom" in capsys.readouterr().out
+    for bad in ({"world": "moon"}, {"world": "car", "ticks": 100}):
+        with pytest.raises(UserError):
+            spacing.spacing(**bad, out=tmp_path)
+
+
+def test_speed_reports_both_sides_and_the_error(tmp_path, capsys):
+    path = tmp_path / "speed.csv"
+    arguments = ["--width", "40", "--height", "25", "--ticks", "90", "--repeats", "1", "--csv", str(path)]
+    assert speed.simulate(arguments) == 0
+    with open(path) as f:
+        rows = list(csv.DictReader(f))
+    assert [r["simulator"] for r in rows] == ["numpy, float32", "spike4dgs", "spike4dgs", "spike4dgs, maps off"]
+    assert all(float(r["million_pixel_ticks_per_s"]) > 0 for r in rows)
+    assert all(int(r["max_count_error"]) <= 1 and float(r["pixels_off_percent"]) < 1 for r in rows[1:])
+    assert "numpy" in capsys.readouterr().out
