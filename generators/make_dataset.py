@@ -38,8 +38,6 @@ def make_dataset(
     A killed run goes on where it was when the same command is given again. A scene that is there already is checked
     and kept. OUT/ID.report.json tells what the stages took. Equal arguments give equal bytes.
 
-    Example: spike4dgs make-dataset car turntable --profile small --out data
-
     Args:
         worlds: Names of worlds: car, turntable.
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).

@@ -59,8 +59,6 @@ def spacing(
 ) -> int:
     """Report key-frame spacing against errors and render time: OUT/WORLD.csv and OUT/WORLD.png.
 
-    Example: spike4dgs spacing car --out runs/spacing
-
     Args:
         world: Name of a world.
         out: Folder for the table and the plot.
@@ -222,8 +220,9 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
         axes.grid(True, color="0.9")
+    right.margins(0.12)
     low, high = left.get_ylim()
-    left.set_ylim(low, high * 40)  # room for the legend
+    left.set_ylim(low, high * 15)  # room for the legend
     for axes in (left, middle, right):
         axes.legend(fontsize=8, loc="upper right" if axes is right else "upper left")
     figure.suptitle(title)
