@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from spike4dgs.benchmark.cameras import Camera, look_at
 from spike4dgs.benchmark.images import write_exr, write_mask
 from spike4dgs.benchmark.scene import Target
@@ -42,7 +43,7 @@ def array_cameras(n: int = 4, width: int = WIDTH, height: int = HEIGHT) -> tuple
 
 
 def write_small_scene(root: Path, seed: int = 0) -> Path:
-    """A scene without Mitsuba: a smooth pattern that drifts to the right; cam_03 is held out, targets every 20 ticks."""
+    """A scene without Mitsuba: a pattern that drifts to the right; cam_03 is held out, targets every 20 ticks."""
     rng = np.random.default_rng(seed)
     cameras = array_cameras()
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)

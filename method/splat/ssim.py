@@ -1,0 +1,191 @@
+"""Fused SSIM for training: value and gradient in one pass of numba kernels, with its plain torch twin.
+
+SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5, zero padding, data range 1, averaged over all
+pixels and images. The windows are separable and stay in the cache; the gradient needs three more blurs:
+
+    S = A B / (C D),  A = 2 m1 m2 + c1,  B = 2 (q12 - m1 m2) + c2,
+    C = m1^2 + m2^2 + c1,  D = q1 - m1^2 + q2 - m2^2 + c2,
+    dS/dimage = blur(dS/dm1) + 2 image blur(dS/dq1) + target blur(dS/dq12)
+
+with m the blurred images, q the blurred squares and product. This is the training loss; scores come from
+`spike4dgs.benchmark.metrics`, which leaves out the border instead of padding it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.splat import threads
+from spike4dgs.method.splat.jit import announce_compilation, helper, kernel
+from spike4dgs.method.splat.vector_ir import fetch_add
+
+RADIUS = 5
+C1, C2 = 0.01**2, 0.03**2
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+_WINDOW /= _WINDOW.sum()
+W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in _WINDOW[: RADIUS + 1])  # from the window's edge to its middle
+_C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean SSIM of images [B, H, W] against targets [B, H, W], differentiable in `image`.
+
+    CPU tensors go through the kernels in float32, others through `ssim_reference`.
+    Raises UserError for other shapes, or for a target that wants a gradient, which the kernels do not give.
+    """
+    if image.ndim != 3 or image.shape != target.shape or image.numel() == 0:
+        found = f"{tuple(image.shape)} and {tuple(target.shape)}"
+        raise problem("ssim", "two batches [B, H, W] of one shape", found, "add the batch dimension")
+    if target.requires_grad:
+        raise problem("ssim", "a target without gradient", "requires_grad", "pass the rendered image first")
+    if image.device.type != "cpu":
+        return ssim_reference(image, target)
+    value: Tensor = _FusedSsim.apply(image, target)  # type: ignore[no-untyped-call]
+    return value
+
+
+def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
+    """The same in plain torch, in the precision of its inputs: the twin that the kernels are tested against."""
+    window = torch.as_tensor(_WINDOW, dtype=image.dtype, device=image.device)
+
+    def blur(x: Tensor) -> Tensor:
+        rows = functional.conv2d(x[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
+        return functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
+
+    m1, m2 = blur(image), blur(target)
+    q1, q2, q12 = blur(image * image), blur(target * target), blur(image * target)
+    numerator = (2 * m1 * m2 + C1) * (2 * (q12 - m1 * m2) + C2)
+    return (numerator / ((m1 * m1 + m2 * m2 + C1) * (q1 - m1 * m1 + q2 - m2 * m2 + C2))).mean()
+
+
+class _FusedSsim(torch.autograd.Function):
+    """The gradient is made together with the value, while the blurred images are at hand."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+        batch, height, width = image.shape
+        a = np.ascontiguousarray(image.detach().numpy(), dtype=np.float32)
+        b = np.ascontiguousarray(target.numpy(), dtype=np.float32)
+        sums = np.empty(batch, np.float64)
+        gradient = np.empty_like(a) if image.requires_grad else np.empty((0, 0, 0), np.float32)
+        announce_compilation(_ssim_kernel, "SSIM")
+        workers = min(threads.get_threads(), batch)
+        scratch = [
+            (
+                np.zeros((height + 2 * RADIUS, width), np.float32),
+                np.zeros(width + 2 * RADIUS, np.float32),
+                np.empty((5, height, width), np.float32),
+            )
+            for _ in range(workers)
+        ]
+        threads.run(_ssim_kernel, (a, b, sums, gradient), scratch)
+        if image.requires_grad:
+            ctx.save_for_backward(torch.from_numpy(gradient))
+            ctx.dtype = image.dtype
+        return torch.as_tensor(sums.sum() / a.size, dtype=image.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return (gradient * outer[0]).to(ctx.dtype), None
+
+
+@helper
+def _blur(source, out, rows, line):  # type: ignore[no-untyped-def]
+    """Blur [H, W] into `out`, which may be `source`. `rows` [H + 10, W] and `line` [W + 10] have zero margins."""
+    height, width = source.shape
+    for y in range(height):
+        for x in range(width):
+            line[x + 5] = source[y, x]
+        r = rows[y + 5]
+        for x in range(width):
+            r[x] = (
+                W5 * line[x + 5]
+                + W4 * (line[x + 4] + line[x + 6])
+                + W3 * (line[x + 3] + line[x + 7])
+                + W2 * (line[x + 2] + line[x + 8])
+                + W1 * (line[x + 1] + line[x + 9])
+                + W0 * (line[x] + line[x + 10])
+            )
+    for y in range(height):
+        o = out[y]
+        for x in range(width):
+            o[x] = (
+                W5 * rows[y + 5, x]
+                + W4 * (rows[y + 4, x] + rows[y + 6, x])
+                + W3 * (rows[y + 3, x] + rows[y + 7, x])
+                + W2 * (rows[y + 2, x] + rows[y + 8, x])
+                + W1 * (rows[y + 1, x] + rows[y + 9, x])
+                + W0 * (rows[y, x] + rows[y + 10, x])
+            )
+
+
+@helper
+def _row_sum(row):  # type: ignore[no-untyped-def]
+    """Sum of a row in eight interleaved partial sums, an order that no compiler changes."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = np.float32(0)
+    whole = len(row) // 8 * 8
+    for x in range(0, whole, 8):
+        s0 += row[x]
+        s1 += row[x + 1]
+        s2 += row[x + 2]
+        s3 += row[x + 3]
+        s4 += row[x + 4]
+        s5 += row[x + 5]
+        s6 += row[x + 6]
+        s7 += row[x + 7]
+    for x in range(whole, len(row)):
+        s0 += row[x]
+    return np.float64((s0 + s1) + (s2 + s3)) + np.float64((s4 + s5) + (s6 + s7))
+
+
+@kernel
+def _ssim_kernel(images, targets, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
+    """Sum of SSIM of each image, and the gradient of the mean over all of them where `gradients` is not empty."""
+    batch, height, width = images.shape
+    scale = np.float32(1.0 / (batch * height * width))
+    m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
+    while True:
+        i = fetch_add(counter, 0, 1)
+        if i >= batch:
+            return
+        a, b = images[i], targets[i]
+        for y in range(height):
+            for x in range(width):
+                q1[y, x] = a[y, x] * a[y, x]
+                q2[y, x] = b[y, x] * b[y, x]
+                q12[y, x] = a[y, x] * b[y, x]
+        _blur(a, m1, rows, line)
+        _blur(b, m2, rows, line)
+        _blur(q1, q1, rows, line)
+        _blur(q2, q2, rows, line)
+        _blur(q12, q12, rows, line)
+        total = 0.0
+        for y in range(height):
+            for x in range(width):
+                u, v = m1[y, x], m2[y, x]
+                uu, vv, uv = u * u, v * v, u * v
+                A, B = _TWO * uv + _C1, _TWO * (q12[y, x] - uv) + _C2
+                C, D = uu + vv + _C1, (q1[y, x] - uu) + (q2[y, x] - vv) + _C2
+                inverse = np.float32(1) / (C * D)
+                S = A * B * inverse
+                q1[y, x] = -S * C * inverse * scale
+                q12[y, x] = _TWO * A * inverse * scale
+                m1[y, x] = _TWO * (v * (B - A) + S * u * (C - D)) * inverse * scale
+                q2[y, x] = S
+            total += _row_sum(q2[y])
+        sums[i] = total
+        if gradients.size:
+            _blur(m1, m1, rows, line)
+            _blur(q1, q1, rows, line)
+            _blur(q12, q12, rows, line)
+            g = gradients[i]
+            for y in range(height):
+                for x in range(width):
+                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x]

@@ -1,0 +1,124 @@
+"""The fused SSIM of training against its float64 twin, scikit-image and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.splat import set_threads
+from spike4dgs.method.splat.ssim import C1, ssim, ssim_reference
+
+
+def images(batch: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    a = torch.rand(batch, height, width, generator=g)
+    return a, (a + 0.2 * torch.randn(batch, height, width, generator=g)).clamp(0, 1.5)
+
+
+@pytest.mark.parametrize("shape", [(1, 125, 200), (3, 24, 40), (2, 7, 5), (1, 1, 1), (2, 11, 33)])
+def test_value_and_gradient_equal_the_float64_twin(shape: tuple[int, int, int]) -> None:
+    a, b = images(*shape)
+    fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
+    value, expected = ssim(fast, b), ssim_reference(slow, b.double())
+    (3 * value).backward()
+    (3 * expected).backward()
+    assert abs(value.item() - expected.item()) < 1e-6
+    assert fast.grad is not None and slow.grad is not None
+    assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm()
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (torch.zeros(1, 30, 30), torch.zeros(1, 30, 30)),  # nothing at all
+        (torch.full((1, 30, 30), 0.7), torch.full((1, 30, 30), 0.7)),  # flat: variances cancel
+        (
+            torch.full((1, 30, 30), 20.0),
+            torch.rand(1, 30, 30, generator=torch.Generator().manual_seed(1)),
+        ),  # overexposed
+        (torch.eye(40)[None], torch.eye(40).flip(0)[None]),
+    ],
+)
+def test_hard_images_stay_finite_and_close(a: torch.Tensor, b: torch.Tensor) -> None:
+    fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
+    value, expected = ssim(fast, b), ssim_reference(slow, b.double())
+    value.backward()
+    expected.backward()
+    assert fast.grad is not None and slow.grad is not None
+    assert torch.isfinite(fast.grad).all()
+    assert abs(value.item() - expected.item()) < 2e-4
+    # Gradients of ordinary pictures this size have norms around 0.03; float32 leaves 1e-5 of noise where the truth is 0.
+    assert (fast.grad - slow.grad).norm() <= 2e-2 * slow.grad.norm() + 1e-5
+
+
+def test_inner_region_equals_scikit_image() -> None:
+    a, b = images(1, 64, 80)
+    full = structural_similarity(
+        a[0].double().numpy(),
+        b[0].double().numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1,
+        full=True,
+    )[1]
+    # Padding differs only within half a window of the border.
+    inner = ssim_map(a, b)[5:-5, 5:-5]
+    np.testing.assert_allclose(inner, full[5:-5, 5:-5], atol=1e-9)
+
+
+def ssim_map(a: torch.Tensor, b: torch.Tensor) -> np.ndarray:
+    """The twin's map: its mean's derivative with respect to a per-pixel weight is the map itself."""
+    window = torch.as_tensor(np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2))
+    window = (window / window.sum()).view(1, 1, 1, -1)
+
+    def blur(x: torch.Tensor) -> torch.Tensor:
+        rows = torch.nn.functional.conv2d(x[:, None], window, padding=(0, 5))
+        return torch.nn.functional.conv2d(rows, window.transpose(2, 3), padding=(5, 0))[:, 0]
+
+    x, y = a.double(), b.double()
+    m1, m2 = blur(x), blur(y)
+    s1, s2, s12 = blur(x * x) - m1**2, blur(y * y) - m2**2, blur(x * y) - m1 * m2
+    full = (2 * m1 * m2 + 1e-4) * (2 * s12 + 9e-4) / ((m1**2 + m2**2 + 1e-4) * (s1 + s2 + 9e-4))
+    assert abs(full.mean().item() - ssim_reference(x, y).item()) < 1e-12
+    return full[0].numpy()
+
+
+def test_flat_images_have_the_closed_form_inside() -> None:
+    """Away from the border two flat images differ in luminance only: (2 u v + C1) / (u^2 + v^2 + C1)."""
+    u, v = 0.3, 0.6
+    a, b = torch.full((1, 31, 31), u), torch.full((1, 31, 31), v)
+    expected = (2 * u * v + C1) / (u * u + v * v + C1)
+    np.testing.assert_allclose(ssim_map(a, b)[15, 15], expected, rtol=1e-6)
+
+
+def test_identical_images_have_value_one_and_no_gradient() -> None:
+    a, _ = images(2, 40, 30)
+    x = a.clone().requires_grad_()
+    value = ssim(x, a)
+    value.backward()
+    assert value.item() == pytest.approx(1, abs=1e-6)
+    assert x.grad is not None and x.grad.abs().max() < 1e-6
+
+
+def test_the_bits_do_not_depend_on_threads() -> None:
+    a, b = images(5, 50, 60)
+    results = []
+    for count in (1, 2):
+        set_threads(count)
+        x = a.clone().requires_grad_()
+        value = ssim(x, b)
+        value.backward()
+        results.append((value.detach(), x.grad))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(UserError, match=r"two batches \[B, H, W\]"):
+        ssim(torch.zeros(3, 4), torch.zeros(3, 4))
+    with pytest.raises(UserError, match="without gradient"):
+        ssim(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4, requires_grad=True))
