@@ -1,14 +1,16 @@
 """Key frames of a world: the background once, and at each time only the pixels that the moving things change.
 
-Which pixels those are (`changed`): a ray through the pixel's centre meets a moving instance, or the surface it meets
-has a moving instance between itself and the light; both grown by 3 px. That misses soft light: reflections in windows,
-light bounced off the car, the turntable's penumbra. These vary slowly, so they are found at coarse anchor times by
-comparing cheap renderings with and without the instances from the same random numbers, smoothed, above 1 %.
+Three kinds of pixel, cheapest first:
+
+- *Still*: the background, rendered once with many samples.
+- *Softly lit* (bounced light, wide penumbrae): the background times a slowly varying factor, see `soft_light`.
+- *Traced* at every key: a ray through the pixel's centre meets a moving instance, or the surface that it meets has one
+  between itself and the light; both grown by 3 px.
 
 Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. What stands still
 keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole picture, bit for
-bit. Pixels that see no moving surface, only its shadow or reflected light, get the background plus the *difference* of
-two such renderings: the background's low noise stays, and nothing jumps where the region of change ends.
+bit. Traced pixels that see no moving surface, only its shadow, get the background plus the *difference* of two such
+renderings: the background's low noise stays, and nothing jumps where the traced region ends.
 
 This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area), or denoise.
 """
@@ -20,21 +22,18 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
+from scipy.ndimage import maximum_filter
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.motion import max_image_speed
+from spike4dgs.generators.soft_light import MOTION_PX, SoftLight
 from spike4dgs.generators.worlds import WorldScene
 
 MAX_DEPTH = 4  # camera, surface, two bounces; measured against 8 in the tests
 _GROW_PX = 3
-_HALO_STEP = 2  # the anchors' grid: every second pixel of every second row
-_HALO_SPP = 32
-_HALO_THRESHOLD = 0.01  # of the background's radiance
-_HALO_MOTION_PX = 4.0  # between anchors
 
 
 class MultiViewRenderer:
@@ -63,7 +62,7 @@ class MultiViewRenderer:
         self._scene = MitsubaScene(world)
         self._tracer = _tracer(self._scene, self.cameras, seed)
         self._seed = seed
-        self._halos: dict[int, np.ndarray] = {}
+        self._soft_light = SoftLight(self.shape, self._trace_at, self.traced, self._anchor_s())
         self._last_hits: tuple[float, np.ndarray, np.ndarray] | None = None
 
     # ------------------------------------------------------------ pictures
@@ -73,12 +72,11 @@ class MultiViewRenderer:
         return self._backgrounds[0]
 
     def keys(self, t_s: float) -> np.ndarray:
-        """The views at `t_s`: the background outside `changed`, traced inside."""
+        """The views at `t_s`: still, softly lit and traced pixels put together."""
         background, same_numbers = self._backgrounds
-        picture = background.copy()
-        where = np.flatnonzero(self.changed(t_s))
-        self._scene.place(t_s)
-        traced = self._tracer.trace(where, self.spp, 0, True) * np.float32(self.world.exposure)
+        picture = background * (1 + self._soft_light.change(t_s))
+        where = np.flatnonzero(self.traced(t_s))
+        traced = self._trace_at(where, self.spp, True, t_s) * np.float32(self.world.exposure)
         correction = background.ravel()[where] - same_numbers.ravel()[where]
         correction[self.object_masks(t_s).ravel()[where]] = 0
         picture.ravel()[where] = np.maximum(traced + correction, 0)
@@ -119,10 +117,23 @@ class MultiViewRenderer:
         return (distance * cosine).astype(np.float32)
 
     def changed(self, t_s: float) -> np.ndarray:
-        """[C, H, W] bool: the pixels that `keys` traces at `t_s`."""
-        anchor = t_s / self._anchor_s
-        halo = self._halo(int(np.floor(anchor))) | self._halo(int(np.ceil(anchor)))
-        return self._ray_region(t_s) | halo
+        """[C, H, W] bool: the pixels of `keys` that are not simply the background: traced or softly lit."""
+        return self.traced(t_s) | (self._soft_light.change(t_s) != 0)
+
+    def traced(self, t_s: float) -> np.ndarray:
+        """[C, H, W] bool: the pixels that `keys` traces: a mask from rays through the pixels' centres, grown."""
+        distance, region = self._hits(t_s)
+        region = region.copy()
+        open_ = np.flatnonzero(~region & np.isfinite(distance))
+        origins, directions = self._rays
+        # stop a little short of the surface, so that it does not shadow itself
+        points = origins[open_] + directions[open_] * (distance[open_, None] * 0.9995)
+        for source in self.world.shadow_sources:
+            to_light = source[:3] - source[3] * points
+            to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+            region[open_] |= self._tracer.cast(points, to_light, True)[1]
+        size = 2 * _GROW_PX + 1
+        return np.asarray(maximum_filter(region.reshape(self.shape), size=(1, size, size)))
 
     # ------------------------------------------------------------ inner workings
 
@@ -153,54 +164,16 @@ class MultiViewRenderer:
             self._last_hits = (t_s, *self._tracer.cast(*self._rays, True))
         return self._last_hits[1:]
 
-    def _ray_region(self, t_s: float) -> np.ndarray:
-        """Pixels whose centre ray or its line to the light meets an instance, grown by a few pixels."""
-        distance, region = self._hits(t_s)
-        region = region.copy()
-        open_ = np.flatnonzero(~region & np.isfinite(distance))
-        origins, directions = self._rays
-        # stop a little short of the surface, so that it does not shadow itself
-        points = origins[open_] + directions[open_] * (distance[open_, None] * 0.9995)
-        for source in self.world.shadow_sources:
-            to_light = source[:3] - source[3] * points
-            to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
-            region[open_] |= self._tracer.cast(points, to_light, True)[1]
-        return _grow(region.reshape(self.shape), _GROW_PX)
+    def _trace_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
+        """Radiance [K] of flat pixels with the keys' random numbers, before exposure."""
+        if moving:
+            self._scene.place(t_s)
+        return np.asarray(self._tracer.trace(pixels, spp, 0, moving))
 
-    @cached_property
     def _anchor_s(self) -> float:
-        """Time between the anchors at which soft changes are looked for."""
-        duration = self.world.duration_s
-        return _HALO_MOTION_PX / max(max_image_speed(self.world, self.cameras, duration, 5), 1e-3)
-
-    def _halo(self, anchor: int) -> np.ndarray:
-        """[C, H, W] bool: where soft light differs from the background at an anchor time."""
-        if anchor not in self._halos:
-            self._halos[anchor] = self._find_halo(anchor * self._anchor_s)
-        return self._halos[anchor]
-
-    @cached_property
-    def _coarse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Flat numbers of the anchors' coarse pixels, [C, h, w], and their background."""
-        flat = np.arange(int(np.prod(self.shape))).reshape(self.shape)[:, ::_HALO_STEP, ::_HALO_STEP]
-        return flat, self._tracer.trace(flat.ravel(), _HALO_SPP, 0, False).reshape(flat.shape)
-
-    def _find_halo(self, t_s: float) -> np.ndarray:
-        flat, without = self._coarse
-        hard = self._ray_region(t_s)[:, ::_HALO_STEP, ::_HALO_STEP]
-        self._scene.place(t_s)
-        soft = ~hard
-        difference = np.zeros(flat.shape, np.float32)
-        difference[soft] = self._tracer.trace(flat[soft], _HALO_SPP, 0, True) - without[soft]
-        # mean over 5x5 coarse pixels outside the hard region: noise has both signs, a change has one
-        size = (0, 1.0, 1.0)
-        weight = ndimage.gaussian_filter(soft.astype(np.float32), size)
-        mean = ndimage.gaussian_filter(difference, size) / np.maximum(weight, 1e-6)
-        level = ndimage.gaussian_filter(without, size)
-        found = soft & (np.abs(mean) > _HALO_THRESHOLD * level)
-        found = ndimage.binary_opening(found, np.ones((1, 2, 2)))  # single coarse pixels are noise
-        fine = np.repeat(np.repeat(found, _HALO_STEP, 1), _HALO_STEP, 2)[:, : self.shape[1], : self.shape[2]]
-        return _grow(fine, round(_HALO_MOTION_PX / 2))
+        """Time between the anchors of soft light."""
+        speed = max_image_speed(self.world, self.cameras, self.world.duration_s, samples=5)
+        return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
 
 
 class ViewRenderer:
@@ -214,11 +187,11 @@ class ViewRenderer:
         return self._all.backgrounds()[0]
 
     def key(self, t_s: float) -> np.ndarray:
-        """[H, W] float32 at `t_s`: the background outside `changed`, traced inside."""
+        """[H, W] float32 at `t_s`: the background outside `changed`, relit or traced inside."""
         return self._all.keys(t_s)[0]
 
     def changed(self, t_s: float) -> np.ndarray:
-        """[H, W] bool: the pixels that `key` traces."""
+        """[H, W] bool: the pixels of `key` that are not simply the background."""
         return self._all.changed(t_s)[0]
 
     def object_mask(self, t_s: float) -> np.ndarray:
@@ -243,9 +216,3 @@ def _tracer(scene: MitsubaScene, cameras: Sequence[Camera], seed: int) -> Any:
     from spike4dgs.generators.wavefront import WavefrontTracer
 
     return WavefrontTracer(scene, cameras, seed, MAX_DEPTH)
-
-
-def _grow(region: np.ndarray, pixels: int) -> np.ndarray:
-    """Each view's region [C, H, W] grown by `pixels` in every direction."""
-    size = 2 * pixels + 1
-    return np.asarray(ndimage.maximum_filter(region, size=(1, size, size)))
