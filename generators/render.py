@@ -37,7 +37,7 @@ _GROW_PX = 3
 
 
 class MultiViewRenderer:
-    """Renders all `cameras` (of one resolution) of a world together: one launch per time. Pictures are [C, H, W] float32.
+    """Renders all `cameras` (one resolution) of a world together: one launch per time. Pictures are [C, H, W] float32.
 
     >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
     >>> pictures = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
@@ -83,7 +83,7 @@ class MultiViewRenderer:
         return picture
 
     def crn_frames(self, t_s: float) -> np.ndarray:
-        """Every pixel traced at `t_s` with the random numbers that `keys` uses; for measuring what `keys` leaves out."""
+        """Every pixel traced at `t_s` with the random numbers of `keys`; for measuring what `keys` leaves out."""
         self._scene.place(t_s)
         return self._whole(self.spp, 0, True)
 
@@ -97,9 +97,7 @@ class MultiViewRenderer:
         frames = []
         for camera in self.cameras:
             sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, spp)
-            rgb = np.array(
-                mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1, spp=spp)
-            )
+            rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1))
             frames.append(rgb[..., :3] @ np.array([0.212671, 0.715160, 0.072169], np.float32))
         return np.stack(frames) * np.float32(self.world.exposure)
 

@@ -1,4 +1,4 @@
-"""The camera array of a world: nine cameras in a 3x3 grid, named row by row from the top left, `cam_04` in the middle."""
+"""The camera array of a world: nine cameras, 3x3, named row by row from the top left; `cam_04` is in the middle."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ square tiles by `mi.render`. A tile's seed depends on (seed, camera, tile, strea
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -72,7 +73,7 @@ class TileTracer:
         return load_sensor(camera, film, spp)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), and whether an instance was hit."""
+        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), whether on an instance."""
         scene = self._scene.full if moving else self._scene.empty
         distance, on_instance = np.full(len(origins), np.inf, np.float32), np.zeros(len(origins), bool)
         for k, (o, d) in enumerate(zip(origins.tolist(), directions.tolist(), strict=True)):
@@ -83,7 +84,9 @@ class TileTracer:
 
 
 def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:
-    """A Mitsuba sensor for `camera` with a box-filtered linear film, whole or cropped."""
+    """A Mitsuba sensor for `camera` with a box-filtered linear film, whole or cropped; at least `spp` samples."""
+    rows = math.isqrt(spp)
+    strata = rows * -(-spp // rows)  # Mitsuba would take as many itself, with a warning for every sensor
     return mi.load_dict(
         {
             "type": "perspective",
@@ -92,6 +95,6 @@ def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(mitsuba_to_world(camera)),
             "film": {"pixel_format": "rgb", "component_format": "float32", "rfilter": {"type": "box"}, **film},
-            "sampler": {"type": "multijitter", "sample_count": spp},
+            "sampler": {"type": "multijitter", "sample_count": strata},
         }
     )

@@ -19,7 +19,7 @@ _LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), cha
 
 
 class PixelSampler(mi.Sampler):  # type: ignore[misc]
-    """Correlated multi-jittered samples (Kensler 2013) that depend on nothing but the pixel's key and the sample number.
+    """Correlated multi-jittered samples (Kensler 2013) that depend on the pixel's key and the sample number alone.
 
     Mitsuba's own samplers number their sequences by lane, so a pixel's samples would change with the list of pixels
     traced. `count` must be a power of two: its permutations then need no rejection loop.
@@ -140,7 +140,7 @@ class WavefrontTracer:
         return ray
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), and whether an instance was hit."""
+        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), whether on an instance."""
         o, d = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (origins, directions))
         scene = self._scene.full if moving else self._scene.empty
         hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d))

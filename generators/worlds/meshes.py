@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles: vertices [N, 3] float64 metres, faces [M, 3] int64, uv [N, 2] float64; smooth = interpolate normals."""
+    """Triangles: vertices [N, 3] float64 metres, faces [M, 3] int64, uv [N, 2]; smooth = interpolate normals."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -203,7 +203,7 @@ class Atlas:
         return round(rows * self.texels_per_m), round(max(self.length, 2 * self.width) * self.texels_per_m)
 
     def place(self, chart: str, p: np.ndarray) -> np.ndarray:
-        """Points [N, 3] on the body -> metres [N, 2] (right, down) in the texture for a chart near|far|top|front|back."""
+        """Points [N, 3] on the body -> metres [N, 2] (right, down) in the texture; chart near|far|top|front|back."""
         x, y, z = np.asarray(p, np.float64).T
         across, h = self.length / 2, self.height
         if chart == "near":
