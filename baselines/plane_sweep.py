@@ -18,6 +18,7 @@ from spike4dgs.benchmark.cameras import Camera
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 WINDOW = 5  # px, side of the correlation window: small enough for thin things at 125x200
 NOISE = 4e-4  # variance of a picture's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
@@ -54,14 +55,27 @@ def full_range(cameras: Sequence[Camera]) -> Float64:
     return step * np.arange(planes + 1)
 
 
-def narrow_range(maps: Sequence[DepthMap], planes: Float64) -> Float64:
-    """The part of `planes` in which the depths that are believed lie, with a margin of four planes."""
-    found = np.concatenate([m.inverse[m.score > MIN_SCORE] for m in maps])
+def find_range(cameras: Sequence[Camera], pictures: Float32) -> Float64:
+    """The inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
+
+    Everything is kept where nothing matches.
+    """
+    planes, step = full_range(cameras), inverse_depth_step(cameras)
+    half = [half_size(c) for c in cameras]
+    small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in pictures])
+    maps = [sweep(half, small, i, planes[::2]) for i in range(len(cameras))]
+    found = np.concatenate([m.inverse[agreed(half, maps, i)] for i, m in enumerate(maps)])
     if not len(found):
         return planes
     low, high = np.quantile(found, [0.002, 0.998])
-    step = planes[1] - planes[0]
-    return planes[(planes >= low - 4 * step) & (planes <= high + 4 * step)]
+    return planes[(planes >= low - 6 * step) & (planes <= high + 6 * step)]
+
+
+def half_size(camera: Camera) -> Camera:
+    """The same view with half as many pixels each way."""
+    c, width, height = camera, camera.width // 2, camera.height // 2
+    x, y = width / c.width, height / c.height
+    return Camera(c.id, width, height, c.fx * x, c.fy * y, c.cx * x, c.cy * y, c.R, c.t)
 
 
 def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> Float64:
@@ -75,20 +89,28 @@ def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> 
     return other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K)
 
 
-def sweep(cameras: Sequence[Camera], pictures: Float32, index: int, planes: Float64) -> DepthMap:
-    """Depth of view `index` from all other views; pictures [C, H, W], inverse depths `planes` ascending."""
-    reference, height, width = pictures[index], *pictures.shape[1:]
+def sweep(
+    cameras: Sequence[Camera], pictures: Float32, index: int, planes: Float64, pixels: Mask | None = None
+) -> DepthMap:
+    """Depth of view `index` from all other views; pictures [C, H, W], inverse depths `planes` ascending.
+
+    With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
+    """
+    top, left, bottom, right = _rectangle(pixels) if pixels is not None else (0, 0, *pictures.shape[1:])
+    reference = np.ascontiguousarray(pictures[index, top:bottom, left:right])
+    height, width = reference.shape
     mean = _box(reference)
     variance = _box(reference * reference) - mean * mean
     scores = np.zeros((len(planes), height, width), np.float32)
-    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
+    here = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
+    there = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # and back
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     for plane, w in enumerate(planes):
         total, seen = scores[plane], np.zeros((height, width), np.float32)
         for other in range(len(cameras)):
             if other == index:
                 continue
-            H = np.linalg.inv(centre) @ plane_homography(cameras[index], cameras[other], float(w)) @ centre
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            H = there @ plane_homography(cameras[index], cameras[other], float(w)) @ here
             warped = cv2.warpPerspective(
                 pictures[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
             )
@@ -96,7 +118,19 @@ def sweep(cameras: Sequence[Camera], pictures: Float32, index: int, planes: Floa
             total += np.maximum(_correlation(reference, mean, variance, warped), 0) * inside
             seen += inside
         total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
-    return _peak(scores, planes)
+    found = _peak(scores, planes)
+    whole = DepthMap(np.zeros(pictures.shape[1:], np.float32), np.full(pictures.shape[1:], -1, np.float32))
+    whole.inverse[top:bottom, left:right], whole.score[top:bottom, left:right] = found.inverse, found.score
+    return whole
+
+
+def _rectangle(pixels: Mask) -> tuple[int, int, int, int]:
+    """Top, left, bottom, right of the smallest rectangle that holds a mask and a margin of one window."""
+    rows, columns = np.nonzero(pixels.any(axis=1))[0], np.nonzero(pixels.any(axis=0))[0]
+    if not len(rows):
+        return 0, 0, 1, 1
+    top, left = max(0, int(rows[0]) - WINDOW), max(0, int(columns[0]) - WINDOW)
+    return top, left, int(rows[-1]) + 1 + WINDOW, int(columns[-1]) + 1 + WINDOW
 
 
 def _box(image: Float32) -> Float32:
@@ -126,14 +160,14 @@ def _peak(scores: Float32, planes: Float64) -> DepthMap:
     return DepthMap(inverse.astype(np.float32), at(best))
 
 
-def lift(camera: Camera, inverse: Float32, pixels: NDArray[np.bool_]) -> Float64:
+def lift(camera: Camera, inverse: Float32, pixels: Mask) -> Float64:
     """World points [N, 3] of the masked pixels, at their inverse depths."""
     v, u = np.nonzero(pixels)
     depth = 1 / np.maximum(inverse[v, u].astype(np.float64), 1e-9)
     return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
 
 
-def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> NDArray[np.bool_]:
+def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> Mask:
     """Pixels [H, W] of view `index` whose depth at least `MIN_AGREE` other views see at the same place."""
     camera, own = cameras[index], maps[index]
     believed = (own.score > MIN_SCORE) & (own.inverse > 0)

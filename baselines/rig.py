@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from spike4dgs.baselines.plane_sweep import DepthMap, agreed, full_range, lift, narrow_range, sweep
+from spike4dgs.baselines.plane_sweep import DepthMap, Mask, agreed, find_range, inverse_depth_step, lift, sweep
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.method.fit import Start
 
 Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
 CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
@@ -34,19 +33,19 @@ def rig(scene: TrainingScene, seed: int) -> Start:
     windows = _windows(scene.n_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
     moving = [_moving(np.stack(c)) for c in counts]
-    planes = full_range(scene.cameras)
-    maps = _sweep_all(scene.cameras, mean, planes)
-    planes = narrow_range(maps, planes)
+    planes = find_range(scene.cameras, mean)
+    maps = [sweep(scene.cameras, mean, i, planes) for i in range(len(scene.cameras))]
     clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
-    if any(m.any() for m in moving):
-        for place in (len(windows) // 2, 0, len(windows) - 1):
-            pictures = np.stack([c[place] for c in counts]) / np.float32(scene.radiance_gain * WINDOW_TICKS)
-            pixels = moving
-            if place != len(windows) // 2:
-                near = slice(max(0, place - 1), place + 2)
-                pixels = [m & ~_moving(np.stack(c[near])) for m, c in zip(moving, counts, strict=True)]
-            short = _sweep_all(scene.cameras, pictures.astype(np.float32), planes)
-            clouds.append(_points(scene.cameras, short, pictures, pixels))
+    middle, last = len(windows) // 2, len(windows) - 1
+    for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
+        pictures = np.stack([c[place] for c in counts]) / np.float32(scene.radiance_gain * WINDOW_TICKS)
+        pixels = moving
+        if place != middle:
+            near = slice(max(0, place - 1), place + 2)
+            pixels = [m & ~_moving(np.stack(c[near])) for m, c in zip(moving, counts, strict=True)]
+        pictures = pictures.astype(np.float32)
+        short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
+        clouds.append(_points(scene.cameras, short, pictures, pixels))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
     points, values = _thin(scene.cameras, points, values)
     points, values = _fill(scene.cameras, mean, points, values)
@@ -70,10 +69,6 @@ def _moving(counts: NDArray[np.int64]) -> Mask:
     changed = (counts.max(axis=0) - counts.min(axis=0) >= CHANGE).astype(np.uint8)
     opened = cv2.medianBlur(changed, 3)  # single pixels are noise
     return cv2.dilate(opened, np.ones((3, 3), np.uint8)).astype(bool)
-
-
-def _sweep_all(cameras: Sequence[Camera], pictures: Float32, planes: NDArray[np.float64]) -> list[DepthMap]:
-    return [sweep(cameras, pictures, i, planes) for i in range(len(cameras))]
 
 
 def _points(
@@ -102,7 +97,7 @@ def _thin(
 ) -> tuple[NDArray[np.float64], Float32]:
     """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
     uv, z = middle_camera(cameras).project(points)
-    step = full_range(cameras)[1] * 2  # 2 px of parallax in the widest pair
+    step = inverse_depth_step(cameras) * 2  # 2 px of parallax in the widest pair
     keep = z > 0
     cells = np.column_stack([np.floor(uv[keep] / CELL_PX), np.floor(1 / (z[keep] * step))]).astype(np.int64)
     _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
@@ -127,8 +122,8 @@ def _fill(
     axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     if not len(points):
-        far = full_range(cameras)[1]
-        return camera.unproject(grid, np.full(len(grid), 1 / far)), np.full(len(grid), mean.mean(), np.float32)
+        far = 1 / inverse_depth_step(cameras)
+        return camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32)
     distance, nearest = cKDTree(uv).query(grid, k=5)
     empty = distance[:, 0] > 2.0
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)

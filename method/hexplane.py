@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from spike4dgs.method.gaussians import Gaussians
+from spike4dgs.method.mlp import perceptron
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # the planes xy, xz, yz
 _CHANGES = {"means": 3, "log_scales": 3, "quats": 4, "logits": 1, "colors": 1}
@@ -114,12 +115,12 @@ class HexPlaneMotion(nn.Module):
 
     def changes(self, means: Tensor, t: float) -> dict[str, Tensor]:
         """What the field adds to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
-        hidden = self.hidden(self.trunk(self.planes(means, t)).relu()).relu()
-        parts = hidden.split(self.trunk.out_features, dim=-1)
-        out = {name: head(part) for (name, head), part in zip(self.last.items(), parts, strict=True)}
-        out["means"] = out["means"] * self.scale
-        out["logits"] = out["logits"][:, 0]
-        return out
+        heads = list(self.last.values())
+        last = torch.block_diag(*(head.weight for head in heads)), torch.cat([head.bias for head in heads])
+        layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
+        out = perceptron(self.planes(means, t), layers)
+        parts = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))
+        return {**parts, "means": parts["means"] * self.scale, "logits": parts["logits"][:, 0]}
 
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at the time t in [0, 1]."""

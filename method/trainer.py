@@ -7,6 +7,8 @@ and a fit that resumes from a checkpoint gives the bits of one that never stoppe
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +76,20 @@ def choose_time(settings: TrainSettings, stage: Stage, step: int, times: int, mo
 def seeded(seed: int, step: int) -> torch.Generator:
     """The random numbers of one step."""
     return torch.Generator().manual_seed((seed * 1_000_003 + step) % 2**63)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch's own threads spin while they wait and take the cores from the rasteriser's, which do most of the work.
+
+    Measured on 2 busy cores: 500 ms a step with torch's two threads, 36 ms with one.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Trainer:
@@ -181,13 +197,14 @@ class Trainer:
         if saved:
             self.restore(saved)
         written = time.monotonic()
-        while self.step < self.total:
-            loss = self.train_step()
-            if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == self.total):
-                save_checkpoint(checkpoint, self.state(), fit)
-                written = time.monotonic()
-            if self.step % 10 == 0 or self.step == self.total:
-                progress(self.step, self.total, f"loss {loss.item():.4f}, {len(self.gaussians)} Gaussians")
+        with one_torch_thread():
+            while self.step < self.total:
+                loss = self.train_step()
+                if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == self.total):
+                    save_checkpoint(checkpoint, self.state(), fit)
+                    written = time.monotonic()
+                if self.step % 10 == 0 or self.step == self.total:
+                    progress(self.step, self.total, f"loss {loss.item():.4f}, {len(self.gaussians)} Gaussians")
 
     def state(self) -> Checkpoint:
         """Everything that later steps depend on."""
