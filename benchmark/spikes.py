@@ -85,7 +85,8 @@ def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:
 def pack(spikes: NDArray[np.generic], rows_bottom_up: bool = True) -> UInt8:
     """Pack upright spikes [T, H, W] (non-zero fires) into rows [T, bytes_per_tick] of the file layout."""
     stored = spikes[:, ::-1] if rows_bottom_up else spikes
-    return np.packbits(stored.reshape(len(stored), -1) != 0, axis=1, bitorder="little")
+    flat = stored.reshape(len(stored), stored.shape[1] * stored.shape[2])
+    return np.packbits(flat != 0, axis=1, bitorder="little")
 
 
 def open_stream(
