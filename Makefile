@@ -10,7 +10,7 @@ SCENES := data/car-0-small data/turntable-0-small
 # The main job: two small scenes, four recipes, table, sheets and leaderboard entries. Killed runs resume.
 benchmark: $(STAMP)
 	$(BIN)/spike4dgs make-dataset car turntable --profile small --out data
-	$(BIN)/spike4dgs run-benchmark $(SCENES) --out runs/small --leaderboard runs/small/leaderboard
+	$(BIN)/spike4dgs run-benchmark $(SCENES) --out runs/small
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
