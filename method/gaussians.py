@@ -150,12 +150,12 @@ def share(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     With n copies (Kheradmand et al. 2024, eq. 9): o' = 1 - (1 - o)^(1/n) keeps the opacity at the centre, and
     s'/s = o / sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) keeps the integral along a line.
     """
-    n = copies.clamp(1, MAX_COPIES)
+    n = copies.clamp(1, MAX_COPIES).double()  # of integers, torch's 1 / n is float32
     o = opacity.double().clamp(1e-6, 1 - 1e-6)
     new = 1 - (1 - o) ** (1 / n)
     # Swapping the sums leaves one: sum over i of binom(i-1, k) for i <= n is binom(n, k+1).
     k = torch.arange(MAX_COPIES, dtype=torch.float64, device=o.device)
-    binomial = _log_binomial(n.double()[:, None], k + 1)
+    binomial = _log_binomial(n[:, None], k + 1)
     terms = torch.where(k < n[:, None], torch.exp(binomial + (k + 1) * new.log()[:, None]), 0.0)  # [K, MAX_COPIES]
     total = (terms * (-1) ** k / (k + 1).sqrt()).sum(-1)
     return new.to(opacity.dtype), (o / total).to(opacity.dtype)
