@@ -14,8 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from spike4dgs.baselines.plane_sweep import DepthMap, Mask, agreed, find_range, inverse_depth_step, lift, sweep
+from spike4dgs.baselines.plane_sweep import (
+    DepthMap,
+    Mask,
+    agreed,
+    find_range,
+    inverse_depth_step,
+    lift,
+    sweep,
+    widest_baseline,
+)
 from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.method.fit import Start
@@ -25,10 +35,17 @@ Float32 = NDArray[np.float32]
 WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
 CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
 CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
+NEIGHBOURS = 5  # points that tell the depth of a place without any
 
 
 def rig(scene: TrainingScene, seed: int) -> Start:
-    """First points of a scene; see the module. Nothing is random, `seed` is not used."""
+    """First points of a scene; see the module. Nothing is random, `seed` is not used.
+
+    Raises UserError where all cameras stand in one place.
+    """
+    if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
+        found = f"{len(scene.cameras)} in one place"
+        raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
     mean = np.stack([_rate(s, 0, scene.n_ticks) for s in scene.streams]) / np.float32(scene.radiance_gain)
     windows = _windows(scene.n_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
@@ -114,17 +131,20 @@ def _thin(
 def _fill(
     cameras: Sequence[Camera], mean: Float32, points: NDArray[np.float64], values: Float32
 ) -> tuple[NDArray[np.float64], Float32]:
-    """Add points where the middle camera sees none, at the inverse depth of the nearest point in its image."""
+    """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.
+
+    Fewer points than that are chance: all of the picture is then laid far away.
+    """
     camera = middle_camera(cameras)
     uv, z = camera.project(points)
     # The picture's border too: outer views see beyond the middle one.
     margin = 0.1 * np.array([camera.width, camera.height])
     axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    if not len(points):
+    if len(points) < NEIGHBOURS:
         far = 1 / inverse_depth_step(cameras)
         return camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32)
-    distance, nearest = cKDTree(uv).query(grid, k=5)
+    distance, nearest = cKDTree(uv).query(grid, k=NEIGHBOURS)
     empty = distance[:, 0] > 2.0
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
     added = camera.unproject(grid[empty], depth)
