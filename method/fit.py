@@ -112,9 +112,7 @@ class RecipeMethod:
         progress(0, 1, "pictures")
         footage = film(scene, start.cameras, images, settings, device)
         first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=device)
-        trainer = Trainer(
-            footage, first, motion, supervise(settings, scene), settings, scale=extent.scale, seed=seed
-        )
+        trainer = Trainer(footage, first, motion, supervise(settings, scene), settings, scale=extent.scale, seed=seed)
         trainer.run(progress, checkpoint, sha256_json([scene.revision, self.params, budget.scale, seed]))
         gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=device))
         return FittedModel(gaussians, motion, scene.duration_us, device)

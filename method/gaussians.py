@@ -45,9 +45,7 @@ class Gaussians:
 
     def trainable(self) -> Gaussians:
         """Detached copies that require gradients."""
-        return Gaussians(
-            **{k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()}
-        )
+        return Gaussians(**{k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()})
 
     def splats(self) -> Splats:
         """Activated values for the renderer."""

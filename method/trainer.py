@@ -228,5 +228,3 @@ class Trainer:
         self._begin(stage)
         import_state(self.adam, saved.part("adam"))
         self.pressure = Pressure(on["pressure"]["gradient"], on["pressure"]["seen"])
-
-

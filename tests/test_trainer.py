@@ -1,0 +1,240 @@
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.recipes import Budget, Recipe
+from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.density import Pressure, refine
+from spike4dgs.method.fit import FittedModel, Parts, RecipeMethod, Start, choose_ticks, film, measure
+from spike4dgs.method.gaussians import from_points
+from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.settings import TrainSettings, make_settings
+from spike4dgs.method.supervision import SUPERVISIONS
+from spike4dgs.method.trainer import Trainer, choose_time, seeded, stages
+
+from toy_world import ToyWorld
+
+WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)
+
+
+def silent(done: int, total: int, note: str = "") -> None:
+    pass
+
+
+def pictures(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
+    """A stand-in for the images part: mean of the spikes 12 ticks around."""
+    spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
+    return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
+
+
+def surfaces(scene: TrainingScene, seed: int) -> Start:
+    """A stand-in for the initialisation: noisy points on the true surfaces at the middle of the clip."""
+    rng = np.random.default_rng(seed)
+    points, values = [], []
+    for camera in scene.cameras[::2]:
+        image, depth, _ = WORLD.look(camera, 0.5)
+        v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
+        points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
+        values.append(image[v, u])
+    cloud = np.concatenate(points)
+    cloud += 0.01 * rng.normal(size=cloud.shape)
+    return Start(scene.cameras, cloud.astype(np.float32), np.concatenate(values).astype(np.float32))
+
+
+PARTS = Parts({"short": pictures}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
+QUICK = {"coarse_steps": 60, "fine_steps": 300, "mlp_width": 16, "features": 8, "views_per_step": 4}
+
+
+def method(motion: str, **settings: float) -> RecipeMethod:
+    return RecipeMethod(Recipe("test", "short", "true", motion, "pixel", {**QUICK, **settings}), PARTS)
+
+
+@cache
+def fitted(motion: str) -> FittedModel:
+    extra = {"coarse_steps": 160} if motion == "static" else {}
+    return method(motion, **extra).fit(WORLD.training, Budget(), "cpu", 0, silent)
+
+
+def psnr(model: FittedModel, moving: bool) -> float:
+    errors = []
+    for t in np.linspace(0.1, 0.9, 5):
+        truth, _, board = WORLD.look(WORLD.held_out, t)
+        error = (model.render(WORLD.held_out, t * WORLD.training.duration_us) - truth) ** 2
+        errors.append(error[board].mean() if moving else error.mean())
+    return float(-10 * np.log10(errors).mean())
+
+
+@pytest.mark.slow
+def test_a_moving_board_is_seen_from_a_new_place():
+    assert psnr(fitted("hexplane"), moving=False) > 25
+
+
+@pytest.mark.slow
+def test_deformation_beats_a_static_scene_where_things_move():
+    assert psnr(fitted("hexplane"), moving=True) > psnr(fitted("static"), moving=True) + 2
+
+
+def trainer(steps: int = 12, **settings: float) -> Trainer:
+    scene = WORLD.training
+    s = replace(
+        TrainSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, mlp_width=16, views_per_step=3),
+        refine_every=2,
+        time_spacing_ticks=40,
+        **settings,
+    )
+    start = surfaces(scene, 0)
+    extent = measure(start, scene)
+    first = from_points(start.points[::3], start.values[::3], opacity=0.5)
+    motion = MOTIONS["hexplane"](extent, s, seeded(0, -1))
+    footage = film(scene, start.cameras, pictures, s, "cpu")
+    return Trainer(footage, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
+
+
+class Killed(Exception):
+    pass
+
+
+def tensors(t: Trainer) -> dict[str, torch.Tensor]:
+    return {k: v.detach().clone() for k, v in t.state().tensors.items()}
+
+
+@cache
+def uninterrupted() -> dict[str, torch.Tensor]:
+    whole = trainer()
+    whole.run(silent)
+    return tensors(whole)
+
+
+@pytest.mark.parametrize("step", range(1, 12))
+def test_killed_at_any_step_and_resumed_gives_the_same_bits(step, tmp_path):
+    path = tmp_path / "fit.safetensors"
+    first = trainer()
+    original = first.train_step
+
+    def dies() -> torch.Tensor:
+        if first.step == step:
+            raise Killed
+        return original()
+
+    first.train_step = dies
+    with pytest.raises(Killed):
+        first.run(silent, path, "this", checkpoint_s=0)
+    second = trainer()
+    second.run(silent, path, "this")
+    result = tensors(second)
+    assert result.keys() == uninterrupted().keys()
+    for name, value in uninterrupted().items():
+        assert torch.equal(result[name], value), name
+
+
+def test_one_seed_one_result_and_another_seed_another():
+    again = trainer()
+    again.run(silent)
+    assert all(torch.equal(v, uninterrupted()[k]) for k, v in tensors(again).items())
+    other = trainer()
+    other.seed = 4
+    other.run(silent)
+    assert not torch.equal(tensors(other)["gaussians.means"][:50], uninterrupted()["gaussians.means"][:50])
+
+
+def test_refinement_changed_the_number_of_gaussians():
+    assert len(uninterrupted()["gaussians.means"]) != len(trainer().gaussians)
+
+
+def test_finished_fit_is_read_back_from_its_checkpoint(tmp_path):
+    path = tmp_path / "fit.safetensors"
+    small = method("hexplane", coarse_steps=2, fine_steps=3)
+    one = small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+    two = small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+    images = [m.render(WORLD.held_out, 3000.0) for m in (one, two)]
+    assert images[0].dtype == np.float32 and np.array_equal(*images) and path.is_file()
+
+
+def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
+    path = tmp_path / "fit.safetensors"
+    small = method("static", coarse_steps=1)
+    small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+    with pytest.raises(UserError, match="another fit's; delete it"):
+        small.fit(WORLD.training, Budget(), "cpu", 1, silent, path)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(UserError, match=r"fit.safetensors: expected a checkpoint, found damaged data"):
+        small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": "none"}, "expected images among short, found 'none'"),
+        ({"initialization": "colmap"}, "initialization among true"),
+        ({"motion": "wobble"}, "motion among hexplane, static"),
+        ({"supervision": "spike"}, "supervision among pixel"),
+    ],
+)
+def test_unknown_part_is_named(change, message):
+    recipe = replace(method("static").recipe, **change)
+    with pytest.raises(UserError, match=message):
+        RecipeMethod(recipe, PARTS).fit(WORLD.training, Budget(), "cpu", 0, silent)
+
+
+@pytest.mark.parametrize(("name", "value"), [("steps", 3), ("coarse_steps", 2.5), ("ramp", "slow"), ("levels", True)])
+def test_unknown_setting_or_wrong_type_is_refused(name, value):
+    with pytest.raises(UserError, match=name):
+        make_settings({name: value}, "recipe x")
+
+
+def test_device_that_is_not_there_is_refused():
+    with pytest.raises(UserError, match="device"):
+        method("static").fit(WORLD.training, Budget(), "cuda:63", 0, silent)
+
+
+def test_budget_scales_steps_only():
+    s = TrainSettings()
+    half = s.scaled(0.5)
+    assert (half.coarse_steps, half.fine_steps) == (s.coarse_steps // 2, s.fine_steps // 2)
+    assert replace(half, coarse_steps=s.coarse_steps, fine_steps=s.fine_steps) == s
+
+
+def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
+    s = TrainSettings(coarse_steps=200, fine_steps=400, ramp=0.5, coarse_share=0.2)
+    coarse, fine = stages(s, moves=True)
+    first = {choose_time(s, coarse, step, 100, True) for step in range(200)}
+    assert min(first) >= 39 and max(first) <= 60 and len(first) > 15
+    whole = {choose_time(s, fine, step, 100, True) for step in range(400, 600)}
+    assert min(whole) <= 1 and max(whole) >= 98 and len(whole) > 80
+    (only,) = stages(s, moves=False)
+    assert len({choose_time(s, only, step, 100, False) for step in range(200)}) > 95
+
+
+@pytest.mark.parametrize("n_ticks", [1, 5, 80, 400, 10000])
+def test_training_ticks_lie_inside_the_clip_and_are_bounded(n_ticks):
+    ticks = choose_ticks(n_ticks, TrainSettings())
+    assert 0 <= ticks[0] and ticks[-1] < n_ticks and len(ticks) <= 256 and list(ticks) == sorted(set(ticks))
+
+
+def test_extent_comes_from_the_points_and_not_only_from_the_array():
+    scene = WORLD.training
+    start = surfaces(scene, 0)
+    outlier = np.array([[1e5, 0, 0]], np.float32)
+    extent = measure(replace(start, points=np.concatenate([start.points, outlier])), scene)
+    assert extent.scale > 1.5  # the array's own radius is 0.57 m, the scene is 4 m away
+    assert float(extent.high[0]) < 10 and (extent.low < extent.high).all()
+
+
+def test_full_scene_relocates_and_open_scene_prunes_and_grows():
+    s = TrainSettings()
+    g = from_points(
+        np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32), np.ones(20, np.float32), opacity=0.5
+    )
+    g.logits[:5] = -10.0
+    pressure = Pressure(torch.full((20,), 1.0), torch.ones(20))
+    (moved,) = refine(g, pressure, s, 1.0, 15, torch.Generator())
+    assert len(moved.gaussians) == 20 and (moved.gaussians.logits > -6).all()
+    (grown,) = refine(g, pressure, s, 1.0, 40, torch.Generator())
+    assert len(grown.gaussians) == 30 and (grown.source[:5] < 15).sum() >= 0
+    (calm,) = refine(g, Pressure.zero(20, g.means.device), s, 1.0, 40, torch.Generator())
+    assert len(calm.gaussians) == 15 and (calm.source >= 5).all()
