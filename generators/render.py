@@ -32,7 +32,7 @@ from spike4dgs.generators.motion import max_image_speed
 from spike4dgs.generators.soft_light import MOTION_PX, SoftLight
 from spike4dgs.generators.worlds import WorldScene
 
-MAX_DEPTH = 4  # camera, surface, two bounces; measured against 8 in the tests
+MAX_DEPTH = 4  # camera, surface, two bounces
 _GROW_PX = 3
 
 
