@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Literal
 
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat.cpu import render_cpu
+from spike4dgs.method.splat.gsplat_cuda import render_cuda
 from spike4dgs.method.splat.reference import render_reference
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
-
-
-_BACKENDS = {"reference": render_reference, "cpu": render_cpu, "auto": render_cpu}
+_BACKENDS: dict[str, Callable[..., RenderOutput]] = {
+    "reference": render_reference,
+    "cpu": render_cpu,
+    "cuda": render_cuda,
+}
 
 
 def render(
@@ -44,11 +48,19 @@ def render(
     Raises:
         UserError: for wrong shapes, non-finite values, or a back end that is not installed.
     """
-    if background is not None and background.shape[-1:] != splats.colors.shape[1:]:
+    if background is not None and background.shape not in [(n,) for n in splats.colors.shape[1:]] + [
+        (len(views), splats.colors.shape[1])
+    ]:
         found, n = str(tuple(background.shape)), splats.colors.shape[1]
-        raise problem("background", f"[{n}] or [C, {n}]", found, "give one value per colour channel")
+        raise problem("background", f"[{n}] or [{len(views)}, {n}]", found, "give one value per colour channel")
     if not (near > 0 and eps2d >= 0):
         raise problem("render", "near > 0 and eps2d >= 0", f"near {near}, eps2d {eps2d}", "correct the argument")
+    if backend == "auto":
+        backend = "cuda" if splats.means.is_cuda else "cpu"
+    if backend not in _BACKENDS:
+        raise problem("backend", ", ".join(["auto", *_BACKENDS]), str(backend), "choose one of them")
+    if backend != "cuda" and splats.means.device.type != "cpu":
+        raise problem(f"back end {backend}", "tensors on the CPU", str(splats.means.device), "move them with .cpu()")
     out = _BACKENDS[backend](splats, views, depth=depth, antialiased=antialiased, near=near, eps2d=eps2d)
     if background is None:
         return out

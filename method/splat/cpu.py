@@ -15,13 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat import project_gradient, project_kernels, tile_kernels
 from spike4dgs.method.splat.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.jit import announce_compilation
 from spike4dgs.method.splat.raster_kernels import AHEAD, MAX_BLOCKS, raster_kernels, record_width
 from spike4dgs.method.splat.threads import aligned, get_threads, run
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
 from spike4dgs.method.splat.vector_ir import host_lanes
 
 Array = np.ndarray
@@ -106,8 +105,7 @@ def _render_view(
     announce_compilation(project_kernels.project_forward, "CPU splatting")
     run(project_kernels.project_forward, (*arguments, *outputs), [(m[0],) for m in memory])
     if n and invalid.max() >= 0:
-        found = f"NaN or infinity at Gaussian {invalid.max()}"
-        raise problem("splats", "finite parameters", found, "look for a diverging learning rate or a division by 0")
+        raise not_finite("geometry", int(invalid.max()))
     pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
     run(tile_kernels.fill_tiles, (keys, tiles, across, histogram, slots, pairs), [()] * threads)
     packed = _pack_colors(colors, depths if s.depth else None)
@@ -196,6 +194,8 @@ def render_cpu(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
     """Back end "cpu": see `render` for the arguments."""
+    if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
+        require_finite(splats)
     dtype = torch.float32
     if any(t.dtype == torch.float64 for t in splats.geometry):
         dtype = torch.float64

@@ -20,8 +20,26 @@ import numpy as np
 from spike4dgs.method.splat.blend_ir import MOMENTS
 from spike4dgs.method.splat.jit import helper, kernel
 from spike4dgs.method.splat.project_kernels import (
-    BLOCK, CULLED, MX, MY, MZ, OP, QW, QX, QY, QZ, SX, SY, SZ,
-    camera_constants, cross, dot, gather_parameters, half_covariance, jacobian, rotation,
+    BLOCK,
+    CULLED,
+    MX,
+    MY,
+    MZ,
+    OP,
+    QW,
+    QX,
+    QY,
+    QZ,
+    SX,
+    SY,
+    SZ,
+    camera_constants,
+    cross,
+    dot,
+    gather_parameters,
+    half_covariance,
+    jacobian,
+    rotation,
 )  # fmt: skip
 from spike4dgs.method.splat.vector_ir import fetch_add
 
@@ -94,12 +112,12 @@ def gather_gradients(
     s: np.ndarray, l: int, i: int, slots: Any, sums: Any, d_colors: Any, depth_channel: int, per_chunk: int  # noqa: E741
 ) -> None:  # fmt: skip
     """Add up Gaussian i's records over its tiles, in their order, into lane l and d_colors[i]."""
-    for row in range(MOMENTS):
-        total = 0.0
-        for chunk in range(sums.shape[0]):
-            for slot in range(slots[i], slots[i + 1]):
-                total += sums[chunk, slot, row]
-        s[M0 + row * BLOCK + l] = total
+    m0, mp, mq, mpp, mpq, mqq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for chunk in range(sums.shape[0]):
+        for slot in range(slots[i], slots[i + 1]):
+            m0, mp, mq = m0 + sums[chunk, slot, 0], mp + sums[chunk, slot, 1], mq + sums[chunk, slot, 2]
+            mpp, mpq, mqq = mpp + sums[chunk, slot, 3], mpq + sums[chunk, slot, 4], mqq + sums[chunk, slot, 5]
+    s[M0 + l], s[MP + l], s[MQ + l], s[MPP + l], s[MPQ + l], s[MQQ + l] = m0, mp, mq, mpp, mpq, mqq
     s[GDEPTH + l] = 0.0
     for channel in range(d_colors.shape[1] + (depth_channel >= 0)):
         chunk, row, total = channel // per_chunk, MOMENTS + channel % per_chunk, 0.0

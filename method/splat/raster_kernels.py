@@ -42,56 +42,62 @@ def record_width(channels: int) -> int:
 
 
 @helper
-def interval(records: Any, r: int, x: int, x_end: int, box: Any, rows: int) -> Any:
-    """First and last + 1 block row that the ellipse meets in pixel columns x .. x + 7, relative to the tile's top."""
-    hx, top_at, ratio = records[r + 3], records[r + 4], records[r + 7]
-    dx = x + 0.5 - records[r]
+def load_record(records: Any, r: int) -> Any:
+    """The record at records[r:], as scalars: the compiler cannot know that writing the lists leaves it unchanged."""
+    return (
+        records[r], records[r + 1], records[r + 2], records[r + 3],
+        records[r + 4], records[r + 5], records[r + 6], records[r + 7],
+    )  # fmt: skip
+
+
+@helper
+def rows_met(g: Any, dx: float, box: Any, rows: int) -> Any:
+    """First and last + 1 block row, counted from the tile's top, where the ellipse meets columns dx .. dx + 7.
+
+    dx: offset from the Gaussian's centre. The ellipse's upper and lower edge are the ridge line plus and minus
+    ratio * sqrt(hx^2 - dx^2); their extremes in the columns lie at the topmost point or at the nearest column.
+    """
+    _, y, slope, hx, top_at, _, _, ratio = g
     left, right = max(dx, -hx), min(dx + (BLOCK_WIDTH - 1), hx)
     high, low = min(max(top_at, left), right), min(max(-top_at, left), right)
-    middle = records[r + 1] - box[2]
-    far = middle + records[r + 2] * high + ratio * math.sqrt(max(hx * hx - high * high, 0.0)) + SLACK
-    near = middle + records[r + 2] * low - ratio * math.sqrt(max(hx * hx - low * low, 0.0)) - SLACK
+    far = y - box[2] + slope * high + ratio * math.sqrt(max(hx * hx - high * high, 0.0)) + SLACK
+    near = y - box[2] + slope * low - ratio * math.sqrt(max(hx * hx - low * low, 0.0)) - SLACK
     height = float(box[3] - box[2])
     first = ceil_int(min(max(near, 0.0), height)) // rows
-    last = (floor_int(min(max(far, 0.0), height)) + rows - 1) // rows
-    return first, (last if x < x_end else 0)
+    return first, (floor_int(min(max(far, 0.0), height)) + rows - 1) // rows
 
 
 @template
-def list_column(
-    variant: Any, records: Any, r: int, x: int, x_end: int, box: Any, rows: int, starts: Any, xis: Any, etas: Any, at: int
-) -> int:  # fmt: skip
+def list_column(variant: Any, g: Any, x: int, x_end: int, box: Any, rows: int, lists: Any, at: int) -> int:
     """Append the blocks of pixel columns x .. x + 7; returns the new length of the list. No branches."""
-    first, last = interval(records, r, x, x_end, box, rows)
-    dx = x + 0.5 - records[r]
-    dy = box[2] + first * rows + 0.5 - records[r + 1]
-    eta_scale = records[r + 6]
-    eta = eta_scale * (dy - records[r + 2] * dx)
+    dx = x + 0.5 - g[0]
+    first, last = rows_met(g, dx, box, rows)
+    eta = g[6] * (box[2] + first * rows + 0.5 - g[1] - g[2] * dx)
     start = (first * ROW_WIDTH + x - box[0]) * rows
-    emit_blocks(variant, starts, xis, etas, at, start, records[r + 5] * dx, eta, eta_scale * rows)
-    return at + max(last - first, 0)
+    emit_blocks(variant, lists[0], lists[1], lists[2], at, start, g[5] * dx, eta, g[6] * rows)
+    return at + (max(last - first, 0) if x < x_end else 0)
 
 
 @template
-def list_blocks(
-    variant: Any, records: Any, order: Any, begin: int, end: int, box: Any, rows: int, starts: Any, xis: Any,
-    etas: Any, ends: Any,
-) -> None:  # fmt: skip
-    """Blocks of the Gaussians order[begin:end] in the tile box (x0, x1, y0, y1); ends[k] bounds the k-th's run."""
+def list_blocks(variant: Any, records: Any, order: Any, begin: int, end: int, box: Any, rows: int, lists: Any) -> None:
+    """Blocks of the Gaussians order[begin:end] in the tile box (x0, x1, y0, y1).
+
+    lists: starts, xis, etas of the blocks, and ends, where the k-th Gaussian's run ends.
+    """
     at = 0
     for m in range(begin, end):
         prefetch(records, np.int64(order[m + AHEAD]) * 8)
-        r = np.int64(order[m]) * 8
-        x = max(ceil_int(max(records[r] - records[r + 3] - 0.5, 0.0)), box[0])
-        x_end = min(floor_int(min(records[r] + records[r + 3] + 0.5, float(box[1]))), box[1])
-        at = list_column(variant, records, r, x, x_end, box, rows, starts, xis, etas, at)
+        g = load_record(records, np.int64(order[m]) * 8)
+        x = max(ceil_int(max(g[0] - g[3] - 0.5, 0.0)), box[0])
+        x_end = min(floor_int(min(g[0] + g[3] + 0.5, float(box[1]))), box[1])
+        at = list_column(variant, g, x, x_end, box, rows, lists, at)
         # Usually empty, but computing it costs less than a mispredicted branch.
-        at = list_column(variant, records, r, x + BLOCK_WIDTH, x_end, box, rows, starts, xis, etas, at)
+        at = list_column(variant, g, x + BLOCK_WIDTH, x_end, box, rows, lists, at)
         x += 2 * BLOCK_WIDTH
         while x < x_end:
-            at = list_column(variant, records, r, x, x_end, box, rows, starts, xis, etas, at)
+            at = list_column(variant, g, x, x_end, box, rows, lists, at)
             x += BLOCK_WIDTH
-        ends[m - begin] = at
+        lists[3][m - begin] = at
 
 
 @helper
@@ -143,7 +149,7 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
                 at = begin
                 while at < end and any_unfinished(variant, buffer, vectors):
                     stop = min(end, at + BATCH)
-                    list_blocks(variant, records, order, at, stop, box, rows, starts, xis, etas, ends)
+                    list_blocks(variant, records, order, at, stop, box, rows, (starts, xis, etas, ends))
                     first = 0
                     for k in range(stop - at):
                         last, i = np.int64(ends[k]), np.int64(order[at + k])
@@ -198,7 +204,7 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
                 at = begin
                 while at < end:
                     stop = min(end, at + BATCH)
-                    list_blocks(variant, records, order, at, stop, box, rows, starts, xis, etas, ends)
+                    list_blocks(variant, records, order, at, stop, box, rows, (starts, xis, etas, ends))
                     first = 0
                     for k in range(stop - at):
                         last, i = np.int64(ends[k]), np.int64(order[at + k])

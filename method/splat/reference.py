@@ -18,7 +18,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, T_MIN, RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    FRUSTUM_MARGIN,
+    T_MIN,
+    RenderOutput,
+    Splats,
+    Views,
+    require_finite,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +121,7 @@ def render_reference(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
     """Back end "reference": see `render` for the arguments. Computes in float64, answers in the dtype of colors."""
+    require_finite(splats)
     dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
     wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))
     w2c, K = views.w2c.double(), views.K.double()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becomes 0
@@ -112,3 +112,17 @@ class RenderOutput:
     def visible(self) -> Tensor:
         """[C, N] bool: near enough, opaque enough, and its ellipse covers at least one pixel centre."""
         return self.radii > 0
+
+
+def require_finite(splats: Splats) -> None:
+    """Raise UserError if any parameter is NaN or infinite."""
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        bad = torch.nonzero(~torch.isfinite(getattr(splats, name).detach()))
+        if len(bad):
+            raise not_finite(name, int(bad[0, 0]))
+
+
+def not_finite(name: str, index: int) -> UserError:
+    """The error for a parameter that is NaN or infinite."""
+    fix = "look for a diverging learning rate or a division by 0"
+    return problem(f"Splats.{name}", "finite numbers", f"NaN or infinity at Gaussian {index}", fix)
