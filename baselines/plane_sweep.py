@@ -52,7 +52,7 @@ def full_range(cameras: Sequence[Camera]) -> Float64:
     """Inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
     step = inverse_depth_step(cameras)
     planes = int(MAX_PARALLAX * cameras[0].width / PARALLAX_STEP)
-    return step * np.arange(planes + 1)
+    return step * np.arange(planes + 1, dtype=np.float64)
 
 
 def find_range(cameras: Sequence[Camera], pictures: Float32) -> Float64:
@@ -86,7 +86,7 @@ def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> 
     """
     R = other.R @ reference.R.T
     t = other.t - R @ reference.t
-    return other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K)
+    return np.asarray(other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K))
 
 
 def sweep(
@@ -134,14 +134,14 @@ def _rectangle(pixels: Mask) -> tuple[int, int, int, int]:
 
 
 def _box(image: Float32) -> Float32:
-    return cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32) -> Float32:
     mean_b = _box(b)
     variance_b = _box(b * b) - mean_b * mean_b
     both = _box(a * b) - mean_a * mean_b
-    return both / np.sqrt((variance_a + NOISE) * (variance_b + NOISE))
+    return np.asarray(both / np.sqrt((variance_a + NOISE) * (variance_b + NOISE)), np.float32)
 
 
 def _peak(scores: Float32, planes: Float64) -> DepthMap:

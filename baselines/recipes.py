@@ -22,7 +22,7 @@ RECIPES = (
         initialization="rig",
         motion="static",
         supervision="pixel",
-        settings={"coarse_steps": 1000},
+        settings={"coarse_steps": 1500},
     ),
 )
 

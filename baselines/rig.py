@@ -55,14 +55,12 @@ def rig(scene: TrainingScene, seed: int) -> Start:
     clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
     middle, last = len(windows) // 2, len(windows) - 1
     for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
-        pictures = np.stack([c[place] for c in counts]) / np.float32(scene.radiance_gain * WINDOW_TICKS)
-        pixels = moving
-        if place != middle:
-            near = slice(max(0, place - 1), place + 2)
-            pixels = [m & ~_moving(np.stack(c[near])) for m, c in zip(moving, counts, strict=True)]
-        pictures = pictures.astype(np.float32)
+        start, stop = windows[place]
+        pictures = np.stack([_rate(s, start, stop) for s in scene.streams]) / np.float32(scene.radiance_gain)
+        near = slice(max(0, place - 1), place + 2)
+        quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
-        clouds.append(_points(scene.cameras, short, pictures, pixels))
+        clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
     points, values = _thin(scene.cameras, points, values)
     points, values = _fill(scene.cameras, mean, points, values)
@@ -72,8 +70,8 @@ def rig(scene: TrainingScene, seed: int) -> Start:
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
     """Mean spikes per tick [H, W]; clips of any length are counted in parts."""
     parts = range(start, stop, 65535)
-    total = sum(stream.counts(a, min(a + 65535, stop)).astype(np.float64) for a in parts)
-    return (total / (stop - start)).astype(np.float32)
+    total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
+    return np.asarray(total / (stop - start), np.float32)
 
 
 def _windows(n_ticks: int) -> list[tuple[int, int]]:

@@ -45,6 +45,8 @@ class HexPlane(nn.Module):
     def __init__(self, shape: HexPlaneShape, low: Tensor, high: Tensor, generator: torch.Generator) -> None:
         super().__init__()
         self.shape = shape
+        self.low: Tensor
+        self.high: Tensor
         self.register_buffer("low", low.float().clone())
         self.register_buffer("high", high.float().clone())
         f = shape.features
@@ -109,14 +111,13 @@ class HexPlaneMotion(nn.Module):
         for layer in (self.trunk, self.hidden):
             nn.init.xavier_uniform_(layer.weight, generator=generator)
             nn.init.zeros_(layer.bias)
-        for head in self.last.values():
-            nn.init.zeros_(head.weight)
-            nn.init.zeros_(head.bias)
+        for parameter in self.last.parameters():
+            nn.init.zeros_(parameter)
 
     def changes(self, means: Tensor, t: float) -> dict[str, Tensor]:
         """What the field adds to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
-        heads = list(self.last.values())
-        last = torch.block_diag(*(head.weight for head in heads)), torch.cat([head.bias for head in heads])
+        final: list[Tensor] = list(self.last.parameters())  # weight, bias, weight, bias, ...
+        last = torch.block_diag(*final[0::2]), torch.cat(final[1::2])
         layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
         out = perceptron(self.planes(means, t), layers)
         parts = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))

@@ -147,6 +147,6 @@ class _Levels(torch.autograd.Function):
 
 
 def sample_levels(unit: Tensor, lines: list[Tensor], space: list[Tensor]) -> Tensor:
-    """Products of all levels: unit coordinates [N, 3], lines of [3, R, F], planes of [3, R, R, F] -> [N, levels * F]."""
+    """Products of all levels: unit points [N, 3], lines of [3, R, F], planes of [3, R, R, F] -> [N, levels * F]."""
     out: Tensor = _Levels.apply(unit, len(space), *space, *(line.contiguous() for line in lines))
     return out

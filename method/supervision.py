@@ -1,4 +1,4 @@
-"""The supervision part of a recipe: what is compared with what. A new one is a function and a line in `SUPERVISIONS`."""
+"""A recipe's supervision: what is compared with what. A new one is a function and a line in `SUPERVISIONS`."""
 
 from __future__ import annotations
 

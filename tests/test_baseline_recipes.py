@@ -1,63 +1,144 @@
+from __future__ import annotations
+
+import dataclasses
 import json
-from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from spike4dgs.baselines.recipes import METHODS, RECIPES
-from spike4dgs.baselines.spike_to_image import IMAGES
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.recipes import Budget, find_methods
-from spike4dgs.benchmark.scene import TrainingScene
 
-from toy_world import ToyWorld
+from spike4dgs.baselines.recipes import METHODS, PARTS, RECIPES
+from spike4dgs.baselines.spike_to_image.tfp import tfp_image
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.recipes import Budget, Recipe, find_methods, get_method
+from spike4dgs.benchmark.scene import Scene, TrainingScene, open_scene
+from spike4dgs.method.fit import RecipeMethod
 
-
-@cache
-def scene() -> TrainingScene:
-    return ToyWorld(width=40, height=24, n_ticks=120).training
+TINY = Budget(scale=0.01)
+NAMES = ["nearest-view", "tfi+4dgs", "tfp+4dgs", "tfp+static"]
 
 
-def silent(done: int, total: int, note: str = "") -> None:
-    pass
+def quiet(done: int, total: int, note: str = "") -> None:
+    """A progress that nobody watches."""
 
 
-def test_the_four_recipes_are_registered_under_their_names():
-    assert list(METHODS) == ["tfi+4dgs", "tfp+4dgs", "tfp+static", "nearest-view"]
+@pytest.fixture
+def scene(small_scene: Path) -> Scene:
+    return open_scene(small_scene)
+
+
+def test_the_four_methods_have_the_names_that_results_are_compared_by() -> None:
+    assert sorted(METHODS) == NAMES
+    assert all(method.name == name for name, method in METHODS.items())
+    assert [r.name for r in RECIPES] == ["tfi+4dgs", "tfp+4dgs", "tfp+static"]
+
+
+def test_the_entry_point_finds_them() -> None:
     found = find_methods()
-    assert all(found[name] is METHODS[name] and METHODS[name].name == name for name in METHODS)
+    assert all(found[name] is METHODS[name] for name in NAMES)
+    assert get_method("tfp+static") is METHODS["tfp+static"]
 
 
-def test_parameters_are_plain_values_and_name_every_setting():
-    for name, method in METHODS.items():
-        assert json.loads(json.dumps(method.params)) == method.params and method.params["name"] == name
-    assert METHODS["tfp+4dgs"].params["settings"]["ssim_weight"] == 0.2
+@pytest.mark.parametrize("name", NAMES)
+def test_params_survive_json(name: str) -> None:
+    params = METHODS[name].params
+    assert json.loads(json.dumps(params, allow_nan=False)) == params
+    assert params["name"] == name
 
 
-def test_recipes_that_are_compared_differ_in_one_part():
+def test_params_tell_recipes_and_settings_apart() -> None:
+    texts = {json.dumps(m.params, sort_keys=True) for m in METHODS.values()}
+    changed = RecipeMethod(dataclasses.replace(RECIPES[0], settings={"levels": 1}), PARTS)
+    texts.add(json.dumps(changed.params, sort_keys=True))
+    assert len(texts) == 5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
+    reports: list[tuple[int, int]] = []
+    model = METHODS[name].fit(
+        scene.training, TINY, "cpu", 0, lambda done, total, note="": reports.append((done, total))
+    )
+    target = scene.targets[1]
+    camera = scene.cameras[target.camera]
+    image = model.render(camera, scene.t_us(target.tick))
+    assert image.shape == (camera.height, camera.width) and image.dtype == np.float32
+    assert np.isfinite(image).all() and image.min() >= 0
+    assert abs(image.mean() - scene.ground_truth(target).mean()) < 0.15
+    assert reports[-1][0] == reports[-1][1] and all(0 <= done <= total for done, total in reports)
+    for t_us in (-5.0, 0.0, scene.training.duration_us, 1e9):  # the clip's ends and beyond
+        assert np.isfinite(model.render(camera, t_us)).all()
+
+
+def test_nearest_view_is_the_nearest_training_cameras_tfp(scene: Scene) -> None:
+    model = METHODS["nearest-view"].fit(scene.training, TINY, "cpu", 0, quiet)
+    for tick in (0, 20, 60, scene.n_ticks - 1):
+        # The cameras stand in a row and cam_03 is held out, next to cam_02.
+        expected = tfp_image(scene.stream("cam_02"), tick) / scene.radiance_gain
+        np.testing.assert_allclose(model.render(scene.cameras["cam_03"], scene.t_us(tick)), expected, rtol=1e-6)
+    own = model.render(scene.cameras["cam_00"], scene.t_us(40))
+    np.testing.assert_allclose(own, tfp_image(scene.stream("cam_00"), 40) / scene.radiance_gain, rtol=1e-6)
+
+
+def test_nearest_view_does_not_depend_on_the_order_of_far_cameras(scene: Scene) -> None:
+    training = scene.training
+    order = [2, 0, 1]
+    mixed = dataclasses.replace(
+        training, cameras=tuple(training.cameras[i] for i in order), streams=tuple(training.streams[i] for i in order)
+    )
+    pictures = [
+        METHODS["nearest-view"].fit(s, TINY, "cpu", 0, quiet).render(scene.cameras["cam_03"], 2000.0)
+        for s in (training, mixed)
+    ]
+    np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize("part", ["images", "initialization", "motion", "supervision"])
+def test_an_unknown_part_is_named(part: str, scene: Scene) -> None:
+    parts: dict[str, Any] = {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"}
+    method = RecipeMethod(Recipe("mine", **{**parts, part: "nothing"}), PARTS)
+    with pytest.raises(UserError, match=f"recipe mine: expected {part} among .*found 'nothing'"):
+        method.fit(scene.training, TINY, "cpu", 0, quiet)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [({"levle": 2}, "'levle'"), ({"levels": 2.5}, "2.5"), ({"ramp": "0.5"}, "'0.5'"), ({"levels": True}, "True")],
+)
+def test_an_unknown_or_mistyped_setting_is_named(overrides: dict[str, Any], found: str) -> None:
+    recipe = Recipe("mine", "tfp", "rig", "static", "pixel", settings=overrides)
+    with pytest.raises(UserError, match=f"recipe mine: expected .*found {found}"):
+        RecipeMethod(recipe, PARTS)
+
+
+def test_a_device_that_is_not_there_is_a_user_error(scene: Scene) -> None:
+    with pytest.raises(UserError, match="device: expected cpu, or a CUDA device.*--device cpu"):
+        METHODS["tfp+static"].fit(scene.training, TINY, "cuda:99", 0, quiet)
+
+
+def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path) -> None:
+    method, path = METHODS["tfp+static"], tmp_path / "fit.safetensors"
+    camera = scene.cameras["cam_03"]
+
+    def fit(training: TrainingScene = scene.training, budget: Budget = TINY, seed: int = 0) -> np.ndarray:
+        return method.fit(training, budget, "cpu", seed, quiet, path).render(camera, 2000.0)
+
+    first = fit()
+    np.testing.assert_array_equal(fit(), first)
+    foreign: list[dict[str, Any]] = [
+        {"seed": 1},
+        {"budget": Budget(0.02)},
+        {"training": dataclasses.replace(scene.training, revision="0" * 64)},
+    ]
+    for other in foreign:
+        with pytest.raises(UserError, match="fit.safetensors: expected a checkpoint of this scene, recipe"):
+            fit(**other)
+
+
+def test_recipes_that_are_compared_differ_in_one_part() -> None:
     tfi, tfp, static = (r.as_dict() for r in RECIPES)
     assert [k for k in tfi if tfi[k] != tfp[k]] == ["name", "images"]
     assert [k for k in tfp if tfp[k] != static[k]] == ["name", "motion", "settings"]
-    assert set(static["settings"]) == {"coarse_steps"}
-
-
-@pytest.mark.parametrize("name", list(METHODS))
-def test_every_recipe_fits_and_renders(name):
-    reports = []
-    method = METHODS[name]
-    model = method.fit(scene(), Budget(0.005), "cpu", 0, lambda done, total, note="": reports.append((done, total)))
-    camera = ToyWorld(width=40, height=24).held_out
-    images = [model.render(camera, t_us) for t_us in (-10.0, 0.0, 3000.0, 1e9)]
-    assert all(i.shape == (24, 40) and i.dtype == np.float32 and np.isfinite(i).all() for i in images)
-    assert all((i >= 0).all() for i in images) and reports[-1][0] == reports[-1][1]
-    assert 0.2 < images[2].mean() < 0.8
-
-
-def test_nearest_view_shows_the_picture_of_the_nearest_camera():
-    model = METHODS["nearest-view"].fit(scene(), Budget(), "cpu", 0, silent)
-    for i, camera in enumerate(scene().cameras):
-        a = camera
-        near = Camera("test", a.width, a.height, a.fx, a.fy, a.cx, a.cy, a.R, a.t + 0.001)
-        expected = IMAGES["tfp"](scene().streams[i], [60], scene().radiance_gain)[0]
-        assert np.array_equal(model.render(near, 60 * 50.0), expected)
-    centre = ToyWorld(width=40, height=24).held_out  # four cameras are equally near: the first of them
-    assert np.array_equal(model.render(centre, 3000.0), IMAGES["tfp"](scene().streams[1], [60], 0.6)[0])
+    steps = METHODS["tfp+4dgs"].params["settings"]
+    assert static["settings"] == {"coarse_steps": steps["coarse_steps"] + steps["fine_steps"]}

@@ -3,15 +3,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from conftest import array_cameras
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.gaussians import Gaussians, densify, from_points, prune, relocate, share
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
 from spike4dgs.method.splat import Views, render
-
-from conftest import array_cameras
 
 RATES = {name: Decay(0.01, 0.001) for name in ("means", "log_scales", "quats", "logits", "colors")}
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from spike4dgs.method.gaussians import Gaussians
 from spike4dgs.method.hexplane import (
     HexPlane,

@@ -1,12 +1,12 @@
 import cv2
 import numpy as np
 import pytest
+from toy_world import GAIN, RATE_HZ, ToyWorld
+
 from spike4dgs.baselines.plane_sweep import agreed, find_range, full_range, half_size, lift, plane_homography, sweep
 from spike4dgs.baselines.rig import middle_camera, rig
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
-
-from toy_world import GAIN, RATE_HZ, ToyWorld
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
 

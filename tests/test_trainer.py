@@ -5,6 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from toy_world import ToyWorld
+
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.recipes import Budget, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
@@ -16,8 +18,6 @@ from spike4dgs.method.motion import MOTIONS
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.supervision import SUPERVISIONS
 from spike4dgs.method.trainer import Trainer, choose_time, seeded, stages
-
-from toy_world import ToyWorld
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)
 

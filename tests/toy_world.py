@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
 from spike4dgs.benchmark.cameras import Camera, look_at
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream, pack
