@@ -60,8 +60,8 @@ def pick_variant() -> str:
     if not why_not:
         return FAST
     print(
-        f"spike4dgs: rendering with {SAFE} because {FAST} does not work here ({why_not}); for about 5 times the speed install "
-        "libLLVM 19 (Debian: apt-get install libllvm19) or name one in DRJIT_LIBLLVM_PATH",
+        f"spike4dgs: rendering with {SAFE} because {FAST} does not work here ({why_not}); for about "
+        "5 times the speed install libLLVM 19 (Debian: apt-get install libllvm19) or name one in DRJIT_LIBLLVM_PATH",
         file=sys.stderr,
     )
     return SAFE
