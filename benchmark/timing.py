@@ -30,8 +30,7 @@ def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     table = Table(*columns, title=title)
     for row in rows:
         table.add_row(*row)
-    console = Console()
-    console.print(table, width=max(console.width, 120), crop=False, overflow="ignore")
+    Console(width=max(Console().width, 120)).print(table)
     if csv_path is not None:
         with atomic_path(csv_path) as part, open(part, "w", newline="") as f:
             csv.writer(f).writerows([columns, *rows])
