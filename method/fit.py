@@ -106,7 +106,7 @@ class RecipeMethod:
         progress(0, 1, "initialisation")
         start = initialize(scene, seed)
         extent = measure(start, scene)
-        motion = make_motion(_on(extent, device), settings, seeded(seed, -1))
+        motion = make_motion(extent, settings, seeded(seed, -1))
         if isinstance(motion, torch.nn.Module):
             motion.to(device)
         progress(0, 1, "pictures")
@@ -122,10 +122,6 @@ def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:
     if name not in table:
         raise problem(f"recipe {recipe.name}", f"{part} among {', '.join(sorted(table))}", repr(name), "correct it")
     return table[name]
-
-
-def _on(extent: Extent, device: str) -> Extent:
-    return Extent(extent.low.to(device), extent.high.to(device), extent.scale, extent.n_ticks, extent.width)
 
 
 def check_device(device: str) -> None:

@@ -45,7 +45,7 @@ class TrainSettings:
     grow_gradient: float = 2e-4  # mean screen-space gradient (half-image units) above which a Gaussian is densified
     split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
     min_opacity: float = 0.005  # fainter ones are removed
-    max_per_pixel: float = 0.5  # Gaussians per pixel of one view
+    max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
 
     # Deformation.
     cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
