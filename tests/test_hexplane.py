@@ -103,6 +103,42 @@ def test_kernel_equals_the_plain_twin_in_value_and_gradient(seed, size, features
         assert float((fast - slow).abs().max() if slow.numel() else 0) <= 2e-5 * scale
 
 
+def test_kernel_equals_the_plain_twin_on_cell_borders_and_far_outside_the_box():
+    g, steps = rng(3), torch.tensor([-1e4, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1e4])
+    unit = torch.cartesian_prod(steps, steps, steps)  # a plane of 5 x 5 has its values at multiples of 1/4
+    space, lines = torch.randn(3, 5, 5, 4, generator=g), torch.randn(3, 5, 4, generator=g)
+    weight = torch.randn(len(unit), 4, generator=g)
+    results = []
+    for fast in (True, False):
+        leaves = [x.clone().requires_grad_(True) for x in (unit, space, lines)]
+        out = sample_levels(leaves[0], [leaves[2]], [leaves[1]]) if fast else sample_level(*leaves)
+        (out * weight).sum().backward()
+        results.append([out.detach(), *(x.grad for x in leaves)])
+    for fast, slow in zip(*results, strict=True):
+        torch.testing.assert_close(fast, slow, rtol=1e-4, atol=1e-5 * float(slow.abs().max()))
+    outside = ((unit <= 0) | (unit >= 1)) & (results[0][1] != 0)
+    assert not outside.any()  # the border has no slope
+
+
+def test_levels_stand_side_by_side_and_do_not_mix():
+    g = rng(4)
+    unit = torch.rand(30, 3, generator=g)
+    space = [torch.randn(3, r, r, 4, generator=g) for r in (3, 6, 11)]
+    lines = [torch.randn(3, r, 4, generator=g) for r in (3, 6, 11)]
+    each = [sample_levels(unit, [a], [s]) for s, a in zip(space, lines, strict=True)]
+    assert torch.equal(sample_levels(unit, lines, space), torch.cat(each, 1))
+
+
+def test_start_middle_and_end_of_the_clip_train_different_rows():
+    planes = HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
+    touched = []
+    for t in (0.0, 0.5, 1.0):
+        planes.zero_grad()
+        planes(torch.rand(40, 3, generator=rng()), t).sum().backward()
+        touched.append([set(torch.nonzero(p.grad.abs().sum((0, 2, 3)))[:, 0].tolist()) for p in planes.time])
+    assert touched == [[{0}] * 2, [{3}] * 2, [{6}] * 2]
+
+
 def test_kernel_survives_points_that_are_no_numbers():
     unit = torch.tensor([[float("nan"), 0.5, 0.5], [float("inf"), -float("inf"), 0.1], [1e30, -1e30, 0.0]])
     sample_levels(unit, [torch.ones(3, 4, 2)], [torch.ones(3, 4, 4, 2)])
