@@ -139,7 +139,7 @@ class MultiViewRenderer:
     def _backgrounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The background at full quality, and its first part alone, which uses the keys' random numbers."""
         parts = [self._whole(self.spp, stream, False) for stream in range(self.background_spp // self.spp)]
-        return np.mean(parts, axis=0, dtype=np.float64).astype(np.float32), parts[0]
+        return np.asarray(np.mean(parts, axis=0, dtype=np.float64), dtype=np.float32), parts[0]
 
     def _whole(self, spp: int, stream: int, moving: bool) -> np.ndarray:
         gray = self._tracer.trace(np.arange(int(np.prod(self.shape))), spp, stream, moving)

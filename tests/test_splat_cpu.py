@@ -11,13 +11,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from splat_scenes import HARD, changed, far_origin, random_splats, views
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import RenderOutput, Splats, Views, cpu, render, set_threads
 from spike4dgs.method.splat.reference import cutoff_margin
-
-from splat_scenes import HARD, changed, far_origin, random_splats, views
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "w2c", "means2d")
 ON_CUTOFF = 1e-4  # relative distance to alpha = 1/255 or T = 1e-4 within which float32 may decide otherwise

@@ -64,7 +64,7 @@ def run(kernel: Any, arguments: Sequence[Any], scratch: Sequence[Sequence[Any]])
         with _lock:
             if _pool is None:
                 _pool = ThreadPoolExecutor(max(_threads - 1, 1), thread_name_prefix="splat")
-            helpers = [_pool.submit(kernel, *arguments, counter, *own) for own in scratch[1:]]
+            helpers = [_pool.submit(kernel, *(*arguments, counter, *own)) for own in scratch[1:]]
     kernel(*arguments, counter, *scratch[0])
     for helper in helpers:
         if not helper.cancel():
