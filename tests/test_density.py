@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from spike4dgs.benchmark.cameras import Camera, look_at
@@ -94,6 +95,18 @@ def test_a_gaussian_marked_for_both_is_split_only() -> None:
     g = cloud(3)
     edit = densify(g, mask(3, 1), mask(3, 1), torch.Generator())
     assert edit.source.tolist() == [0, 2, -1, -1]
+
+
+def test_halves_spread_along_the_axes_of_the_gaussian_that_is_split() -> None:
+    one = cloud(1, seed=4)
+    one.log_scales[0] = torch.tensor([0.1, 0.4, 1.0]).log()
+    everything = torch.ones(4000, dtype=torch.bool)
+    halves = densify(one.rows(torch.zeros(4000).long()), ~everything, everything, torch.Generator().manual_seed(0))
+    w, x, y, z = (one.quats[0] / one.quats[0].norm()).tolist()
+    R = torch.tensor(Rotation.from_quat([x, y, z, w]).as_matrix(), dtype=torch.float32)
+    spread = torch.cov((halves.gaussians.means - one.means).T)
+    torch.testing.assert_close(spread, R @ torch.diag(torch.tensor([0.01, 0.16, 1.0])) @ R.T, rtol=0.1, atol=0.02)
+    assert (halves.gaussians.means.mean(0) - one.means[0]).norm() < 0.05
 
 
 def test_relocated_gaussians_equal_their_hosts_and_leave_the_others_alone() -> None:

@@ -85,7 +85,9 @@ def test_background_that_the_middle_of_the_clip_hides_is_found_at_its_ends(t: fl
     u, v = np.clip(camera.project(points.astype(np.float64))[0], 0, [95, 59]).astype(int).T
     now = cv2.dilate(MOVING.look(camera, t)[2].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     shown = MOVING.look(camera, 0.5)[2] & ~now
-    assert (shown[v, u] & (np.abs(points[:, 1] - 1) < 0.2)).sum() > 0.1 * shown.sum() > 10
+    on_wall = shown[v, u] & (np.abs(points[:, 1] - 1) < 0.2)
+    assert shown.sum() > 100
+    assert on_wall.sum() > 0.35 * shown.sum()  # about 0.5; 0.2 to 0.25 without the clip's ends
 
 
 @pytest.mark.parametrize("seed", range(6))

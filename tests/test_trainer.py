@@ -204,6 +204,9 @@ def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
     coarse, fine = stages(s, moves=True)
     first = {choose_time(s, coarse, step, 100, True) for step in range(200)}
     assert min(first) >= 39 and max(first) <= 60 and len(first) > 15
+    opening = [[choose_time(s, fine, step, 100, True) for step in range(a, a + 40)] for a in (200, 260, 330)]
+    reach = [max(times) - min(times) for times in opening]
+    assert reach[0] < 40 and reach[0] + 15 < reach[1] and reach[1] + 15 < reach[2]
     whole = {choose_time(s, fine, step, 100, True) for step in range(400, 600)}
     assert min(whole) <= 1 and max(whole) >= 98 and len(whole) > 80
     (only,) = stages(s, moves=False)
