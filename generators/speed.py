@@ -109,13 +109,13 @@ def simulate(argv: Sequence[str] = ()) -> int:
 
 
 def _best(run: Callable[[], Iterator[UInt8]], repeats: int) -> tuple[float, UInt8]:
-    """Shortest wall time of the runs (after one that compiles, if there are several) and the last run's packed rows."""
+    """Shortest wall time of the runs, after one that is not counted (compilation), and the last run's packed rows."""
     times = []
-    for _ in range(repeats + (repeats > 1)):
+    for _ in range(repeats + 1):
         start = time.perf_counter()
         chunks = list(run())
         times.append(time.perf_counter() - start)
-    return min(times), np.concatenate(chunks)
+    return min(times[1:]), np.concatenate(chunks)
 
 
 def _show(rows: list[dict[str, str]], title: str) -> None:
