@@ -16,7 +16,7 @@ class TrainSettings:
     # Steps. One step renders several views at one time, where 4DGS takes one image: 1 step here is 4 there.
     coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
     fine_steps: int = 1200  # deforming stage (4DGS: 14000 single images)
-    views_per_step: int = 4  # they share one time and one deformation; 4 and 1200 steps beat 8 and 700 by 2 dB
+    views_per_step: int = 4  # they share one time and one deformation; of 8 views only half as many steps fit the time
     ramp: float = 0.3  # share of the fine stage in which the times open up from the middle to the whole clip
 
     # Times at which pictures are made from the spikes.
@@ -52,7 +52,7 @@ class TrainSettings:
     levels: int = 2  # multires 1, 2
     cell_ticks: float = 16.0  # time cell
     features: int = 16  # per plane and level, 4DGS's dynerf preset
-    mlp_width: int = 32  # a third of the time of 64, at no measured loss
+    mlp_width: int = 32  # 4DGS: 128; 32 takes 0.4 of the time of 64
     grid_rate: float = 1e-2
     grid_rate_last: float = 1e-3
     deformation_rate: float = 1e-3
