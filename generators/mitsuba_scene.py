@@ -28,6 +28,7 @@ class MitsubaScene:
             moving[f"group_{group}"] = {"type": "shapegroup", **members}
         for name, group in world.instances.items():
             moving[name] = {"type": "instance", "shapes": {"type": "ref", "id": f"group_{group}"}}
+        moving |= _shapes("deforming", {name: surface.part for name, surface in world.deforming.items()})
         self.empty = mi.load_dict({"type": "scene", **static})
         self.full = mi.load_dict({"type": "scene", **static, **moving})
         self._parameters = mi.traverse(self.full)
@@ -41,6 +42,9 @@ class MitsubaScene:
         mi = load_mitsuba()
         for name, pose in self._world.poses(t_s).items():
             self._parameters[f"{name}.to_world"] = mi.Transform4f(mi.ScalarTransform4f(pose))
+        for name, surface in self._world.deforming.items():
+            vertices = np.ascontiguousarray(surface.vertices(t_s), np.float32)
+            self._parameters[f"deforming_{name}.vertex_positions"] = vertices.ravel()
         self._parameters.update()
         self._placed_at = t_s
 

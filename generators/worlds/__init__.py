@@ -1,8 +1,8 @@
 """The worlds that the benchmark renders: every one a function of (seed, variant, duration). One line per world."""
 
 from spike4dgs.generators.worlds import car, turntable
-from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene
+from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene
 
-__all__ = ["WORLDS", "Part", "RigSpec", "World", "WorldScene"]
+__all__ = ["WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene"]
 
 WORLDS: dict[str, World] = {world.name: world for world in (car.WORLD, turntable.WORLD)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,21 @@ class Part(NamedTuple):
 
     mesh: Mesh
     material: Material
+
+
+@dataclass(frozen=True)
+class Deforming:
+    """A moving surface whose vertices go their own ways: wings, or many rigid bodies merged into one mesh.
+
+    Attributes:
+        part: topology, texture coordinates and material; its vertices are only placeholders of the right number.
+        vertices: time in seconds -> [N, 3] float64 world positions, always in the order of `part.mesh.vertices`.
+        bodies: [M] int64, the body that each face belongs to, from 0 up without holes; None where it is one body.
+    """
+
+    part: Part
+    vertices: Callable[[float], np.ndarray]
+    bodies: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -40,14 +55,14 @@ class RigSpec:
 
 @dataclass(frozen=True)
 class WorldScene:
-    """One concrete world: static surfaces, rigid moving instances, light and cameras. Metres, Z up, X right, Y away.
+    """One concrete world: what stands still, what moves, light and cameras. Metres, Z up, X right, Y away.
 
     Attributes:
         name: key in `WORLDS`.
         seed, variant, duration_s: the arguments it was built from; equal arguments give equal scenes.
         static: surfaces that never move.
         groups: rigid groups of surfaces in their own coordinates; an instance shows one group at a pose.
-        instances: instance name -> group name. Only these move.
+        instances: instance name -> group name. Only these and `deforming` move.
         emitters: Mitsuba emitter dictionaries (numbers, lists and numpy arrays only).
         poses: time in seconds -> {instance name: [4, 4] float64 local-to-world}.
         exposure: factor from rendered radiance to scene units, in which white paper in full light is 1.0.
@@ -56,6 +71,7 @@ class WorldScene:
             one of them is crossed by a moving instance lies in its shadow.
         depth_range: (near, far) metres that enclose everything the cameras see.
         notes: physical facts worth recording with the data (speed, size), name -> number with the unit in the name.
+        deforming: moving surfaces that are not rigid, name -> surface.
     """
 
     name: str
@@ -72,6 +88,7 @@ class WorldScene:
     shadow_sources: np.ndarray
     depth_range: tuple[float, float]
     notes: Mapping[str, float]
+    deforming: Mapping[str, Deforming] = field(default_factory=dict)
 
     def moving_points(self, t_s: float) -> np.ndarray:
         """World positions of all moving vertices at `t_s`, always in the same order: [N, 3] float64."""
@@ -80,6 +97,7 @@ class WorldScene:
         for instance, group in self.instances.items():
             local = np.concatenate([part.mesh.vertices for part in self.groups[group]])
             chunks.append(local @ poses[instance][:3, :3].T + poses[instance][:3, 3])
+        chunks += [surface.vertices(t_s) for surface in self.deforming.values()]
         return np.concatenate(chunks)
 
 
