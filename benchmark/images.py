@@ -1,8 +1,11 @@
-"""Image files: half-float EXR for linear radiance, 8-bit PNG for masks and pictures."""
+"""Image files: half-float EXR for linear radiance, EXR for geometry, 8-bit PNG for masks and pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,47 +14,125 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 
 Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+GRAY = (0.212671, 0.715160, 0.072169)  # luminance of linear R, G, B (CIE XYZ's Y of sRGB primaries, as Mitsuba has it)
+_AGAIN = "render or restore it"
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What a camera sees at an instant, besides light."""
+
+    depth: Float32  # [H, W] metres along the optical axis; inf where there is nothing
+    ids: NDArray[np.uint32]  # [H, W] 0 where nothing moves, otherwise the moving thing (scene.json: "instances")
+    flow: Float32  # [H, W, 2] where the surface point of this pixel goes, in pixels (x right, y down)
+
+
+def gray(image: Float32) -> Float32:
+    """Gray of linear RGB: [..., 3] to [...], float32."""
+    r, g, b = (np.float32(weight) * image[..., i].astype(np.float32) for i, weight in enumerate(GRAY))
+    return np.asarray(r + g + b)  # not a matrix product: its last bit would depend on the machine
 
 
 def write_exr(path: Path, image: Float32, t_us: float) -> None:
-    """Write gray linear radiance [H, W] as half-float EXR (channel Y, ZIP), with its time as the attribute `t_us`.
+    """Write linear radiance as half-float EXR (ZIP), with its time as the attribute `t_us`.
 
+    Gray [H, W] becomes the channel Y. RGB [H, W, 3] becomes R, G, B and their `gray` Y, so that `read_exr` reads both.
     Raises UserError for values that are not finite or that half floats cannot hold.
     """
-    import OpenEXR
-
-    if image.ndim != 2 or not np.isfinite(image).all() or np.abs(image).max(initial=0) > 65504:
+    if not _is_image(image) or not np.isfinite(image).all() or np.abs(image).max(initial=0) > 65504:
         found = f"shape {image.shape}, range {np.min(image):g} to {np.max(image):g}"
-        raise problem(path, "a finite gray image within +-65504", found, "correct the method that rendered it")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "t_us": float(t_us)}
-    with atomic_path(path) as part:
-        OpenEXR.File(header, {"Y": np.ascontiguousarray(image, dtype=np.float16)}).write(str(part))
+        kind = "RGB" if image.ndim == 3 else "gray"
+        raise problem(path, f"a finite {kind} image within +-65504", found, "correct the method that rendered it")
+    channels = {"Y": image} if image.ndim == 2 else {**_split("RGB", image), "Y": gray(image)}
+    _write_channels(path, {name: values.astype(np.float16) for name, values in channels.items()}, t_us)
 
 
 def read_exr(path: Path) -> Float32:
-    """Read a gray EXR [H, W] as float32. Raises UserError where it is missing, damaged or has no channel Y."""
+    """Read the gray channel of an EXR [H, W] as float32.
+
+    Raises UserError where the file is missing, damaged or has no channel Y.
+    """
+    found = _read_channels(path, ("Y",), "a gray image (channel Y)", "write one gray channel")
+    return found["Y"].astype(np.float32)
+
+
+def read_rgb(path: Path) -> Float32:
+    """Read a colour EXR as linear RGB [H, W, 3] float32.
+
+    Raises UserError where the file is missing, damaged or has no channels R, G, B.
+    """
+    found = _read_channels(path, tuple("RGB"), "a colour image (channels R, G, B)", "read a gray image's channel Y")
+    return np.stack([found[name].astype(np.float32) for name in "RGB"], axis=-1)
+
+
+def write_geometry(path: Path, depth: Float32, ids: NDArray[np.uint32], flow: Float32, t_us: float) -> None:
+    """Write depth [H, W], ids [H, W] and flow [H, W, 2] as EXR (ZIP): Z, flow.x, flow.y float32, id uint32.
+
+    Raises UserError where the shapes differ, for NaN, and for flow that is not finite.
+    """
+    shape = np.shape(depth)
+    if len(shape) != 2 or np.shape(ids) != shape or np.shape(flow) != (*shape, 2):
+        found = f"{shape}, {np.shape(ids)}, {np.shape(flow)}"
+        raise problem(path, "shapes (H, W), (H, W), (H, W, 2)", found, "correct the program that made it")
+    if np.isnan(depth).any() or not np.isfinite(flow).all():
+        raise problem(path, "depth that is no NaN, finite flow", "other values", "correct the program that made it")
+    floats = {"Z": depth, "flow.x": flow[..., 0], "flow.y": flow[..., 1]}
+    channels: dict[str, NDArray[Any]] = {name: values.astype(np.float32) for name, values in floats.items()}
+    _write_channels(path, {**channels, "id": ids.astype(np.uint32)}, t_us)
+
+
+def read_geometry(path: Path) -> Geometry:
+    """Read what `write_geometry` wrote. Raises UserError where it is missing, damaged or lacks a channel."""
+    names = ("Z", "id", "flow.x", "flow.y")
+    found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again")
+    flow = np.stack([found["flow.x"], found["flow.y"]], axis=-1)
+    return Geometry(found["Z"].astype(np.float32), found["id"].astype(np.uint32), flow.astype(np.float32))
+
+
+def _is_image(image: NDArray[Any]) -> bool:
+    return image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+
+
+def _split(names: str, image: Float32) -> dict[str, Float32]:
+    return {name: image[..., i] for i, name in enumerate(names)}
+
+
+def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: float) -> None:
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "t_us": float(t_us)}
+    with atomic_path(path) as part:
+        OpenEXR.File(header, {name: np.ascontiguousarray(v) for name, v in channels.items()}).write(str(part))
+
+
+def _read_channels(path: Path, names: tuple[str, ...], what: str, fix: str) -> dict[str, NDArray[Any]]:
+    """Channels by name [H, W], in the type that the file has."""
     import OpenEXR
 
     if not path.is_file():
-        raise problem(path, "an EXR image", "no such file", "render or restore it")
+        raise problem(path, "an EXR image", "no such file", _AGAIN)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as f:
             channels = f.channels()
-            if "Y" not in channels:
-                raise problem(
-                    path, "a gray image (channel Y)", f"channels {sorted(channels)}", "write one gray channel"
-                )
-            return np.asarray(channels["Y"].pixels, dtype=np.float32)
+            if not set(names) <= set(channels):
+                raise problem(path, what, f"channels {sorted(channels)}", fix)
+            return {name: np.asarray(channels[name].pixels) for name in names}
     except (RuntimeError, ValueError) as e:  # cut-off files raise either
-        raise problem(path, "an EXR image", f"damaged data ({e})", "render or restore it") from None
+        raise problem(path, "an EXR image", f"damaged data ({e})", _AGAIN) from None
+
+
+def write_png(path: Path, image: UInt8) -> None:
+    """Write 8-bit gray [H, W] or RGB [H, W, 3] as PNG."""
+    from PIL import Image
+
+    with atomic_path(path) as part:
+        Image.fromarray(image).save(part)
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Write a mask [H, W] as 8-bit PNG (0 and 255)."""
-    from PIL import Image
-
-    with atomic_path(path) as part:
-        Image.fromarray(mask.astype(np.uint8) * 255).save(part)
+    write_png(path, mask.astype(np.uint8) * 255)
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -67,7 +148,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         raise problem(path, "a mask image", f"damaged data ({e})", "restore it or make the scene again") from None
 
 
-def encode_srgb(image: Float32) -> NDArray[np.uint8]:
+def encode_srgb(image: Float32) -> UInt8:
     """Linear radiance -> sRGB-encoded 8 bit, clipped to [0, 1]: how linear images are shown to people."""
     x = np.clip(np.nan_to_num(image), 0.0, 1.0)
     encoded = np.where(
