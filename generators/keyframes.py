@@ -1,120 +1,187 @@
 """Key frames on disk: one file per time, written whole or not at all, so that a killed run goes on where it was.
 
-`still.npz` holds what does not move: the background of every view. A key file holds, for every view, only the pixels
-that differ from it (flat positions and values), which is what a key costs on disk and in reading.
+`still.npz` holds what does not move. A key file holds, for every view, only the pixels that the renderer gives
+(`MultiViewRenderer.key_arrays`): a bit for each pixel and the values of those that are set. Pixels that a coarse key
+does not give are the background; those that a finer key does not give lie on the simulator's curve (clamped
+Catmull-Rom) through the next coarser keys.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.generators.motion import KeyPlan
+from spike4dgs.generators.render import Still
 from spike4dgs.generators.sensor import Float32
+
+
+class Clip(NamedTuple):
+    """One view of a clip, dense: what `sensor.simulate` takes."""
+
+    keys: Sequence[Float32]  # [H, W] each, read when it is asked for
+    ticks: list[int]
+    means: bool = False  # each key is the mean of its own tick, instead of the radiance at its start
 
 
 class KeyStore:
     """The key frames of a set of views in a folder.
 
     >>> store = KeyStore(Path("keys"))  # doctest: +SKIP
-    >>> store.set_background(renderer.backgrounds())  # [C, H, W]  # doctest: +SKIP
-    >>> for tick in store.missing(ticks):  # doctest: +SKIP
-    ...     store.write(tick, renderer.keys(tick / 20_000))
-    >>> clip = store.view(0, ticks)  # a lazy sequence of [H, W] for `sensor.simulate`  # doctest: +SKIP
+    >>> store.set_still(renderer.still())  # doctest: +SKIP
+    >>> for tick in store.missing(plan):  # doctest: +SKIP
+    ...     store.put(tick, renderer.key_arrays(tick, plan))
+    >>> clip = store.view(0, plan)  # doctest: +SKIP
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._background: Float32 | None = None
+        self._loaded: Still | None = None
 
     @property
-    def has_background(self) -> bool:
-        """Whether the background is stored."""
-        return self._still.is_file()
+    def has_still(self) -> bool:
+        """Whether what does not move is stored."""
+        return self._still_path.is_file()
 
-    @property
-    def background(self) -> Float32:
-        """What does not move, [C, H, W] float32. Raises UserError where the file is missing or damaged."""
-        if self._background is None:
-            self._background = _read(self._still, "background")["background"]
-        return self._background
+    def still(self) -> Still:
+        """What does not move. Raises UserError where the file is missing or damaged."""
+        if self._loaded is None:
+            self._loaded = Still.from_arrays(_read(self._still_path, "background", "first"))
+        return self._loaded
 
-    def set_background(self, images: Float32) -> None:
-        """Store the background [C, H, W]. Raises UserError for values that are not finite."""
-        _check(images, self._still)
-        _write(self._still, {"background": np.asarray(images, dtype=np.float32)})
-        self._background = None
+    def set_still(self, still: Still) -> None:
+        """Store what does not move. Raises UserError for values that are not finite."""
+        _write(self._still_path, still.arrays())
+        self._loaded = None
 
-    def missing(self, ticks: Sequence[int]) -> list[int]:
-        """The ticks without a stored key."""
-        return [int(t) for t in ticks if not self._path(t).is_file()]
+    def missing(self, plan: KeyPlan) -> list[int]:
+        """The ticks of a plan without a stored key."""
+        return [t for t in plan.ticks if not self._path(t).is_file()]
 
-    def write(self, tick: int, images: Float32) -> None:
-        """Store the key [C, H, W] of a tick. Raises UserError for another shape or values that are not finite."""
-        still = self.background
-        if images.shape != still.shape:
-            raise problem(self._path(tick), f"views {still.shape}", f"{images.shape}", "render the same views")
-        _check(images, self._path(tick))
-        arrays: dict[str, NDArray[Any]] = {}
-        for view, (image, base) in enumerate(zip(images.astype(np.float32, copy=False), still, strict=True)):
-            where = np.flatnonzero(image != base)
-            arrays[f"where{view}"] = where.astype(np.uint32)
-            arrays[f"values{view}"] = image.ravel()[where]
+    def put(self, tick: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store the key of a tick. Raises UserError for values that are not finite."""
         _write(self._path(tick), arrays)
 
-    def read(self, tick: int, view: int) -> Float32:
-        """One view of a key, [H, W] float32. Raises UserError where the file is missing or damaged."""
-        arrays = _read(self._path(tick), f"where{view}", f"values{view}")
-        image: Float32 = self.background[view].copy()
-        image.ravel()[arrays[f"where{view}"]] = arrays[f"values{view}"]
-        return image
+    def view(self, view: int, plan: KeyPlan) -> Clip:
+        """One view for the simulator: radiance at the keys' ticks or, with sub-ticks, the mean of every tick."""
+        instants = self.instants(view, plan)
+        if plan.sub_ticks == 1:
+            return instants
+        return Clip(_Means(self, view, plan, instants), list(range(plan.n_ticks)), True)
 
-    def view(self, view: int, ticks: Sequence[int]) -> _View:
-        """The keys of one view as a sequence that reads a key when it is asked for."""
-        return _View(self, view, ticks)
+    def instants(self, view: int, plan: KeyPlan) -> Clip:
+        """One view of a plan: radiance at all ticks that have a key. Reading in ascending order is fastest."""
+        return Clip(_Instants(self, view, plan), plan.ticks)
 
-    def range(self, view: int, ticks: Sequence[int]) -> tuple[Float32, Float32]:
-        """Smallest and largest radiance [H, W] of each pixel of a view over the keys."""
-        low = high = self.read(ticks[0], view)
-        for tick in ticks[1:]:
-            image = self.read(tick, view)
-            low, high = np.minimum(low, image), np.maximum(high, image)
+    def range(self, view: int, plan: KeyPlan) -> tuple[Float32, Float32]:
+        """Smallest and largest radiance [H, W] of each pixel of a view over the coarse keys."""
+        low = high = self.still().background[view]
+        keys = self.instants(view, plan)
+        for k in range(0, len(keys.ticks), plan.chain[0] // plan.chain[-1]):
+            image = keys.keys[k]
+            low, high = (image, image) if k == 0 else (np.minimum(low, image), np.maximum(high, image))
         return low, high
 
+    def given(self, tick: int, view: int, kind: str = "") -> tuple[NDArray[np.bool_], Float32]:
+        """Which pixels [H, W] of a view a key gives, and their values. `kind` "mean_": the means over the tick.
+
+        Raises UserError where the file is missing or damaged.
+        """
+        shape = self.still().background[view].shape
+        arrays = _read(self._path(tick), f"{kind}given{view}", f"{kind}values{view}")
+        mask, values = arrays[f"{kind}given{view}"], arrays[f"{kind}values{view}"]
+        if len(mask) * 8 < np.prod(shape) or (bits := np.unpackbits(mask, count=int(np.prod(shape)))).sum() != len(
+            values
+        ):
+            found = f"{len(mask)} bytes of bits, {len(values)} values"
+            raise problem(self._path(tick), f"a key of {shape} pixels", found, "delete it and run again")
+        return bits.reshape(shape).astype(bool), values
+
     @property
-    def _still(self) -> Path:
+    def _still_path(self) -> Path:
         return self.folder / "still.npz"
 
     def _path(self, tick: int) -> Path:
         return self.folder / f"{tick:06d}.npz"
 
 
-class _View(Sequence[Float32]):
-    def __init__(self, store: KeyStore, view: int, ticks: Sequence[int]) -> None:
-        self._store, self._view, self._ticks = store, view, ticks
+class _Instants(Sequence[Float32]):
+    """Dense keys of one view; those of the last few coarse intervals are kept."""
+
+    def __init__(self, store: KeyStore, view: int, plan: KeyPlan) -> None:
+        self._store, self._view, self._plan, self._ticks = store, view, plan, plan.ticks
+        self._kept: dict[int, Float32] = {}
 
     def __len__(self) -> int:
         return len(self._ticks)
 
-    def __getitem__(self, k: Any) -> Any:  # a key; slices are not needed
-        return self._store.read(int(self._ticks[k]), self._view)
+    def __getitem__(self, k: Any) -> Any:  # one key; slices are not needed
+        return self._at(self._ticks[k])
+
+    def _at(self, tick: int) -> Float32:
+        if tick not in self._kept:
+            for old in [t for t in self._kept if t < tick - 4 * self._plan.chain[0]]:
+                del self._kept[old]
+            level = self._plan.level(tick)
+            image = self._between(tick, self._plan.chain[level - 1]) if level else self._background
+            mask, values = self._store.given(tick, self._view)
+            image[mask] = values
+            self._kept[tick] = image
+        return self._kept[tick]
+
+    @property
+    def _background(self) -> Float32:
+        return np.array(self._store.still().background[self._view])
+
+    def _between(self, tick: int, spacing: int) -> Float32:
+        """The clamped Catmull-Rom curve through the keys every `spacing` ticks; see `sensor`."""
+        first, last = tick // spacing * spacing, self._ticks[-1]
+        p1, p2 = self._at(first), self._at(first + spacing)
+        p0 = self._at(first - spacing) if first else None
+        p3 = self._at(first + 2 * spacing) if first + 2 * spacing <= last else None
+        u, d = np.float32((tick - first) / spacing), p2 - p1
+        m1 = d if p0 is None else (p2 - p0) * np.float32(0.5)
+        m2 = d if p3 is None else (p3 - p1) * np.float32(0.5)
+        curve = p1 + u * (m1 + u * (3 * d - 2 * m1 - m2 + u * (m1 + m2 - 2 * d)))
+        return np.clip(curve, np.minimum(p1, p2), np.maximum(p1, p2))
 
 
-def _check(images: Float32, path: Path) -> None:
-    if not np.isfinite(images).all():
-        found = f"{np.count_nonzero(~np.isfinite(images))} pixels that are not"
-        raise problem(path, "finite radiance", found, "correct the world or the renderer")
+class _Means(Sequence[Float32]):
+    """The mean radiance of every tick: of the curve through the instants, or rendered where it moves too fast."""
+
+    def __init__(self, store: KeyStore, view: int, plan: KeyPlan, instants: Clip) -> None:
+        self._store, self._view, self._n, self._instants = store, view, plan.n_ticks, instants.keys
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __getitem__(self, tick: Any) -> Any:
+        keys = self._instants
+        p1, p2 = keys[tick], keys[tick + 1]
+        p0, p3 = (keys[tick - 1] if tick else p1), (keys[tick + 2] if tick + 2 < len(keys) else p2)
+        weight1, weight2 = (0.5 if tick else 1.0), (0.5 if tick + 2 < len(keys) else 1.0)
+        m1, m2 = np.float32(weight1) * (p2 - p0), np.float32(weight2) * (p3 - p1)
+        mean = (p1 + p2) * np.float32(0.5) + (m1 - m2) * np.float32(1 / 12)
+        mean = np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2))
+        mask, values = self._store.given(tick, self._view, "mean_")
+        mean[mask] = values
+        return mean
 
 
-def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    for array in arrays.values():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            found = f"{np.count_nonzero(~np.isfinite(array))} pixels that are not"
+            raise problem(path, "finite radiance", found, "correct the world or the renderer")
     with atomic_path(path) as part:
-        np.savez(part, allow_pickle=False, **arrays)
+        np.savez(part, allow_pickle=False, **dict(arrays))
 
 
 def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:

@@ -4,8 +4,10 @@ Three kinds of pixel, cheapest first:
 
 - *Still*: the background, rendered once with many samples.
 - *Softly lit* (bounced light, wide penumbrae): the background times a slowly varying factor, see `soft_light`.
-- *Traced* at every key: a ray through the pixel's centre meets a moving instance, or the surface that it meets has one
-  between itself and the light; both grown by 3 px.
+- *Traced* at every key: a ray through the pixel's centre meets a moving thing, or the surface that it meets has one
+  between itself and the light; both grown by 3 px (`sight`).
+
+Keys between two coarse ones hold only traced pixels in which something moves too fast for the coarse ones (`motion`).
 
 Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. What stands still
 keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole picture, bit for
@@ -17,26 +19,47 @@ This module does not: blur motion (a key is an instant), filter (a pixel is the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
-from spike4dgs.generators.motion import max_image_speed
+from spike4dgs.generators.motion import KeyPlan, max_image_speed
+from spike4dgs.generators.sight import Sight
 from spike4dgs.generators.soft_light import MOTION_PX, SoftLight
 from spike4dgs.generators.worlds import WorldScene
 
 MAX_DEPTH = 4  # camera, surface, two bounces
-_GROW_PX = 3
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)  # of linear Rec. 709
 
 
-class MultiViewRenderer:
+@dataclass(frozen=True, eq=False)
+class Still:
+    """What does not move: the background at full quality, and its first samples alone, whose random numbers keys use.
+
+    Both [C, H, W] float32, or [C, H, W, 3] in colour.
+    """
+
+    background: np.ndarray
+    first: np.ndarray
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a file or another process."""
+        return {"background": self.background, "first": self.first}
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> Still:
+        """The inverse of `arrays`."""
+        return Still(arrays["background"], arrays["first"])
+
+
+class MultiViewRenderer(Sight):
     """Renders all `cameras` (one resolution) of a world together: one launch per time. Pictures are [C, H, W] float32.
 
     >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
@@ -44,11 +67,28 @@ class MultiViewRenderer:
     """
 
     def __init__(
-        self, world: WorldScene, cameras: Sequence[Camera], *, seed: int, spp: int, background_spp: int
+        self,
+        world: WorldScene,
+        cameras: Sequence[Camera],
+        *,
+        seed: int,
+        spp: int,
+        background_spp: int,
+        color: bool = False,
+        still: Still | None = None,
+        whole_frames: bool = False,
     ) -> None:
-        """Loads the world into Mitsuba (about a second).
+        """Loads the world into Mitsuba (about a second). Raises UserError for numbers of samples that do not fit.
 
-        `spp` and `background_spp` are powers of two, the background's at least `spp`. Raises UserError otherwise.
+        Args:
+            world: what is rendered.
+            cameras: views of one resolution.
+            seed: of all random numbers.
+            spp: samples per pixel of keys, a power of two.
+            background_spp: of what stands still, a power of two, at least `spp`.
+            color: pictures are linear RGB, [C, H, W, 3].
+            still: what a renderer with the same arguments returned from `still`; else it is rendered when needed.
+            whole_frames: trace every pixel of every key: the slow, exact way.
         """
         for name, value in (("spp", spp), ("background_spp", background_spp)):
             if value < 1 or value & (value - 1):
@@ -57,35 +97,54 @@ class MultiViewRenderer:
             raise problem("background_spp", f"at least spp = {spp}", str(background_spp), "raise it")
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise problem("cameras", "one resolution for all", "several or none", "render them apart")
-        self.world, self.cameras, self.spp, self.background_spp = world, tuple(cameras), spp, background_spp
-        self.shape = (len(cameras), cameras[0].height, cameras[0].width)
-        self._scene = MitsubaScene(world)
-        self._tracer = _tracer(self._scene, self.cameras, seed)
+        scene = MitsubaScene(world)
+        super().__init__(world, cameras, scene, _tracer(scene, cameras, seed))
+        self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
-        self._soft_light = SoftLight(self.shape, self._trace_at, self.traced, self._anchor_s())
-        self._last_hits: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
+        self._given_still = still
 
     # ------------------------------------------------------------ pictures
 
-    def backgrounds(self) -> np.ndarray:
-        """The views without the moving instances."""
-        return self._backgrounds[0]
+    def still(self) -> Still:
+        """The views without the moving things."""
+        return self._still
 
     def keys(self, t_s: float) -> np.ndarray:
         """The views at `t_s`: still, softly lit and traced pixels put together."""
-        background, same_numbers = self._backgrounds
-        picture = background * (1 + self._soft_light.change(t_s))
+        if self.whole_frames:
+            return self.crn_frames(t_s)
+        change = self._soft_light.change(t_s)
+        picture = self._still.background * (1 + (change[..., None] if self.color else change))
         where = np.flatnonzero(self.traced(t_s))
-        traced = self._trace_at(where, self.spp, True, t_s) * np.float32(self.world.exposure)
-        correction = background.ravel()[where] - same_numbers.ravel()[where]
-        correction[self.object_masks(t_s).ravel()[where]] = 0
-        picture.ravel()[where] = np.maximum(traced + correction, 0)
+        self._flat(picture)[where] = self._traced_at(where, t_s)
         return picture
+
+    def key_arrays(self, tick: int, plan: KeyPlan) -> dict[str, np.ndarray]:
+        """What `KeyStore` keeps of a tick: for each view v the pixels that are given, packed, and their values.
+
+        Coarse keys (`given{v}`, `values{v}`): the pixels that differ from the background. Others: those that move too
+        fast for the coarser keys. With sub-ticks also `mean_given{v}`, `mean_values{v}`: the mean radiance over the
+        tick where it moves too fast even for that. A function of the arguments alone, whatever was rendered before.
+        """
+        t_s, level = tick / plan.rate_hz, plan.level(tick)
+        if level == 0:
+            picture = self.keys(t_s)
+            given = np.ones(self.shape, bool) if self.whole_frames else picture != self._still.background
+            values = picture.ravel()[given.ravel()]
+        else:
+            given = self._fast(t_s, plan.chain[level - 1] / plan.rate_hz, plan.max_px)
+            values = self._traced_at(np.flatnonzero(given), t_s)
+        arrays = self._sparse("given", "values", given, values)
+        if plan.sub_ticks > 1 and tick < plan.n_ticks:
+            fast = self._fast(t_s + 0.5 / plan.rate_hz, 1 / plan.rate_hz, plan.max_px)
+            means = self._means_at(np.flatnonzero(fast), t_s, plan)
+            arrays |= self._sparse("mean_given", "mean_values", fast, means)
+        return arrays
 
     def crn_frames(self, t_s: float) -> np.ndarray:
         """Every pixel traced at `t_s` with the random numbers of `keys`; for measuring what `keys` leaves out."""
-        self._scene.place(t_s)
-        return self._whole(self.spp, 0, True)
+        return self._whole(self.spp, 0, t_s)
 
     def reference_frames(self, t_s: float, spp: int) -> np.ndarray:
         """The views at `t_s` by Mitsuba's own render loop, sensor, film and sampler: every pixel, nothing reused."""
@@ -98,111 +157,95 @@ class MultiViewRenderer:
         for camera in self.cameras:
             sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, spp)
             rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1))
-            frames.append(rgb[..., :3] @ np.array([0.212671, 0.715160, 0.072169], np.float32))
+            frames.append(rgb[..., :3] if self.color else rgb[..., :3] @ LUMINANCE)
         return np.stack(frames) * np.float32(self.world.exposure)
-
-    # ------------------------------------------------------------ geometry
-
-    def object_masks(self, t_s: float) -> np.ndarray:
-        """[C, H, W] bool: the ray through the pixel's centre meets a moving instance first."""
-        return self._hits(t_s)[1].reshape(self.shape)
-
-    def depths(self, t_s: float) -> np.ndarray:
-        """[C, H, W] float32: z in camera coordinates where the ray through the pixel's centre ends (inf: nothing)."""
-        distance = self._hits(t_s)[0].reshape(self.shape)
-        forward = np.stack([c.R[2] for c in self.cameras])  # [C, 3]
-        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
-        return (distance * cosine).astype(np.float32)
 
     def changed(self, t_s: float) -> np.ndarray:
         """[C, H, W] bool: the pixels of `keys` that are not simply the background: traced or softly lit."""
         return self.traced(t_s) | (self._soft_light.change(t_s) != 0)
 
     def traced(self, t_s: float) -> np.ndarray:
-        """[C, H, W] bool: the pixels that `keys` traces: a mask from rays through the pixels' centres, grown."""
-        distance, region = self._hits(t_s)
-        region = region.copy()
-        open_ = np.flatnonzero(~region & np.isfinite(distance))
-        origins, directions = self._rays
-        # stop a little short of the surface, so that it does not shadow itself
-        points = origins[open_] + directions[open_] * (distance[open_, None] * 0.9995)
-        for source in self.world.shadow_sources:
-            to_light = source[:3] - source[3] * points
-            to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
-            region[open_] |= self._tracer.cast(points, to_light, True)[1]
-        size = 2 * _GROW_PX + 1
-        return np.asarray(maximum_filter(region.reshape(self.shape), size=(1, size, size)))
+        """[C, H, W] bool: the pixels that `keys` traces."""
+        return np.ones(self.shape, bool) if self.whole_frames else super().traced(t_s)
 
     # ------------------------------------------------------------ inner workings
 
     @cached_property
-    def _backgrounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The background at full quality, and its first part alone, which uses the keys' random numbers."""
-        parts = [self._whole(self.spp, stream, False) for stream in range(self.background_spp // self.spp)]
-        return np.asarray(np.mean(parts, axis=0, dtype=np.float64), dtype=np.float32), parts[0]
+    def _still(self) -> Still:
+        if self._given_still is not None:
+            return self._given_still
+        first = self._whole(self.spp, 0, None)
+        total = first.astype(np.float64)
+        parts = self.background_spp // self.spp
+        for stream in range(1, parts):
+            total += self._whole(self.spp, stream, None)
+        return Still((total / parts).astype(np.float32), first)
 
-    def _whole(self, spp: int, stream: int, moving: bool) -> np.ndarray:
-        gray = self._tracer.trace(np.arange(int(np.prod(self.shape))), spp, stream, moving)
-        return (gray * np.float32(self.world.exposure)).reshape(self.shape)
+    def _whole(self, spp: int, stream: int, t_s: float | None) -> np.ndarray:
+        values = self._at(np.arange(int(np.prod(self.shape))), spp, stream, t_s)
+        return values.reshape(self._still_shape)
 
-    @cached_property
-    def _rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions [C*H*W, 3] float64 through the pixel centres."""
-        _, height, width = self.shape
-        v, u = np.mgrid[:height, :width] + 0.5
-        uv = np.stack([u.ravel(), v.ravel()], 1)
-        directions = np.concatenate([c.unproject(uv, np.ones(len(uv))) - c.center for c in self.cameras])
-        origins = np.repeat(np.stack([c.center for c in self.cameras]), len(uv), axis=0)
-        return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
+        """Radiance [K] or [K, 3] of the flat pixels `where` of a key."""
+        traced = self._at(where, self.spp, 0, t_s)
+        if self.whole_frames:
+            return traced
+        correction = self._flat(self._still.background)[where] - self._flat(self._still.first)[where]
+        correction[self.object_masks(t_s).ravel()[where]] = 0
+        return np.maximum(traced + correction, 0)
 
-    def _hits(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distance and on-instance flag of every pixel's centre ray; the last time's answer is kept."""
-        if self._last_hits is None or self._last_hits[0] != t_s:
+    def _means_at(self, where: np.ndarray, t_s: float, plan: KeyPlan) -> np.ndarray:
+        """Mean radiance [K] of flat pixels over the tick from `t_s` on, from instants with fewer samples each."""
+        if len(where) == 0:
+            return np.zeros(0, np.float32)
+        spp = max(self.spp // plan.sub_ticks, 1)
+        total = np.zeros(len(where), np.float64)
+        for part in range(plan.sub_ticks):
+            instant = t_s + (part + 0.5) / plan.sub_ticks / plan.rate_hz
+            traced = self._at(where, spp, part, instant)
+            still = np.flatnonzero(~self.object_masks(instant).ravel()[where])
+            without = self._at(where[still], spp, part, None)
+            traced[still] += self._still.background.ravel()[where[still]] - without
+            total += traced
+        return np.maximum(total / plan.sub_ticks, 0).astype(np.float32)
+
+    def _fast(self, t_s: float, within_s: float, max_px: float) -> np.ndarray:
+        """[C, H, W] bool: traced pixels in which something moves more than `max_px` px `within_s` seconds."""
+        return super().traced(t_s) & (self.speeds(t_s) * within_s > max_px)
+
+    def _at(self, pixels: np.ndarray, spp: int, stream: int, t_s: float | None) -> np.ndarray:
+        """Radiance [K] (colour: [K, 3]) of flat pixels; None: without the moving things."""
+        if t_s is not None:
             self._scene.place(t_s)
-            self._last_hits = (t_s, *self._tracer.cast(*self._rays, True))
-        return self._last_hits[1:]
+        rgb = self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure)
+        return np.asarray(rgb if self.color else rgb @ LUMINANCE)
 
-    def _trace_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
-        """Radiance [K] of flat pixels with the keys' random numbers, before exposure."""
+    def _gray_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
+        """Radiance [K] of flat pixels with the keys' random numbers, gray and before exposure: for soft light."""
         if moving:
             self._scene.place(t_s)
-        return np.asarray(self._tracer.trace(pixels, spp, 0, moving))
+        return np.asarray(self._tracer.trace(pixels, spp, 0, moving) @ LUMINANCE)
+
+    @property
+    def _still_shape(self) -> tuple[int, ...]:
+        return (*self.shape, 3) if self.color else self.shape
+
+    def _flat(self, picture: np.ndarray) -> np.ndarray:
+        """A view of the picture as [N] or [N, 3]."""
+        return picture.reshape(-1, 3) if self.color else picture.reshape(-1)
+
+    def _sparse(self, mask_name: str, values_name: str, given: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:
+        bounds = np.concatenate([[0], np.cumsum(given.reshape(len(given), -1).sum(1))])
+        arrays: dict[str, np.ndarray] = {}
+        for v, mask in enumerate(given):
+            arrays[f"{mask_name}{v}"] = np.packbits(mask)
+            arrays[f"{values_name}{v}"] = values[bounds[v] : bounds[v + 1]].astype(np.float32)
+        return arrays
 
     def _anchor_s(self) -> float:
         """Time between the anchors of soft light."""
         speed = max_image_speed(self.world, self.cameras, self.world.duration_s, samples=5)
         return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
-
-
-class ViewRenderer:
-    """One camera of a world; the pictures of `MultiViewRenderer` for it alone, [H, W]."""
-
-    def __init__(self, world: WorldScene, camera: Camera, *, seed: int, spp: int, background_spp: int) -> None:
-        self._all = MultiViewRenderer(world, [camera], seed=seed, spp=spp, background_spp=background_spp)
-
-    def background(self) -> np.ndarray:
-        """[H, W] float32 gray linear radiance without the moving instances."""
-        return self._all.backgrounds()[0]
-
-    def key(self, t_s: float) -> np.ndarray:
-        """[H, W] float32 at `t_s`: the background outside `changed`, relit or traced inside."""
-        return self._all.keys(t_s)[0]
-
-    def changed(self, t_s: float) -> np.ndarray:
-        """[H, W] bool: the pixels of `key` that are not simply the background."""
-        return self._all.changed(t_s)[0]
-
-    def object_mask(self, t_s: float) -> np.ndarray:
-        """[H, W] bool: the pixel's centre sees a moving instance."""
-        return self._all.object_masks(t_s)[0]
-
-    def depth(self, t_s: float) -> np.ndarray:
-        """[H, W] float32 z-depth at the pixels' centres (inf: nothing there)."""
-        return self._all.depths(t_s)[0]
-
-    def reference_frame(self, t_s: float, spp: int) -> np.ndarray:
-        """[H, W] float32: every pixel traced by Mitsuba's own render loop."""
-        return self._all.reference_frames(t_s, spp)[0]
 
 
 def _tracer(scene: MitsubaScene, cameras: Sequence[Camera], seed: int) -> Any:

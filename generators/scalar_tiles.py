@@ -15,10 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from spike4dgs.benchmark.cameras import Camera, mitsuba_sensor, mitsuba_to_world
-from spike4dgs.generators.mitsuba_scene import MitsubaScene
+from spike4dgs.generators.mitsuba_scene import Hits, MitsubaScene
 
 _TILE = 16
-_LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)  # Mitsuba's `luminance` of linear Rec. 709
+
+Rays = tuple[np.ndarray, np.ndarray]
 
 
 class TileTracer:
@@ -32,7 +33,7 @@ class TileTracer:
         self._sensors: dict[tuple[int, int, int, int], Any] = {}
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        """Gray radiance [K] float32 of flat `pixels` [K], mean of `spp` samples.
+        """Linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples.
 
         A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
         """
@@ -41,11 +42,11 @@ class TileTracer:
         tiles = np.stack([view, row // _TILE, column // _TILE], 1)
         wanted, which = np.unique(tiles, axis=0, return_inverse=True)
         which = which.ravel()
-        out = np.zeros(len(pixels), np.float32)
+        out = np.zeros((len(pixels), 3), np.float32)
         for k, (v, y, x) in enumerate(wanted.tolist()):
             mine = which == k
-            gray = self._tile(v, y, x, spp, stream, moving)
-            out[mine] = gray[row[mine] - y * _TILE, column[mine] - x * _TILE]
+            tile = self._tile(v, y, x, spp, stream, moving)
+            out[mine] = tile[row[mine] - y * _TILE, column[mine] - x * _TILE]
         return out
 
     def _tile(self, view: int, y: int, x: int, spp: int, stream: int, moving: bool) -> np.ndarray:
@@ -57,7 +58,7 @@ class TileTracer:
         picture = mi.render(
             scene, sensor=self._sensors[key], integrator=self._integrator, seed=zlib.crc32(name.encode())
         )
-        return np.asarray(picture, np.float32)[..., :3] @ _LUMINANCE
+        return np.asarray(picture, np.float32)[..., :3]
 
     def _sensor(self, view: int, y: int, x: int, spp: int) -> Any:
         camera = self._cameras[view]
@@ -72,15 +73,31 @@ class TileTracer:
         }
         return load_sensor(camera, film, spp)
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), whether on an instance."""
-        scene = self._scene.full if moving else self._scene.empty
-        distance, on_instance = np.full(len(origins), np.inf, np.float32), np.zeros(len(origins), bool)
-        for k, (o, d) in enumerate(zip(origins.tolist(), directions.tolist(), strict=True)):
-            hit = scene.ray_intersect_preliminary(mi.Ray3f(o, d))
+    def prepare(self, origins: np.ndarray, directions: np.ndarray) -> Rays:
+        """Rays [N, 3] with unit directions, ready to be cast again and again."""
+        return origins, directions
+
+    def cast_static(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays meet what stands still: distance [N] float32 (inf: nothing) and surface normal [N, 3] float32."""
+        distance, normal = np.full(len(rays[0]), np.inf, np.float32), np.zeros((len(rays[0]), 3), np.float32)
+        for k, (o, d) in enumerate(zip(*(a.tolist() for a in rays), strict=True)):
+            hit = self._scene.empty.ray_intersect(mi.Ray3f(o, d))
             if hit.is_valid():
-                distance[k], on_instance[k] = hit.t, hit.instance is not None
-        return distance, on_instance
+                distance[k], normal[k] = hit.t, hit.n
+        return distance, normal
+
+    def cast_movers(self, rays: Rays) -> Hits:
+        """Where rays meet the moving things, which stand alone: nothing else is in the way."""
+        n = len(rays[0])
+        found = Hits(np.full(n, np.inf, np.float32), np.full(n, -1, np.int32), np.zeros(n, np.int64), np.zeros((n, 2)))
+        numbers = {name: k for k, name in enumerate(self._scene.thing_ids)}
+        for k, (o, d) in enumerate(zip(*(a.tolist() for a in rays), strict=True)):
+            hit = self._scene.movers.ray_intersect_preliminary(mi.Ray3f(o, d))
+            if hit.is_valid():
+                owner = hit.shape if hit.instance is None else hit.instance
+                found.distance[k], found.thing[k] = hit.t, numbers[owner.id()]
+                found.face[k], found.uv[k] = hit.prim_index, list(hit.prim_uv)
+        return found
 
 
 def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:

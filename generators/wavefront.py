@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.generators.mitsuba_scene import MitsubaScene
+from spike4dgs.generators.mitsuba_scene import Hits, MitsubaScene
 
 _LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
 
@@ -94,10 +94,12 @@ class WavefrontTracer:
             to_world = c.R.T @ np.linalg.inv(c.K)  # pixel coordinates -> world direction
             rows.append([*to_world.ravel(), *c.center])
         self._cameras = mi.Float(np.array(rows, np.float32).ravel())  # [C, 12]
+        by_id = {shape.id(): shape for shape in scene.movers.shapes()}
+        self._things = [mi.ShapePtr(by_id[name]) for name in scene.thing_ids]
         self._keys = mi.UInt32(np.array([zlib.crc32(c.id.encode()) for c in cameras], np.uint32))
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        """Gray radiance [K] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
+        """Linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
 
         A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
         """
@@ -105,7 +107,7 @@ class WavefrontTracer:
         parts = [
             self._launch(pixels[k : k + per_launch], spp, stream, moving) for k in range(0, len(pixels), per_launch)
         ]
-        return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
 
     def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
         listed = mi.UInt32(np.ascontiguousarray(pixels, np.uint32))
@@ -124,9 +126,8 @@ class WavefrontTracer:
         ray = self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
         scene = self._scene.full if moving else self._scene.empty
         radiance, _, _ = self._integrator.sample(scene, sampler, ray)
-        gray = mi.luminance(radiance)
-        dr.eval(gray)  # the path kernel writes one number per sample; the reduction below reads it
-        return np.array(dr.block_sum(gray, spp), np.float32) / np.float32(spp)
+        dr.eval(radiance)  # the path kernel writes one colour per sample; the reductions below read it
+        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in radiance], 1) / np.float32(spp)
 
     def _ray(self, view: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.RayDifferential3f:
         def number(k: int) -> mi.Float:
@@ -139,12 +140,28 @@ class WavefrontTracer:
         ray.maxt = dr.largest(mi.Float)
         return ray
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays [N, 3]: distance along `directions` [N] float32 (inf: none), whether on an instance."""
+    def prepare(self, origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
+        """Rays [N, 3] with unit directions, ready to be cast again and again."""
         o, d = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (origins, directions))
-        scene = self._scene.full if moving else self._scene.empty
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d))
-        on_instance = hit.is_valid() & (hit.instance != None)  # noqa: E711 (an array comparison)
+        ray = mi.Ray3f(mi.Point3f(o), d)
+        dr.eval(ray)
+        return ray
+
+    def cast_static(self, rays: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays meet what stands still: distance [N] float32 (inf: nothing) and surface normal [N, 3] float32."""
+        hit = self._scene.empty.ray_intersect(rays)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
-        dr.eval(distance, on_instance)
-        return np.array(distance), np.array(on_instance)
+        dr.eval(distance, hit.n)
+        return np.array(distance), np.array(hit.n).T
+
+    def cast_movers(self, rays: mi.Ray3f) -> Hits:
+        """Where rays meet the moving things, which stand alone: nothing else is in the way."""
+        hit = self._scene.movers.ray_intersect_preliminary(rays)
+        thing = mi.Int32(-1)
+        for number, shape in enumerate(self._things):
+            thing = dr.select((hit.instance == shape) | (hit.shape == shape), number, thing)
+        thing = dr.select(hit.is_valid(), thing, -1)
+        distance = dr.select(hit.is_valid(), hit.t, dr.inf)
+        dr.eval(distance, thing, hit.prim_index, hit.prim_uv)
+        face, uv = np.array(hit.prim_index), np.array(hit.prim_uv)
+        return Hits(np.array(distance), np.array(thing), face.astype(np.int64), uv.T.astype(np.float64))
