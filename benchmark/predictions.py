@@ -55,6 +55,7 @@ class PredictionInfo:
     method: MethodInfo
     scene: str
     scene_revision: str | None = None
+    split: str | None = None  # None: the scene's default one
     budget: float | None = None  # multiple of the published number of steps
     device: str | None = None
     fit_seconds: float | None = None

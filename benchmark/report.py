@@ -38,7 +38,10 @@ def make_console() -> Console:
 
 def results_table(records: Sequence[Record]) -> Table:
     """All records as a table: one block per scene and one for the mean; the best value of a block is bold."""
-    table = Table(title="Results", caption="higher is better; a dash is a value that does not exist", box=None)
+    splits = ", ".join(sorted({r["dataset"]["split"] for r in records}))
+    table = Table(
+        title=f"Results, split {splits}", caption="higher is better; a dash is a value that does not exist", box=None
+    )
     table.add_column("scene")
     table.add_column("method")
     for m in METRICS.values():

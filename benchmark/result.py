@@ -43,7 +43,7 @@ def missing_cell(status: str, error: str) -> Cell:
 
 def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str, Cell], device: str) -> Record:
     """Put the cells (by scene id) of a method together. `device` is where this process computes."""
-    splits = {str(s.meta["default_split"]) for s in scenes}
+    splits = {s.split for s in scenes}
     if len(splits) > 1:
         raise problem("scenes", "one split", ", ".join(sorted(splits)), "score scenes of one dataset together")
     record = {

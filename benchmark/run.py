@@ -5,6 +5,8 @@ OUT/results/METHOD.json         the result records, scored from those files
 OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
 OUT/work/KEY/                   the checkpoint of an unfinished fit
 OUT/sheet_SCENE.png, OUT/scatter.png, OUT/leaderboard/
+
+A run on another split than the default one keeps all this in OUT/SPLIT/.
 """
 
 from __future__ import annotations
@@ -170,6 +172,7 @@ def run_benchmark(
     seed: int = 0,
     device: str = "auto",
     budget: float = 1.0,
+    split: str | None = None,
     leaderboard: Path | None = None,
     replace: bool = False,
     allow_gaps: bool = False,
@@ -179,10 +182,11 @@ def run_benchmark(
     Args:
         scenes: Scene folders.
         methods: Methods by name; all that are installed if left out.
-        out: Folder for predictions, results, pictures and logs.
+        out: Folder for predictions, results, pictures and logs; for another split than the default, OUT/SPLIT is.
         seed: Seed that every fit gets.
         device: auto, cpu or cuda.
         budget: Multiple of each method's published number of steps.
+        split: Training views and held-out views, such as corner or views-3; each scene's default if left out.
         leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
         replace: Replace entries of the same name in that leaderboard.
         allow_gaps: Accept recordings with gaps.
@@ -195,9 +199,11 @@ def run_benchmark(
     if not budget > 0 or budget == float("inf"):
         raise problem("--budget", "a positive number", str(budget), "use 1 for the published setting")
     chosen = [known[name] for name in dict.fromkeys(methods or known)]
+    opened = open_scenes(scenes, allow_gaps, split)
+    if split and not all(s.is_default_split for s in opened):
+        out = out / split
     settings = Settings(out, seed, choose_device(device), Budget(budget))
     console = make_console()
-    opened = open_scenes(scenes, allow_gaps)
     records = run_matrix(opened, chosen, settings, console)
     console.print(results_table(records))
     write_pictures(opened, records, out)

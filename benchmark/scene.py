@@ -22,6 +22,7 @@ from spike4dgs.benchmark.images import read_exr, read_mask
 from spike4dgs.benchmark.manifest import Manifest, read_manifest
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.spikes import SpikeStream, open_stream
+from spike4dgs.benchmark.splits import Split
 
 SCHEMA = "spike4dgs-scene/1"
 
@@ -63,11 +64,15 @@ class TrainingScene:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An opened scene folder. Images are gray linear radiance, [H, W] float32, 1.0 = white."""
+    """An opened scene folder, seen through one of its splits: it decides `train`, `test`, `targets` and `training`.
+
+    Images are gray linear radiance, [H, W] float32, 1.0 = white.
+    """
 
     root: Path
     meta: dict[str, Any]  # scene.json
     cameras: dict[str, Camera]
+    split: str
     targets: tuple[Target, ...]
     manifest: Manifest
 
@@ -98,13 +103,18 @@ class Scene:
 
     @property
     def train(self) -> tuple[str, ...]:
-        """Training cameras of the default split."""
-        return tuple(self.meta["splits"][self.meta["default_split"]]["train"])
+        """Training cameras."""
+        return tuple(self.meta["splits"][self.split]["train"])
 
     @property
     def test(self) -> tuple[str, ...]:
-        """Held-out cameras of the default split."""
-        return tuple(self.meta["splits"][self.meta["default_split"]]["test"])
+        """Held-out cameras."""
+        return tuple(self.meta["splits"][self.split]["test"])
+
+    @property
+    def is_default_split(self) -> bool:
+        """Whether this is the split that is meant where none is named."""
+        return bool(self.split == self.meta["default_split"])
 
     def t_us(self, tick: int) -> float:
         """Time at which a tick starts, in microseconds."""
@@ -133,11 +143,11 @@ class Scene:
         return TrainingScene(self.id, self.revision, cameras, streams, self.rate_hz, self.n_ticks, self.radiance_gain)
 
 
-def open_scene(root: Path | str, allow_gaps: bool = False) -> Scene:
-    """Read and validate a scene folder.
+def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = None) -> Scene:
+    """Read and validate a scene folder, and see it through a split: the scene's default one if None.
 
     Raises UserError where the folder, scene.json, the cameras or the targets are missing, foreign, damaged or
-    inconsistent, and where a recording has gaps unless `allow_gaps`.
+    inconsistent, where there is no such split, and where a recording has gaps unless `allow_gaps`.
     """
     root = Path(root)
     if not root.is_dir():
@@ -149,13 +159,18 @@ def open_scene(root: Path | str, allow_gaps: bool = False) -> Scene:
         manifest.path(name)
     cameras = _read_cameras(root)
     _check_splits(meta, cameras, root / "scene.json")
-    targets = _read_targets(root / "targets.json", meta, cameras)
+    targets = _read_targets(root / "targets.json", meta)
+    chosen = meta["default_split"] if split is None else split
+    if chosen not in targets:
+        raise problem(
+            root / "scene.json", f"a split among {', '.join(meta['splits'])}", repr(chosen), "name one of them"
+        )
     if meta["gaps"] and not allow_gaps:
         found = f"{len(meta['gaps'])} gap(s), the first {json.dumps(meta['gaps'][0])}"
         raise problem(
             root / "scene.json", "a recording without gaps", found, "pass --allow-gaps to read it all the same"
         )
-    return Scene(root, meta, cameras, targets, manifest)
+    return Scene(root, meta, cameras, chosen, targets[chosen], manifest)
 
 
 def check_meta(meta: dict[str, Any], path: Path) -> None:
@@ -189,18 +204,34 @@ def _check_splits(meta: dict[str, Any], cameras: dict[str, Camera], path: Path) 
             raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
 
 
-def _read_targets(path: Path, meta: dict[str, Any], cameras: dict[str, Camera]) -> tuple[Target, ...]:
+def _read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
+    """The targets of every split: a split that holds out what the default one does has the same."""
+    data = read_json(path, "the scored images")
+    splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
+    held_out = splits[meta["default_split"]].test
     try:
-        targets = tuple(
-            Target(str(t["camera"]), int(t["tick"])) for t in read_json(path, "the scored images")["targets"]
-        )
-    except (KeyError, TypeError, ValueError) as e:
-        raise problem(path, "a list of {camera, tick}", repr(e), "restore it or make the scene again") from None
-    held_out = meta["splits"][meta["default_split"]]["test"]
+        default = _parse_targets(data["targets"])
+        others = {str(name): _parse_targets(targets) for name, targets in data.get("splits", {}).items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise problem(path, "lists of {camera, tick}", repr(e), "restore it or make the scene again") from None
+    needed = {name for name, s in splits.items() if set(s.test) != set(held_out)}
+    if set(others) != needed:
+        found = ", ".join(sorted(others)) or "none"
+        raise problem(path, f"targets of the splits {', '.join(sorted(needed)) or '(none)'}", found, "restore the file")
+    targets = {name: others.get(name, default) for name in splits}
+    for name, of_split in targets.items():
+        _check_targets(path, of_split, splits[name].test, meta["n_ticks"])
+    return targets
+
+
+def _parse_targets(items: list[dict[str, Any]]) -> tuple[Target, ...]:
+    return tuple(Target(str(t["camera"]), int(t["tick"])) for t in items)
+
+
+def _check_targets(path: Path, targets: tuple[Target, ...], held_out: tuple[str, ...], n_ticks: int) -> None:
     for i, t in enumerate(targets):
         found = f"{t.camera} at tick {t.tick}"
-        if t.camera not in cameras or t.camera not in held_out or not 0 <= t.tick < meta["n_ticks"]:
+        if t.camera not in held_out or not 0 <= t.tick < n_ticks:
             raise problem(path, "held-out cameras and ticks of this scene", found, "restore the file")
         if t in targets[:i]:
             raise problem(path, "distinct targets", f"{found} twice", "restore the file")
-    return targets

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from spike4dgs.benchmark.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.manifest import Manifest, write_manifest
 from spike4dgs.benchmark.scene import SCHEMA, Target, check_meta
+from spike4dgs.benchmark.splits import DEFAULT_SPLIT, Split
 
 _POSES = (
     "transforms_*.json: camera to world, OpenGL axes; sparse/0: world to camera, OpenCV axes; pixel centres at +0.5"
@@ -22,7 +23,11 @@ _POSES = (
 
 @dataclass(frozen=True, eq=False)
 class SceneDescription:
-    """Everything in scene.json, transforms, targets and the COLMAP model that is not a stream or an image."""
+    """Everything in scene.json, transforms, targets and the COLMAP model that is not a stream or an image.
+
+    `train` and `test` are the default split and name every camera once. `targets` are those of all splits: a split
+    has those of its held-out cameras. `extras` become the optional top-level objects of scene.json.
+    """
 
     id: str
     title: str
@@ -40,6 +45,20 @@ class SceneDescription:
     clock: dict[str, Any] = field(default_factory=lambda: {"t0_ns": 0, "source": "simulation"})
     sync: dict[str, Any] = field(default_factory=lambda: {"method": "exact", "max_error_us": 0})
     gaps: tuple[dict[str, Any], ...] = ()
+    splits: Mapping[str, Split] = field(default_factory=dict)  # `standard_splits`, or none but the default
+    extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def all_splits(self) -> dict[str, Split]:
+        """All splits by name, the default one first. Raises ValueError where `splits` has another default one."""
+        default = Split(self.train, self.test)
+        if self.splits.get(DEFAULT_SPLIT, default) != default:
+            raise ValueError(f"{DEFAULT_SPLIT} is {default}, and not {self.splits[DEFAULT_SPLIT]}")
+        return {DEFAULT_SPLIT: default} | dict(self.splits)
+
+    def targets_of(self, split: Split) -> tuple[Target, ...]:
+        """The scored images of a split."""
+        return tuple(t for t in self.targets if t.camera in split.test)
 
 
 def stream_name(camera: str) -> str:
@@ -52,8 +71,9 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
 
     The streams, images and masks are already in `root`. A folder without manifest.json is an unfinished scene.
     """
-    size = scene.cameras[0]
+    size, splits = scene.cameras[0], scene.all_splits
     meta = {
+        **scene.extras,
         "schema": SCHEMA,
         "id": scene.id,
         "title": scene.title,
@@ -70,23 +90,45 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
         "sensor": scene.sensor,
         "radiance_gain": scene.radiance_gain,
         "streams": {c.id: stream_name(c.id) for c in scene.cameras},
-        "splits": {"center": {"train": list(scene.train), "test": list(scene.test)}},
-        "default_split": "center",
+        "splits": {name: {"train": list(s.train), "test": list(s.test)} for name, s in splits.items()},
+        "default_split": DEFAULT_SPLIT,
         "gaps": list(scene.gaps),
         "source": scene.source,
     }
     check_meta(meta, root / "scene.json")
     write_json(root / "scene.json", meta)
+    _write_transforms(root, scene)
+    _write_targets(root, scene)
+    write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
+    write_text(root / "README.md", _readme(root, scene))
+    return write_manifest(root)
+
+
+def _write_targets(root: Path, scene: SceneDescription) -> None:
+    """The scored images: of the default split, and of those splits that hold out other cameras."""
+    lists = {
+        name: [{"camera": t.camera, "tick": t.tick} for t in scene.targets_of(split)]
+        for name, split in scene.all_splits.items()
+        if name == DEFAULT_SPLIT or set(split.test) != set(scene.test)
+    }
+    default = lists.pop(DEFAULT_SPLIT)
+    write_json(root / "targets.json", {"targets": default} | ({"splits": lists} if lists else {}))
+
+
+def _write_transforms(root: Path, scene: SceneDescription) -> None:
+    """The default split's streams and targets, and in transforms_all.json every image that there is.
+
+    Images of training cameras stay out of transforms_train.json: they are ground truth, which no method may train on.
+    """
     by_id = {c.id: c for c in scene.cameras}
     train = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.train]
     test = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.test]
-    test += [_frame(scene, by_id[t.camera], t.tick, f"images/{t.name}.exr") for t in scene.targets]
-    write_json(root / "transforms_train.json", {"camera_model": "PINHOLE", "frames": train})
-    write_json(root / "transforms_test.json", {"camera_model": "PINHOLE", "frames": test})
-    write_json(root / "targets.json", {"targets": [{"camera": t.camera, "tick": t.tick} for t in scene.targets]})
-    write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
-    write_text(root / "README.md", _readme(scene))
-    return write_manifest(root)
+    targets = scene.targets_of(scene.all_splits[DEFAULT_SPLIT])
+    test += [_frame(scene, by_id[t.camera], t.tick, f"images/{t.name}.exr") for t in targets]
+    paths = sorted((root / "images").glob("*/*.exr"))
+    images = [_frame(scene, by_id[p.parent.name], int(p.stem), p.relative_to(root).as_posix()) for p in paths]
+    for name, frames in (("train", train), ("test", test), ("all", images)):
+        write_json(root / f"transforms_{name}.json", {"camera_model": "PINHOLE", "frames": frames})
 
 
 def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -> dict[str, Any]:
@@ -129,18 +171,41 @@ def read_colmap(folder: Path) -> tuple[Camera, ...]:
     return tuple(sorted(cameras, key=lambda c: c.id))
 
 
-def _readme(scene: SceneDescription) -> str:
+# What a scene may hold beside its streams and descriptions: a path and a sentence for README.md.
+_CONTENTS = {
+    "images": "`images/CAMERA/TICK.exr`: linear radiance at the start of the tick, 1.0 = white (half float): gray in\n"
+    "  channel Y, where it was rendered in colour also R, G, B.",
+    "masks": "`masks/CAMERA/TICK.png`: the moving region of the same image (white).",
+    "geometry": "`geometry/CAMERA/TICK.exr`: Z, depth along the optical axis in metres (inf: nothing); id, the moving\n"
+    "  thing (0: none; names in scene.json); flow.x, flow.y, how far its point moves in pixels in the next 20 ticks.",
+    "calibration/flat": "`calibration/flat/CAMERA.dat`: a recording of uniform light, packed like `spikes/`.",
+    "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`.",
+    "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
+    "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
+    "events": "`events/CAMERA.npz`: an event camera: t (us), x, y (row 0 at the top), p (1: brighter, 0: darker).",
+    "sheet.png": "`sheet.png`, `preview.webp`: the scene at a glance.",
+}
+
+
+def _readme(root: Path, scene: SceneDescription) -> str:
     c = scene.cameras[0]
     ms = scene.n_ticks * 1000 / scene.rate_hz
+    contents = "\n".join(f"- {text}" for name, text in _CONTENTS.items() if (root / name).exists())
+    splits = "\n".join(
+        f"  - `{name}`: train {', '.join(s.train)}; test {', '.join(s.test) or 'none'}"
+        for name, s in scene.all_splits.items()
+    )
     return f"""# {scene.title}
 
 Scene `{scene.id}` in the format `{SCHEMA}`: {len(scene.cameras)} spike cameras of {c.width}x{c.height} pixels,
 {scene.n_ticks} ticks at {scene.rate_hz:g} Hz ({ms:g} ms). Licence: {scene.licence}.
 
-- `spikes/*.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per tick.
-- `images/CAMERA/TICK.exr`: gray linear radiance (half float, 1.0 = white) at the start of the tick; held-out cameras.
-- `masks/CAMERA/TICK.png`: the moving region of the same image.
+- `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
+  tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.
+{contents}
+- `scene.json`: everything else about the scene. `manifest.json`: size and SHA-256 of every file.
 - `transforms_train.json`, `transforms_test.json`: poses and intrinsics; `sparse/0`: the same for COLMAP.
-- `targets.json`: what is scored. `manifest.json`: size and SHA-256 of every file.
-- A pixel that sees radiance L fires {scene.radiance_gain:g} * L spikes per tick on average, before gain and dark maps.
+  `transforms_all.json`: the same for every image, those at training cameras too, which are not for training.
+- `targets.json`: what is scored. Splits, the first is the default:
+{splits}
 """

@@ -46,13 +46,15 @@ def score_scene(predictions: Predictions, scene: Scene) -> Cell:
 
 
 def open_for(root: Path, scene: Scene) -> Predictions:
-    """Open a predictions folder and check that it was made for this revision of this scene."""
+    """Open a predictions folder and check that it was made for this revision and split of this scene."""
     if not scene.targets:
         raise problem(scene.root, "a scene with targets", "none in targets.json", "score a scene that has ground truth")
     predictions = open_predictions(root, scene.targets)
+    info = predictions.info
     for what, found, expected in (
-        ("scene", predictions.info.scene, scene.id),
-        ("scene revision", predictions.info.scene_revision, scene.revision),
+        ("scene", info.scene, scene.id),
+        ("scene revision", info.scene_revision, scene.revision),
+        ("split", info.split or scene.meta["default_split"], scene.split),
     ):
         if found is not None and found != expected:
             fix = "run the method on this scene, or score with the scene it was run on"
@@ -112,11 +114,11 @@ def _one_method(methods: dict[str, MethodInfo], root: Path) -> MethodInfo:
     return first
 
 
-def open_scenes(paths: Sequence[Path], allow_gaps: bool = False) -> list[Scene]:
-    """Open the scenes of a command line. Raises UserError where there is none."""
+def open_scenes(paths: Sequence[Path], allow_gaps: bool = False, split: str | None = None) -> list[Scene]:
+    """Open the scenes of a command line through a split. Raises UserError where there is none."""
     if not paths:
         raise problem("scenes", "at least one scene folder", "none", "make one with `spike4dgs make-dataset`")
-    return [open_scene(p, allow_gaps) for p in paths]
+    return [open_scene(p, allow_gaps, split) for p in paths]
 
 
 def score(
@@ -124,6 +126,7 @@ def score(
     scenes: Positional[tuple[Path, ...]],
     *,
     out: Path | None = None,
+    split: str | None = None,
     allow_gaps: bool = False,
 ) -> int:
     """Score predictions, of any program, from their files.
@@ -133,9 +136,10 @@ def score(
             holds one predictions folder per scene id.
         scenes: Scene folders.
         out: Write the result record to this file.
+        split: Split of the scenes that the predictions are for; each scene's default one if left out.
         allow_gaps: Accept recordings with gaps.
     """
-    record = score_all(predictions, open_scenes(scenes, allow_gaps))
+    record = score_all(predictions, open_scenes(scenes, allow_gaps, split))
     make_console().print(results_table([record]))
     if out:
         write_record(out, record)

@@ -1,7 +1,8 @@
 """`submit`: check a result record, compute it again from the files where they are at hand, and rank it.
 
-    LEADERBOARD/entries/METHOD.json     one record per method, labelled verified or self-reported
-    LEADERBOARD/leaderboard.json        ranked rows, made from the entries alone
+    LEADERBOARD/entries/METHOD.json         one record per method, labelled verified or self-reported
+    LEADERBOARD/entries/METHOD@SPLIT.json   the same on another split than the default one
+    LEADERBOARD/leaderboard.json            ranked rows, made from the entries alone
 
 Fit time, speed and memory are taken from prediction.json: they cannot be computed again.
 """
@@ -24,6 +25,7 @@ from spike4dgs.benchmark.result import Cell, Record, check_record, is_complete, 
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.score import open_for, open_scenes, prediction_folders, score_scene
+from spike4dgs.benchmark.splits import DEFAULT_SPLIT
 
 ENTRY, BOARD = "spike4dgs-entry/1", "spike4dgs-leaderboard/1"
 TOLERANCE = 1e-6  # dB or SSIM: between machines the last bits of a mean differ
@@ -53,7 +55,7 @@ def submit(
         allow_gaps: Accept recordings with gaps.
     """
     record = read_record(result)
-    opened = open_scenes(scenes, allow_gaps) if scenes else []
+    opened = open_scenes(scenes, allow_gaps, record["dataset"]["split"]) if scenes else []
     missing = _missing(record, predictions, opened)
     if predictions is not None and not missing:
         verify_record(record, result, predictions, opened)
@@ -62,7 +64,7 @@ def submit(
     board = write_leaderboard(leaderboard)
     name = record["method"]["name"]
     why = f" ({missing})" if missing and entry["label"] == label else ""
-    print(f"{name}: {entry['label']}{why}, {_standing(board, name)}")
+    print(f"{name}: {entry['label']}{why}, {_standing(board, record)}")
     return 0
 
 
@@ -125,7 +127,7 @@ def _check_same(claimed: Cell, computed: Cell, where: str) -> None:
 
 def _write_entry(leaderboard: Path, record: Record, label: str, replace: bool) -> Entry:
     """Write the entry, or keep the one that says the same; a better label is taken over."""
-    path = leaderboard / "entries" / f"{record['method']['name']}.json"
+    path = leaderboard / "entries" / f"{entry_name(record)}.json"
     entry: Entry = {"schema": ENTRY, "label": label, "submitted": utc_now(), "record": record}
     if path.is_file():
         old = read_entry(path)
@@ -140,6 +142,12 @@ def _write_entry(leaderboard: Path, record: Record, label: str, replace: bool) -
     return entry
 
 
+def entry_name(record: Mapping[str, Any]) -> str:
+    """The file name of a record's entry, without suffix: the method, and the split unless it is the default one."""
+    name, split = str(record["method"]["name"]), record["dataset"]["split"]
+    return name if split == DEFAULT_SPLIT else f"{name}@{split}"
+
+
 def _claim(record: Mapping[str, Any]) -> str:
     """What a record claims, without when and where it was scored: equal claims are the same record."""
     context = ("created", "command", "environment", "harness")
@@ -147,12 +155,12 @@ def _claim(record: Mapping[str, Any]) -> str:
 
 
 def read_entry(path: Path) -> Entry:
-    """Read an entry. Raises UserError where it is damaged, invalid, or its file name is not its method's."""
+    """Read an entry. Raises UserError where it is damaged, invalid, or its file name is not its record's."""
     entry = read_json(path, "a leaderboard entry")
     check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), path, "submit the record again")
     check_record(entry["record"], path)
-    if entry["record"]["method"]["name"] != path.stem:
-        raise problem(path, f"the entry of {path.stem}", entry["record"]["method"]["name"], "rename the file")
+    if (name := entry_name(entry["record"])) != path.stem:
+        raise problem(path, f"the entry of {path.stem}", name, "rename the file")
     return entry
 
 
@@ -198,7 +206,7 @@ def rank(entries: Sequence[Entry]) -> list[dict[str, Any]]:
                 "method": record["method"]["name"],
                 "label": entry["label"],
                 "submitted": entry["submitted"],
-                "entry": f"entries/{record['method']['name']}.json",
+                "entry": f"entries/{entry_name(record)}.json",
                 "mean": record["mean"],
                 "status": {scene: cell["status"] for scene, cell in record["scenes"].items()},
                 "fit_seconds": None if None in seconds else math.fsum(seconds),
@@ -207,10 +215,12 @@ def rank(entries: Sequence[Entry]) -> list[dict[str, Any]]:
     return rows
 
 
-def _standing(board: Mapping[str, Any], method: str) -> str:
+def _standing(board: Mapping[str, Any], record: Record) -> str:
+    dataset = record["dataset"]
+    where = dataset["name"] + ("" if dataset["split"] == DEFAULT_SPLIT else f", split {dataset['split']}")
     for contest in board["boards"]:
         for row in contest["rows"]:
-            if row["method"] == method:
+            if row["entry"] == f"entries/{entry_name(record)}.json":
                 place = "not ranked" if row["rank"] is None else f"rank {row['rank']} of {len(contest['rows'])}"
-                return f"{place} on {contest['dataset']['name']}"
+                return f"{place} on {where}"
     return "not listed"
