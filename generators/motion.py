@@ -120,8 +120,8 @@ def spacings(speed_px_s: float, n_ticks: int, rate_hz: int, max_px: float) -> tu
     """Key spacings in ticks, coarsest first, for a clip whose fastest point has this speed.
 
     All divide a millisecond, so that a frame at every whole millisecond is exactly a key. The finest is the longest
-    that moves nothing by more than `max_px` (one tick, if even that is too long); each other is the shortest multiple of
-    the one after it, as long as nothing moves by more than 2.5 px.
+    that moves nothing by more than `max_px` (one tick, if even that is too long); each other is the shortest multiple
+    of the one after it, as long as nothing moves by more than 2.5 px.
     Raises UserError where a millisecond is no whole number of ticks.
     """
     per_ms, rest = divmod(rate_hz, 1000)

@@ -195,19 +195,9 @@ class MultiViewRenderer(Sight):
         return np.maximum(traced + correction, 0)
 
     def _means_at(self, where: np.ndarray, t_s: float, plan: KeyPlan) -> np.ndarray:
-        """Mean radiance [K] of flat pixels over the tick from `t_s` on, from instants with fewer samples each."""
-        if len(where) == 0:
-            return np.zeros(0, np.float32)
-        spp = max(self.spp // plan.sub_ticks, 1)
-        total = np.zeros(len(where), np.float64)
-        for part in range(plan.sub_ticks):
-            instant = t_s + (part + 0.5) / plan.sub_ticks / plan.rate_hz
-            traced = self._at(where, spp, part, instant)
-            still = np.flatnonzero(~self.object_masks(instant).ravel()[where])
-            without = self._at(where[still], spp, part, None)
-            traced[still] += self._still.background.ravel()[where[still]] - without
-            total += traced
-        return np.maximum(total / plan.sub_ticks, 0).astype(np.float32)
+        """Mean radiance [K] of flat pixels over the tick from `t_s` on: of so many instants inside it."""
+        shares = (np.arange(plan.sub_ticks) + 0.5) / plan.sub_ticks
+        return np.mean([self._traced_at(where, t_s + share / plan.rate_hz) for share in shares], axis=0)
 
     def _fast(self, t_s: float, within_s: float, max_px: float) -> np.ndarray:
         """[C, H, W] bool: traced pixels in which something moves more than `max_px` px `within_s` seconds."""
