@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.cameras import Camera, to_nerfstudio
+from spike4dgs.benchmark.croissant import write_croissant
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.manifest import Manifest, write_manifest
 from spike4dgs.benchmark.scene import SCHEMA, Target, check_meta
@@ -67,9 +68,10 @@ def stream_name(camera: str) -> str:
 
 
 def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
-    """Write scene.json, transforms, targets, the COLMAP model and README, then the manifest, last of all.
+    """Write scene.json, transforms, targets, the COLMAP model, README and croissant.json; last of all the manifest.
 
-    The streams, images and masks are already in `root`. A folder without manifest.json is an unfinished scene.
+    The streams, images and everything else are already in `root`. A folder without manifest.json is an unfinished
+    scene.
     """
     size, splits = scene.cameras[0], scene.all_splits
     meta = {
@@ -101,6 +103,7 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
     _write_targets(root, scene)
     write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
     write_text(root / "README.md", _readme(root, scene))
+    write_croissant(root, meta, f"{scene.title}. {_summary(scene)}")
     return write_manifest(root)
 
 
@@ -187,9 +190,13 @@ _CONTENTS = {
 }
 
 
+def _summary(scene: SceneDescription) -> str:
+    c, ms = scene.cameras[0], scene.n_ticks * 1000 / scene.rate_hz
+    cameras = f"{len(scene.cameras)} spike cameras of {c.width}x{c.height} pixels"
+    return f"{cameras}, {scene.n_ticks} ticks at {scene.rate_hz:g} Hz ({ms:g} ms)."
+
+
 def _readme(root: Path, scene: SceneDescription) -> str:
-    c = scene.cameras[0]
-    ms = scene.n_ticks * 1000 / scene.rate_hz
     contents = "\n".join(f"- {text}" for name, text in _CONTENTS.items() if (root / name).exists())
     splits = "\n".join(
         f"  - `{name}`: train {', '.join(s.train)}; test {', '.join(s.test) or 'none'}"
@@ -197,8 +204,8 @@ def _readme(root: Path, scene: SceneDescription) -> str:
     )
     return f"""# {scene.title}
 
-Scene `{scene.id}` in the format `{SCHEMA}`: {len(scene.cameras)} spike cameras of {c.width}x{c.height} pixels,
-{scene.n_ticks} ticks at {scene.rate_hz:g} Hz ({ms:g} ms). Licence: {scene.licence}.
+Scene `{scene.id}` in the format `{SCHEMA}`. {_summary(scene)}
+Licence: {scene.licence}.
 
 - `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
   tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.
