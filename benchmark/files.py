@@ -5,6 +5,7 @@ A killed process leaves at most a `*.part` file behind, never a half-written res
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -15,22 +16,52 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 
+_ROOM = ("room for the file", "free some disk space, or choose another folder")
+_ACCESS = ("a folder that may be written to", "change its permissions, or choose another folder")
+_FOLDERS = ("folders on the way to the file", "remove what stands in their place, or choose another folder")
+_FAILURES = {  # what writing expected, and what to do; other errors are the program's
+    errno.ENOSPC: _ROOM,
+    errno.EDQUOT: _ROOM,
+    errno.EFBIG: _ROOM,
+    errno.EACCES: _ACCESS,
+    errno.EPERM: _ACCESS,
+    errno.EROFS: _ACCESS,
+    errno.ENOTDIR: _FOLDERS,
+    errno.EEXIST: _FOLDERS,
+    errno.EISDIR: ("a file's name", "remove the folder of that name, or choose another name"),
+    errno.ENAMETOOLONG: ("a name that the file system takes", "choose a shorter one"),
+}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system says while `path` is written (disk full, no permission, ...) into a UserError."""
+    try:
+        yield
+    except OSError as e:
+        if e.errno not in _FAILURES:
+            raise
+        expected, fix = _FAILURES[e.errno]
+        raise problem(path, expected, os.strerror(e.errno).lower(), fix) from e
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success fsync it and rename it into place.
 
-    The temporary name keeps the suffix, because image writers choose the format by it.
+    The temporary name keeps the suffix, because image writers choose the format by it. Raises UserError where the
+    system cannot write the file; whatever goes wrong, nothing half written stays behind.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        yield part
-        with open(part, "rb+") as f:
-            os.fsync(f.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield part
+            with open(part, "rb+") as f:
+                os.fsync(f.fileno())
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -103,7 +103,13 @@ def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: floa
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "t_us": float(t_us)}
     with atomic_path(path) as part:
-        OpenEXR.File(header, {name: np.ascontiguousarray(v) for name, v in channels.items()}).write(str(part))
+        file = OpenEXR.File(header, {name: np.ascontiguousarray(v) for name, v in channels.items()})
+        try:
+            file.write(str(part))
+        except RuntimeError as e:  # what the system said is in the text only
+            raise problem(
+                path, "a file that can be written", str(e), "free some disk space, or choose another folder"
+            ) from e
 
 
 def _read_channels(path: Path, names: tuple[str, ...], what: str, fix: str) -> dict[str, NDArray[Any]]:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_file, write_json, write_text
+from spike4dgs.benchmark.files import read_json, sha256_file, write_json, write_text, writing
 from spike4dgs.benchmark.images import read_exr, write_exr
 from spike4dgs.benchmark.scene import Target
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -155,7 +155,8 @@ class PredictionWriter:
 
     def __enter__(self) -> PredictionWriter:
         shutil.rmtree(self._part, ignore_errors=True)  # what a killed run left
-        self._part.mkdir(parents=True)
+        with writing(self.root):
+            self._part.mkdir(parents=True)
         return self
 
     def add(self, target: Target, image: NDArray[np.float32], t_us: float) -> None:

@@ -27,7 +27,7 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.cell import Job, is_done, run_job
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.files import write_text, writing
 from spike4dgs.benchmark.recipes import Budget, Method, find_methods
 from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
 from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
@@ -109,8 +109,10 @@ def _check_inputs(scene: Scene) -> None:
 @contextmanager
 def _lock(out: Path) -> Iterator[None]:
     """Keep a second run out of the folder. The system lifts the lock when the process ends, however it ends."""
-    out.mkdir(parents=True, exist_ok=True)
-    with open(out / ".lock", "w") as f:
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        lock = open(out / ".lock", "w")
+    with lock as f:
         try:
             fcntl.flock(f, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

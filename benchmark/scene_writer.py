@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.croissant import write_croissant
-from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import write_json, write_text, writing
 from spike4dgs.benchmark.manifest import Manifest, write_manifest
 from spike4dgs.benchmark.scene import SCHEMA, Target, check_meta
 from spike4dgs.benchmark.splits import DEFAULT_SPLIT, Split
@@ -140,7 +141,10 @@ def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -
 
 
 def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.float64]) -> None:
-    """Write cameras.bin, images.bin and points3D.bin with pycolmap: one PINHOLE camera and one image per view."""
+    """Write cameras.bin, images.bin and points3D.bin with pycolmap: one PINHOLE camera and one image per view.
+
+    Raises UserError where the folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
+    """
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -154,8 +158,16 @@ def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.flo
         model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=c.id), pose)
     for p in points:
         model.add_point3D(p, pycolmap.Track(), np.full(3, 128, dtype=np.uint8))
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(str(folder))
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        model.write_binary(str(folder))
+        written = pycolmap.Reconstruction(str(folder))
+    except (ValueError, RuntimeError, OSError) as e:
+        fix = "free some disk space, or choose another folder"
+        raise problem(folder, "a folder that a whole COLMAP model can be written to", str(e), fix) from e
+    if (written.num_images(), written.num_points3D()) != (len(cameras), len(points)):
+        raise problem(folder, "a whole COLMAP model", "a part of it", "free some disk space, or choose another folder")
 
 
 def read_colmap(folder: Path) -> tuple[Camera, ...]:

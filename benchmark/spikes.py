@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import writing
 
 UInt8 = NDArray[np.uint8]
 T = TypeVar("T", bound=np.generic)
@@ -114,6 +115,8 @@ def open_stream(
 class SpikeWriter:
     """Write a stream tick by tick; the file appears under its name only when the writer closes without error.
 
+    Raises UserError where the system cannot write it (disk full, no permission, ...); nothing stays behind then.
+
     >>> with SpikeWriter(Path("cam.dat"), 8, 2) as w:  # doctest: +SKIP
     ...     w.write(np.zeros((100, 2), np.uint8))
     """
@@ -121,27 +124,31 @@ class SpikeWriter:
     def __init__(self, path: Path, width: int, height: int) -> None:
         self.path, self._size = path, bytes_per_tick(width, height)
         self.n_ticks = 0
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        self._file = open(self._part, "wb")
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self._part, "wb")
 
     def write(self, packed: UInt8) -> None:
         """Append packed ticks [n, bytes_per_tick]. Raises UserError for rows of another size."""
         if packed.ndim != 2 or packed.shape[1] != self._size or packed.dtype != np.uint8:
             expected = f"uint8 rows of {self._size} bytes"
             raise problem(self.path, expected, f"{packed.dtype} {packed.shape}", "pack the ticks with spikes.pack")
-        self._file.write(np.ascontiguousarray(packed).data)
+        with writing(self.path):
+            self._file.write(np.ascontiguousarray(packed).data)
         self.n_ticks += len(packed)
 
     def __enter__(self) -> SpikeWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
-        if kind is None:
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        self._file.close()
-        if kind is None:
-            os.replace(self._part, self.path)
-        else:
+        try:
+            with writing(self.path):
+                if kind is None:
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
+                self._file.close()
+                if kind is None:
+                    os.replace(self._part, self.path)
+        finally:
             self._part.unlink(missing_ok=True)
