@@ -31,7 +31,17 @@ COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
         "spike4dgs.generators.make_dataset:make_dataset",
         "render a world and simulate its spike cameras",
-        "make-dataset car turntable --profile small --out data",
+        "make-dataset --all --profile small --out data",
+    ),
+    "worlds": Command(
+        "spike4dgs.generators.world_table:worlds",
+        "list the worlds: speeds, moving pixels, depths, key spacing",
+        "worlds",
+    ),
+    "calibrate": Command(
+        "spike4dgs.generators.calibration:calibrate",
+        "estimate gain and dark maps from flat-field and dark recordings",
+        "calibrate data/car-0-small",
     ),
     "run-benchmark": Command(
         "spike4dgs.benchmark.run:run_benchmark",
@@ -67,6 +77,11 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.benchmark.spikecv:export_spikecv",
         "write a scene's streams as a SpikeCV folder",
         "export-spikecv data/car-0-small --out car-spikecv",
+    ),
+    "export-nerfstudio": Command(
+        "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
+        "write a scene as nerfstudio's D-NeRF data: pictures, poses, times",
+        "export-nerfstudio data/car-0-small --out car-nerfstudio",
     ),
     "spacing": Command(
         "spike4dgs.generators.spacing:spacing",

@@ -64,6 +64,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def check_new(folder: Path) -> None:
+    """Raise UserError unless `folder` is empty or does not exist yet: what is there is never overwritten."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise problem(folder, "a new or empty folder", "something there", "choose another --out or remove it")
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` atomically."""
     with atomic_path(path) as part:

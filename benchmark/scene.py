@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
-from spike4dgs.benchmark.images import read_exr, read_mask
+from spike4dgs.benchmark.images import read_exr, read_mask, read_rgb
 from spike4dgs.benchmark.manifest import Manifest, read_manifest
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.spikes import SpikeStream, open_stream
@@ -130,6 +130,10 @@ class Scene:
     def ground_truth(self, target: Target) -> NDArray[np.float32]:
         """Radiance of a target, [H, W] float32."""
         return read_exr(self.manifest.path(f"images/{target.name}.exr"))
+
+    def ground_truth_rgb(self, target: Target) -> NDArray[np.float32]:
+        """The same in colour, [H, W, 3]. Raises UserError where the scene has gray images only."""
+        return read_rgb(self.manifest.path(f"images/{target.name}.exr"))
 
     def moving(self, target: Target) -> NDArray[np.bool_]:
         """The moving region of a target, [H, W] bool: where the `*_dynamic` metrics look."""

@@ -20,7 +20,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, read_json, write_text
+from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.benchmark.scene_writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes import SpikeStream, SpikeWriter, UInt8, open_stream
@@ -70,7 +70,7 @@ def import_spikecv(
         raise problem("rate_hz and radiance_gain", "positive numbers", f"{rate_hz:g}, {radiance_gain:g}", "correct it")
     sources = {path.name: _read_config(path) for path in _spikecv_folders(folder)}
     cameras = None if transforms is None else _read_poses(transforms, sources)
-    _check_new(out)
+    check_new(out)
     streams = {}
     for camera, source in sources.items():
         target = out / (f"{camera}.dat" if cameras is None else stream_name(camera))
@@ -101,7 +101,7 @@ def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False)
         allow_gaps: Export a recording with gaps all the same.
     """
     opened = open_scene(scene, allow_gaps)
-    _check_new(out)
+    check_new(out)
     for camera in opened.meta["streams"]:
         stream = opened.stream(camera)
         with atomic_path(out / camera / f"{camera}.dat") as part, open(part, "wb") as file:
@@ -224,8 +224,3 @@ def _write_scene(
             sync={"method": "unknown", "max_error_us": None},
         ),
     )
-
-
-def _check_new(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise problem(out, "a new or empty folder", "something there", "choose another --out or remove it")
