@@ -13,6 +13,7 @@ from spike4dgs.benchmark.images import write_exr, write_mask
 from spike4dgs.benchmark.scene import Target
 from spike4dgs.benchmark.scene_writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes import SpikeWriter, pack
+from spike4dgs.benchmark.splits import standard_splits
 
 WIDTH, HEIGHT, TICKS, GAIN = 40, 24, 80, 0.6
 
@@ -42,12 +43,17 @@ def array_cameras(n: int = 4, width: int = WIDTH, height: int = HEIGHT) -> tuple
     )
 
 
-def write_small_scene(root: Path, seed: int = 0) -> Path:
-    """A scene without Mitsuba: a pattern that drifts to the right; cam_03 is held out, targets every 20 ticks."""
+def write_small_scene(root: Path, seed: int = 0, splits: bool = False) -> Path:
+    """A scene without Mitsuba: a pattern that drifts to the right; cam_03 is held out, targets every 20 ticks.
+
+    With `splits` it has the standard ones; `corner` holds out cam_00, with two targets.
+    """
     rng = np.random.default_rng(seed)
     cameras = array_cameras()
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     targets = tuple(Target("cam_03", t) for t in (20, 40, 60))
+    if splits:
+        targets += (Target("cam_00", 30), Target("cam_00", 50))
 
     def radiance(camera: int, tick: float) -> np.ndarray:
         return 0.45 + 0.3 * np.sin((x - 0.1 * tick - 2 * camera) / 4) * np.cos(y / 5)
@@ -61,7 +67,8 @@ def write_small_scene(root: Path, seed: int = 0) -> Path:
                 charge -= fired
                 writer.write(pack(fired[None]))
     for t in targets:
-        write_exr(root / f"images/{t.name}.exr", radiance(3, t.tick).astype(np.float32), t.tick * 50.0)
+        image = radiance(int(t.camera[-1]), t.tick).astype(np.float32)
+        write_exr(root / f"images/{t.name}.exr", image, t.tick * 50.0)
         write_mask(root / f"masks/{t.name}.png", np.abs(x - 20) < 8)
     sensor = {"model": "integrate-and-fire/1", "rows_bottom_up": True}
     ids = [c.id for c in cameras]
@@ -81,6 +88,7 @@ def write_small_scene(root: Path, seed: int = 0) -> Path:
             sensor=sensor,
             source={"kind": "test"},
             points=rng.normal(size=(30, 3)),
+            splits=standard_splits(cameras, "cam_03") if splits else {},
         ),
     )
     return root
