@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,6 +61,12 @@ class MitsubaScene:
                 parameters[name] = positions
             parameters.update()
         self._placed_at = t_s
+
+
+@lru_cache(maxsize=1)
+def mitsuba_scene(world: WorldScene) -> MitsubaScene:
+    """The scene of a world; the last one is kept, because every scene in memory makes Mitsuba's kernels larger."""
+    return MitsubaScene(world)
 
 
 def _movers(world: WorldScene, plain: bool) -> dict[str, Any]:

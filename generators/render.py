@@ -28,7 +28,8 @@ import numpy as np
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.generators.mitsuba_scene import MitsubaScene
+from spike4dgs.benchmark.images import gray
+from spike4dgs.generators.mitsuba_scene import mitsuba_scene
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.motion import KeyPlan, max_image_speed
 from spike4dgs.generators.sight import Sight
@@ -36,7 +37,6 @@ from spike4dgs.generators.soft_light import MOTION_PX, SoftLight
 from spike4dgs.generators.worlds import WorldScene
 
 MAX_DEPTH = 4  # camera, surface, two bounces
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)  # of linear Rec. 709
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class MultiViewRenderer(Sight):
             raise problem("background_spp", f"at least spp = {spp}", str(background_spp), "raise it")
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise problem("cameras", "one resolution for all", "several or none", "render them apart")
-        scene = MitsubaScene(world)
+        scene = mitsuba_scene(world)
         super().__init__(world, cameras, scene, _tracer(scene, cameras, seed))
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
@@ -157,7 +157,7 @@ class MultiViewRenderer(Sight):
         for camera in self.cameras:
             sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, spp)
             rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1))
-            frames.append(rgb[..., :3] if self.color else rgb[..., :3] @ LUMINANCE)
+            frames.append(rgb[..., :3] if self.color else gray(rgb[..., :3]))
         return np.stack(frames) * np.float32(self.world.exposure)
 
     def changed(self, t_s: float) -> np.ndarray:
@@ -208,13 +208,13 @@ class MultiViewRenderer(Sight):
         if t_s is not None:
             self._scene.place(t_s)
         rgb = self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure)
-        return np.asarray(rgb if self.color else rgb @ LUMINANCE)
+        return rgb if self.color else gray(rgb)
 
     def _gray_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
         """Radiance [K] of flat pixels with the keys' random numbers, gray and before exposure: for soft light."""
         if moving:
             self._scene.place(t_s)
-        return np.asarray(self._tracer.trace(pixels, spp, 0, moving) @ LUMINANCE)
+        return gray(self._tracer.trace(pixels, spp, 0, moving))
 
     @property
     def _still_shape(self) -> tuple[int, ...]:
@@ -238,7 +238,7 @@ class MultiViewRenderer(Sight):
         return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
 
 
-def _tracer(scene: MitsubaScene, cameras: Sequence[Camera], seed: int) -> Any:
+def _tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
     """The tracer for the process's variant. Imported here because the modules need the variant to be set."""
     if load_mitsuba().variant().startswith("scalar"):
         from spike4dgs.generators.scalar_tiles import TileTracer

@@ -3,31 +3,37 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
-from spike4dgs.generators.motion import key_ticks, max_image_speed
+from spike4dgs.generators.motion import KeyPlan, carried, key_plan, max_image_speed, spacings
 from spike4dgs.generators.render import _tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.scalar_tiles import load_sensor
-from spike4dgs.generators.worlds import WORLDS, WorldScene
+from spike4dgs.generators.worlds import WORLDS, Part, WorldScene
 
 WIDTH, HEIGHT = 64, 40
 NAMES = sorted(WORLDS)
 
 
+def all_parts(world: WorldScene) -> list[Part]:
+    rigid = [part for group in world.groups.values() for part in group]
+    return [*world.static.values(), *rigid, *(surface.part for surface in world.deforming.values())]
+
+
 def fingerprint(world: WorldScene) -> str:
     """A hash over all meshes, materials, lights and a pose."""
     digest = hashlib.sha256()
-    parts = [*world.static.values(), *(part for group in world.groups.values() for part in group)]
-    for part in parts:
+    for part in all_parts(world):
         for array in (part.mesh.vertices, part.mesh.faces, part.mesh.uv, np.asarray(part.material.albedo)):
             digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr(sorted(world.emitters.items())).encode())
@@ -47,13 +53,16 @@ def test_a_world_is_a_function_of_seed_and_variant(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_meshes_and_materials_are_sound(name):
     world = WORLDS[name].build(0, 0, 0.02)
-    for part in [*world.static.values(), *(part for group in world.groups.values() for part in group)]:
+    for part in all_parts(world):
         mesh = part.mesh
         assert np.isfinite(mesh.vertices).all() and np.isfinite(mesh.uv).all()
         assert mesh.uv.shape == (len(mesh.vertices), 2)
         assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
         albedo = np.asarray(part.material.albedo)
         assert np.isfinite(albedo).all() and albedo.shape[-1] == 3
+    for surface in world.deforming.values():
+        assert surface.vertices(0.007).shape == surface.part.mesh.vertices.shape
+        assert surface.bodies is None or len(surface.bodies) == len(surface.part.mesh.faces)
     assert set(world.poses(0.0)) == set(world.instances)
     for pose in world.poses(0.007).values():  # rigid: nothing is stretched or mirrored
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
@@ -95,32 +104,42 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
     for camera in rig:
         sent = rng.random((100, 2))
         origins, directions = sensor_rays(camera, sent)
-        distance, _ = tracer.cast(origins, directions, True)
+        rays = tracer.prepare(origins, directions)
+        distance = np.minimum(tracer.cast_static(rays)[0], tracer.cast_movers(rays).distance)
         uv, z = camera.project(origins + directions * distance[:, None])
         assert (z > world.depth_range[0]).all() and (z < world.depth_range[1]).all()
         assert np.abs(uv - sent * [WIDTH, HEIGHT]).max() < 0.01
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_moving_triangles_are_where_the_poses_say(name):
+def test_moving_triangles_are_where_the_world_says(name):
     world, t_s = WORLDS[name].build(0, 0, 0.02), 0.0131
     scene = MitsubaScene(world)
     scene.place(t_s)
     rig = cameras(world, WIDTH, HEIGHT, (4,))
     rng = np.random.default_rng(0)
-    poses, middles = world.poses(t_s), []
-    for instance, group in world.instances.items():
+    poses, middles, owners = world.poses(t_s), [], []
+    for number, (instance, group) in enumerate(world.instances.items()):
         for part in world.groups[group]:
             faces = part.mesh.faces[rng.integers(len(part.mesh.faces), size=12)]
             local = part.mesh.vertices[faces].mean(1)
             middles.append(local @ poses[instance][:3, :3].T + poses[instance][:3, 3])
-    ways = np.concatenate(middles) - rig[0].center
+            owners.append(np.full(12, number))
+    for number, surface in enumerate(world.deforming.values(), start=len(world.instances)):
+        faces = surface.part.mesh.faces[rng.integers(len(surface.part.mesh.faces), size=60)]
+        middles.append(surface.vertices(t_s)[faces].mean(1))
+        owners.append(np.full(60, number))
+    ways, owner = np.concatenate(middles) - rig[0].center, np.concatenate(owners)
     expected = np.linalg.norm(ways, axis=1)
-    origins = np.repeat(rig[0].center[None], len(ways), 0)
-    distance, on_instance = _tracer(scene, rig, 0).cast(origins, ways / expected[:, None], True)
-    assert (distance < expected * 1.0005).all()  # the triangle itself, or something before it
-    met = np.abs(distance - expected) < 5e-4 * expected
-    assert met.sum() > 20 and on_instance[met].all()
+    tracer = _tracer(scene, rig, 0)
+    hits = tracer.cast_movers(tracer.prepare(np.repeat(rig[0].center[None], len(ways), 0), ways / expected[:, None]))
+    assert (hits.distance < expected * 1.0005).all()  # the triangle itself, or something before it
+    met = np.abs(hits.distance - expected) < 5e-4 * expected
+    assert met.sum() > 20 and (hits.thing[met] == owner[met]).mean() > 0.9  # things touch each other at joints
+    later = carried(world, hits, rig[0].center + ways, t_s, t_s + 1e-3)[met & (hits.thing == owner)]
+    parts = [world.moving_points(t) for t in (t_s, t_s + 1e-3)]
+    nearest = cKDTree(parts[1]).query(later)[0]  # carried points are on the moved surface, between its vertices
+    assert np.median(nearest) < 1.5 * np.median(cKDTree(parts[0]).query((rig[0].center + ways)[met])[0]) + 1e-6
 
 
 def test_the_car_crosses_from_left_to_right_through_the_middle():
@@ -167,20 +186,40 @@ def test_the_speed_bound_holds_for_finite_steps(name):
     per_ms=st.sampled_from([1, 7, 10, 20, 40]),
     max_px=st.floats(0.05, 4),
 )
-def test_key_ticks(speed, n_ticks, per_ms, max_px):
+def test_spacings_and_the_ticks_they_give(speed, n_ticks, per_ms, max_px):
     rate_hz = 1000 * per_ms
-    ticks = key_ticks(speed, n_ticks, rate_hz, max_px)
-    steps = np.diff(ticks)
-    spacing = int(steps[0])
-    assert ticks[0] == 0 and (steps == spacing).all() and spacing > 0
-    assert per_ms % spacing == 0  # so every whole millisecond is a key
-    assert ticks[-2] < n_ticks <= ticks[-1]
-    assert spacing == 1 or speed * spacing / rate_hz <= max_px
-    wider = [d for d in range(spacing + 1, per_ms + 1) if per_ms % d == 0]
+    chain = spacings(speed, n_ticks, rate_hz, max_px)
+    plan = KeyPlan(n_ticks, rate_hz, max_px, chain)
+    assert per_ms % chain[0] == 0  # so every whole millisecond is a whole key
+    assert all(a > b and a % b == 0 for a, b in itertools.pairwise(chain))
+    finest = chain[-1]
+    assert finest == 1 or speed * finest / rate_hz <= max_px
+    wider = [d for d in range(finest + 1, per_ms + 1) if per_ms % d == 0]
     assert not wider or speed * wider[0] / rate_hz > max_px  # and it is the widest
+    assert len(chain) == 1 or speed * chain[0] / rate_hz <= 2.5
+    ticks = plan.ticks
+    assert ticks[0] == 0 and set(np.diff(ticks)) == {finest}
+    assert ticks[-1] - chain[0] < n_ticks <= ticks[-1] and ticks[-1] % chain[0] == 0
+    for tick in ticks[:50]:
+        level = plan.level(tick)
+        assert tick % chain[level] == 0 and all(tick % coarser for coarser in chain[:level])
 
 
-@pytest.mark.parametrize("arguments", [(1.0, 10, 20_500), (1.0, 0, 20_000), (1.0, 10, 500), (1.0, 10, 20_000, 0.0)])
-def test_key_ticks_refuse_what_they_cannot_space(arguments):
+@pytest.mark.parametrize(
+    "arguments", [(1.0, 10, 20_500, 0.5), (1.0, 0, 20_000, 0.5), (1.0, 10, 500, 0.5), (1.0, 10, 20_000, 0.0)]
+)
+def test_spacings_refuse_what_they_cannot_divide(arguments):
     with pytest.raises(UserError, match="key frames"):
-        key_ticks(*arguments)
+        spacings(*arguments)
+
+
+def test_plans_follow_the_speed_and_the_switches():
+    slow, fast = (WORLDS["turntable"].build(0, v, 0.02) for v in (0, 1))
+    rig = cameras(slow, 400, 250, (4,))
+    assert key_plan(slow, rig, 400, 20_000, 0.5).sub_ticks == 1
+    hard = key_plan(fast, rig, 400, 20_000, 0.5)
+    assert hard.chain[-1] == 1 and hard.sub_ticks in (1, 2)
+    assert key_plan(fast, rig, 400, 20_000, 0.1).sub_ticks == 8
+    assert key_plan(fast, rig, 400, 20_000, 0.1, sub_ticks=False).sub_ticks == 1
+    exact = key_plan(slow, rig, 400, 20_000, 0.5, adaptive=False)
+    assert exact.chain == (1,) and len(exact.ticks) == 401

@@ -53,7 +53,7 @@ class RigSpec:
     fov_x_deg: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WorldScene:
     """One concrete world: what stands still, what moves, light and cameras. Metres, Z up, X right, Y away.
 
