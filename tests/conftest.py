@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +45,9 @@ def array_cameras(n: int = 4, width: int = WIDTH, height: int = HEIGHT) -> tuple
     )
 
 
-def write_small_scene(root: Path, seed: int = 0, splits: bool = False) -> Path:
+def write_small_scene(
+    root: Path, seed: int = 0, splits: bool = False, extras: Mapping[str, dict[str, Any]] | None = None
+) -> Path:
     """A scene without Mitsuba: a pattern that drifts to the right; cam_03 is held out, targets every 20 ticks.
 
     With `splits` it has the standard ones; `corner` holds out cam_00, with two targets.
@@ -89,6 +93,7 @@ def write_small_scene(root: Path, seed: int = 0, splits: bool = False) -> Path:
             source={"kind": "test"},
             points=rng.normal(size=(30, 3)),
             splits=standard_splits(cameras, "cam_03") if splits else {},
+            extras=extras or {},
         ),
     )
     return root

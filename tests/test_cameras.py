@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,6 +81,17 @@ def test_mitsuba_and_back_projects_to_the_same_pixels(camera: Camera) -> None:
     assert worst_px(camera, back, seen_points(camera)) < 0.01
 
 
+@given(cameras(square=True))
+def test_mitsuba_poses_mean_its_axes(camera: Camera) -> None:
+    """Project as Mitsuba's manual says: x left, y up, z forward, fov along x, offsets relative to the film's size."""
+    sensor, points = mitsuba_sensor(camera), seen_points(camera)
+    local = (np.linalg.inv(mitsuba_to_world(camera)) @ np.c_[points, np.ones(len(points))].T)[:3].T
+    half = np.tan(np.radians(sensor["fov"]) / 2)  # of the width, at distance 1
+    u = (0.5 - local[:, 0] / local[:, 2] / (2 * half) - sensor["principal_point_offset_x"]) * camera.width
+    v = 0.5 - sensor["principal_point_offset_y"] - local[:, 1] / local[:, 2] / (2 * half) * camera.width / camera.height
+    assert np.abs(np.stack([u, v * camera.height], 1) - camera.project(points)[0]).max() < 0.01
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_ray_of_mitsubas_sensor_hits_our_pixel(seed: int) -> None:
     mi = pytest.importorskip("mitsuba")
@@ -119,13 +129,13 @@ def test_colmap_model_and_back_projects_to_the_same_pixels(
         assert worst_px(a, b, seen_points(a)) < 0.01
 
 
-def test_pycolmap_projects_our_points_to_our_pixels(tmp_path: Path) -> None:
+@settings(max_examples=15, deadline=None)
+@given(camera=cameras())
+def test_pycolmap_projects_our_points_to_our_pixels(tmp_path_factory: pytest.TempPathFactory, camera: Camera) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    camera = look_at(
-        "c", np.array([3.0, -4, 2]), np.zeros(3), np.array([0.0, 0, 1]), focal=300.0, width=200, height=125
-    )
-    write_colmap(tmp_path, [camera], np.zeros((0, 3)))
-    image = next(iter(pycolmap.Reconstruction(str(tmp_path)).images.values()))
+    folder = tmp_path_factory.mktemp("sparse")
+    write_colmap(folder, [camera], np.zeros((0, 3)))
+    image = next(iter(pycolmap.Reconstruction(str(folder)).images.values()))
     for point in seen_points(camera, 10):
         assert np.abs(image.project_point(point) - camera.project(point[None])[0][0]).max() < 0.01
 

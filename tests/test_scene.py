@@ -64,6 +64,24 @@ def test_transforms_follow_nerfstudio(small_scene: Path) -> None:
     assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "transform_matrix"} <= set(image)
 
 
+def test_scenes_may_state_what_else_they_hold(tmp_path: Path) -> None:
+    extras = {
+        "ground_truth": {"every_ticks": 20},
+        "conventional": {"rate_hz": 60, "exposure_us": 8333},
+        "events": {"contrast": 0.2},
+        "calibration": {"flat_ticks": 4000},
+        "instances": {"1": "car", "2": "wheel"},
+    }
+    scene = open_scene(write_small_scene(tmp_path / "scene", extras=extras))
+    assert {key: scene.meta[key] for key in extras} == extras
+    with pytest.raises(UserError, match=r"Additional properties are not allowed \('weather' was unexpected\)"):
+        write_small_scene(tmp_path / "other", extras={"weather": {}})
+    with pytest.raises(UserError, match="at instances: 'car' does not match"):
+        write_small_scene(tmp_path / "third", extras={"instances": {"car": "1"}})
+    with pytest.raises(UserError, match="at events"):
+        write_small_scene(tmp_path / "fourth", extras={"events": 3})  # type: ignore[dict-item]
+
+
 def edit_json(name: str, edit: Callable[[dict[str, Any]], Any], rehash: bool = True) -> Callable[[Path], None]:
     """Change a description file, and make the manifest agree, as a program that writes foreign scenes would."""
 

@@ -89,6 +89,23 @@ def test_export_has_no_padding_and_rows_bottom_up(tmp_path: Path) -> None:
     assert (tmp_path / "out/cam/cam.dat").read_bytes() == expected
 
 
+@settings(max_examples=12, deadline=None)
+@given(st.integers(1, 1100), st.integers(1, 9), st.integers(8, 21), st.booleans(), st.integers(0, 9))
+def test_a_scene_of_any_size_goes_out_and_comes_back(
+    tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, top_down: bool, seed: int
+) -> None:
+    root, spikes = tmp_path_factory.mktemp("spikecv"), random_spikes(n, height, width, seed)
+    poses = {"frames": [{"camera": "cam", **to_nerfstudio(array_cameras(1, width, height)[0])}]}
+    (root / "poses.json").write_text(json.dumps(poses))
+    known = {"rate_hz": 20000.0, "transforms": root / "poses.json"}
+    source = write_spikecv(root / "cam", spikes[:, ::-1] if top_down else spikes)
+    import_spikecv(source, root / "scene", rows_top_down=top_down, **known)
+    np.testing.assert_array_equal(open_scene(root / "scene").stream("cam").window(0, n), spikes)
+    export_spikecv(root / "scene", root / "out")
+    import_spikecv(root / "out", root / "back", **known)
+    np.testing.assert_array_equal(open_scene(root / "back").stream("cam").window(0, n), spikes)
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [

@@ -45,6 +45,64 @@ def test_windows_and_counts_give_back_what_was_packed(
     np.testing.assert_array_equal(counts, spikes[start:stop].sum(0))
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 20), st.integers(1, 20), st.booleans(), st.integers(0, 99))
+def test_each_pixel_is_the_bit_that_the_layout_says(
+    n: int, height: int, width: int, bottom_up: bool, seed: int
+) -> None:
+    spikes = random_spikes(n, height, width, seed)
+    packed = pack(spikes, bottom_up)
+    assert packed.shape == (n, bytes_per_tick(width, height)) and 8 * packed.shape[1] - height * width in range(8)
+    for t in range(n):
+        bits = [packed[t, p >> 3] >> (p & 7) & 1 for p in range(8 * packed.shape[1])]
+        rows = [bits[r * width : (r + 1) * width] for r in range(height)]
+        assert (rows[::-1] if bottom_up else rows) == spikes[t].tolist()
+        assert not any(bits[height * width :]), "padding is zero"
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 25), st.integers(1, 25), st.booleans(), st.data())
+def test_a_spike_at_an_edge_stays_there(height: int, width: int, bottom_up: bool, data: st.DataObject) -> None:
+    """One spike in a border pixel of the first, a middle or the last tick: found there by window and count, alone."""
+    y = data.draw(st.sampled_from([0, height - 1, height // 2]))
+    x = data.draw(st.sampled_from([0, width - 1, width // 2]))
+    t = data.draw(st.sampled_from([0, 4, 8]))
+    spikes = np.zeros((9, height, width), np.uint8)
+    spikes[t, y, x] = 1
+    stream = SpikeStream(pack(spikes, bottom_up), width, height, 20000.0, bottom_up)
+    for start, stop in ((0, 9), (t, t + 1), (0, t + 1), (t, 9)):
+        assert np.argwhere(stream.window(start, stop)).tolist() == [[t - start, y, x]]
+        assert np.argwhere(stream.counts(start, stop)).tolist() == [[y, x]]
+    for start, stop in ((0, t), (t + 1, 9), (t, t)):
+        assert not stream.window(start, stop).any() and not stream.counts(start, stop).any()
+    assert stream.window(t, t).shape == (0, height, width) and stream.counts(t, t).shape == (height, width)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 19), st.integers(1, 19), st.booleans(), st.integers(0, 99), st.data())
+def test_files_of_any_size_in_any_parts(
+    tmp_path_factory: pytest.TempPathFactory,
+    n: int,
+    height: int,
+    width: int,
+    bottom_up: bool,
+    seed: int,
+    data: st.DataObject,
+) -> None:
+    spikes = random_spikes(n, height, width, seed)
+    path = tmp_path_factory.mktemp("streams") / "a.dat"
+    cuts = sorted(data.draw(st.lists(st.integers(0, n), max_size=4)))
+    with SpikeWriter(path, width, height) as writer:
+        for part in np.array_split(pack(spikes, bottom_up), cuts):
+            writer.write(part)
+    assert path.stat().st_size == n * -(-width * height // 8) and writer.n_ticks == n
+    stream = open_stream(path, width, height, 20000.0, rows_bottom_up=bottom_up, n_ticks=n)
+    start = data.draw(st.integers(0, n))
+    stop = data.draw(st.integers(start, n))
+    np.testing.assert_array_equal(stream.window(start, stop), spikes[start:stop])
+    np.testing.assert_array_equal(stream.counts(start, stop), spikes[start:stop].sum(0))
+
+
 @pytest.mark.parametrize("size", [(400, 250), (13, 7)])
 def test_a_file_written_in_parts_reads_back(tmp_path: Path, size: tuple[int, int]) -> None:
     spikes = random_spikes(40, size[1], size[0], 0)
