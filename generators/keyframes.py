@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.images import gray
 from spike4dgs.generators.motion import KeyPlan
 from spike4dgs.generators.render import Still
 from spike4dgs.generators.sensor import Float32
@@ -44,6 +45,7 @@ class KeyStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._loaded: Still | None = None
+        self._background: Float32 | None = None
 
     @property
     def has_still(self) -> bool:
@@ -56,10 +58,17 @@ class KeyStore:
             self._loaded = Still.from_arrays(_read(self._still_path, "background", "first"))
         return self._loaded
 
+    @property
+    def background(self) -> Float32:
+        """Gray of the background, [C, H, W]."""
+        if self._background is None:
+            self._background = gray(self.still().background)
+        return self._background
+
     def set_still(self, still: Still) -> None:
         """Store what does not move. Raises UserError for values that are not finite."""
         _write(self._still_path, still.arrays())
-        self._loaded = None
+        self._loaded = self._background = None
 
     def missing(self, plan: KeyPlan) -> list[int]:
         """The ticks of a plan without a stored key."""
@@ -80,9 +89,13 @@ class KeyStore:
         """One view of a plan: radiance at all ticks that have a key. Reading in ascending order is fastest."""
         return Clip(_Instants(self, view, plan), plan.ticks)
 
+    def radiance(self, view: int, plan: KeyPlan, tick: int) -> Float32:
+        """Radiance [H, W] at the start of any tick of the clip: a key, or on the simulator's curve between two."""
+        return _Instants(self, view, plan).at(tick)
+
     def range(self, view: int, plan: KeyPlan) -> tuple[Float32, Float32]:
         """Smallest and largest radiance [H, W] of each pixel of a view over the coarse keys."""
-        low = high = self.still().background[view]
+        low = high = self.background[view]
         keys = self.instants(view, plan)
         for k in range(0, len(keys.ticks), plan.chain[0] // plan.chain[-1]):
             image = keys.keys[k]
@@ -94,7 +107,7 @@ class KeyStore:
 
         Raises UserError where the file is missing or damaged.
         """
-        shape = self.still().background[view].shape
+        shape = self.background[view].shape
         arrays = _read(self._path(tick), f"{kind}given{view}", f"{kind}values{view}")
         mask, values = arrays[f"{kind}given{view}"], arrays[f"{kind}values{view}"]
         if len(mask) * 8 < np.prod(shape) or (bits := np.unpackbits(mask, count=int(np.prod(shape)))).sum() != len(
@@ -123,29 +136,32 @@ class _Instants(Sequence[Float32]):
         return len(self._ticks)
 
     def __getitem__(self, k: Any) -> Any:  # one key; slices are not needed
-        return self._at(self._ticks[k])
+        return self.at(self._ticks[k])
 
-    def _at(self, tick: int) -> Float32:
+    def at(self, tick: int) -> Float32:
         if tick not in self._kept:
             for old in [t for t in self._kept if t < tick - 4 * self._plan.chain[0]]:
                 del self._kept[old]
-            level = self._plan.level(tick)
-            image = self._between(tick, self._plan.chain[level - 1]) if level else self._background
-            mask, values = self._store.given(tick, self._view)
-            image[mask] = values
-            self._kept[tick] = image
+            self._kept[tick] = self._read(tick)
         return self._kept[tick]
 
-    @property
-    def _background(self) -> Float32:
-        return np.array(self._store.still().background[self._view])
+    def _read(self, tick: int) -> Float32:
+        """Radiance at the start of a tick."""
+        chain = self._plan.chain
+        if tick % chain[-1]:
+            return self._between(tick, chain[-1])
+        level = self._plan.level(tick)
+        image = self._between(tick, chain[level - 1]) if level else np.array(self._store.background[self._view])
+        mask, values = self._store.given(tick, self._view)
+        image[mask] = values
+        return image
 
     def _between(self, tick: int, spacing: int) -> Float32:
         """The clamped Catmull-Rom curve through the keys every `spacing` ticks; see `sensor`."""
         first, last = tick // spacing * spacing, self._ticks[-1]
-        p1, p2 = self._at(first), self._at(first + spacing)
-        p0 = self._at(first - spacing) if first else None
-        p3 = self._at(first + 2 * spacing) if first + 2 * spacing <= last else None
+        p1, p2 = self.at(first), self.at(first + spacing)
+        p0 = self.at(first - spacing) if first else None
+        p3 = self.at(first + 2 * spacing) if first + 2 * spacing <= last else None
         u, d = np.float32((tick - first) / spacing), p2 - p1
         m1 = d if p0 is None else (p2 - p0) * np.float32(0.5)
         m2 = d if p3 is None else (p3 - p1) * np.float32(0.5)

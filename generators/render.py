@@ -41,9 +41,11 @@ MAX_DEPTH = 4  # camera, surface, two bounces
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """What does not move: the background at full quality, and its first samples alone, whose random numbers keys use.
+    """What does not move, linear RGB [C, H, W, 3] float32.
 
-    Both [C, H, W] float32, or [C, H, W, 3] in colour.
+    Attributes:
+        background: at full quality.
+        first: the same with the random numbers, and so the noise, of keys.
     """
 
     background: np.ndarray
@@ -57,6 +59,10 @@ class Still:
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> Still:
         """The inverse of `arrays`."""
         return Still(arrays["background"], arrays["first"])
+
+    def views(self, chosen: Sequence[int]) -> Still:
+        """Some of the views."""
+        return Still(self.background[list(chosen)], self.first[list(chosen)])
 
 
 class MultiViewRenderer(Sight):
@@ -102,20 +108,36 @@ class MultiViewRenderer(Sight):
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
         self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
-        self._given_still = still
+        if still is not None:
+            self.still = still
 
     # ------------------------------------------------------------ pictures
 
+    @cached_property
     def still(self) -> Still:
         """The views without the moving things."""
-        return self._still
+        first = self._whole(self.spp, 0, None)
+        total = first.astype(np.float64)
+        parts = self.background_spp // self.spp
+        for stream in range(1, parts):
+            total += self._whole(self.spp, stream, None)
+        return Still((total / parts).astype(np.float32), first)
+
+    def still_on(self, background: np.ndarray) -> Still:
+        """With a background that another renderer made; only the part that has this one's noise is rendered."""
+        return Still(background, self._whole(self.spp, 0, None))
+
+    @cached_property
+    def background(self) -> np.ndarray:
+        """`still.background`, in the kind of the pictures: [C, H, W], or in colour [C, H, W, 3]."""
+        return self.still.background if self.color else gray(self.still.background)
 
     def keys(self, t_s: float) -> np.ndarray:
         """The views at `t_s`: still, softly lit and traced pixels put together."""
         if self.whole_frames:
             return self.crn_frames(t_s)
         change = self._soft_light.change(t_s)
-        picture = self._still.background * (1 + (change[..., None] if self.color else change))
+        picture = self.background * (1 + (change[..., None] if self.color else change))
         where = np.flatnonzero(self.traced(t_s))
         self._flat(picture)[where] = self._traced_at(where, t_s)
         return picture
@@ -130,7 +152,7 @@ class MultiViewRenderer(Sight):
         t_s, level = tick / plan.rate_hz, plan.level(tick)
         if level == 0:
             picture = self.keys(t_s)
-            given = np.ones(self.shape, bool) if self.whole_frames else picture != self._still.background
+            given = np.ones(self.shape, bool) if self.whole_frames else picture != self.background
             values = picture.ravel()[given.ravel()]
         else:
             given = self._fast(t_s, plan.chain[level - 1] / plan.rate_hz, plan.max_px)
@@ -144,7 +166,8 @@ class MultiViewRenderer(Sight):
 
     def crn_frames(self, t_s: float) -> np.ndarray:
         """Every pixel traced at `t_s` with the random numbers of `keys`; for measuring what `keys` leaves out."""
-        return self._whole(self.spp, 0, t_s)
+        rgb = self._whole(self.spp, 0, t_s)
+        return rgb if self.color else gray(rgb)
 
     def reference_frames(self, t_s: float, spp: int) -> np.ndarray:
         """The views at `t_s` by Mitsuba's own render loop, sensor, film and sampler: every pixel, nothing reused."""
@@ -170,29 +193,23 @@ class MultiViewRenderer(Sight):
 
     # ------------------------------------------------------------ inner workings
 
-    @cached_property
-    def _still(self) -> Still:
-        if self._given_still is not None:
-            return self._given_still
-        first = self._whole(self.spp, 0, None)
-        total = first.astype(np.float64)
-        parts = self.background_spp // self.spp
-        for stream in range(1, parts):
-            total += self._whole(self.spp, stream, None)
-        return Still((total / parts).astype(np.float32), first)
-
     def _whole(self, spp: int, stream: int, t_s: float | None) -> np.ndarray:
-        values = self._at(np.arange(int(np.prod(self.shape))), spp, stream, t_s)
-        return values.reshape(self._still_shape)
+        """Every pixel traced, linear RGB [C, H, W, 3]."""
+        return self._rgb_at(np.arange(int(np.prod(self.shape))), spp, stream, t_s).reshape(*self.shape, 3)
 
     def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
         """Radiance [K] or [K, 3] of the flat pixels `where` of a key."""
-        traced = self._at(where, self.spp, 0, t_s)
+        rgb = self._rgb_at(where, self.spp, 0, t_s)
+        traced = rgb if self.color else gray(rgb)
         if self.whole_frames:
             return traced
-        correction = self._flat(self._still.background)[where] - self._flat(self._still.first)[where]
+        correction = self._flat(self.background)[where] - self._flat(self._first)[where]
         correction[self.object_masks(t_s).ravel()[where]] = 0
         return np.maximum(traced + correction, 0)
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        return self.still.first if self.color else gray(self.still.first)
 
     def _means_at(self, where: np.ndarray, t_s: float, plan: KeyPlan) -> np.ndarray:
         """Mean radiance [K] of flat pixels over the tick from `t_s` on: of so many instants inside it."""
@@ -203,22 +220,17 @@ class MultiViewRenderer(Sight):
         """[C, H, W] bool: traced pixels in which something moves more than `max_px` px `within_s` seconds."""
         return super().traced(t_s) & (self.speeds(t_s) * within_s > max_px)
 
-    def _at(self, pixels: np.ndarray, spp: int, stream: int, t_s: float | None) -> np.ndarray:
-        """Radiance [K] (colour: [K, 3]) of flat pixels; None: without the moving things."""
+    def _rgb_at(self, pixels: np.ndarray, spp: int, stream: int, t_s: float | None) -> np.ndarray:
+        """Linear RGB [K, 3] of flat pixels; None: without the moving things."""
         if t_s is not None:
             self._scene.place(t_s)
-        rgb = self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure)
-        return rgb if self.color else gray(rgb)
+        return np.asarray(self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure))
 
     def _gray_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
         """Radiance [K] of flat pixels with the keys' random numbers, gray and before exposure: for soft light."""
         if moving:
             self._scene.place(t_s)
         return gray(self._tracer.trace(pixels, spp, 0, moving))
-
-    @property
-    def _still_shape(self) -> tuple[int, ...]:
-        return (*self.shape, 3) if self.color else self.shape
 
     def _flat(self, picture: np.ndarray) -> np.ndarray:
         """A view of the picture as [N] or [N, 3]."""

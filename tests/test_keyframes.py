@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.images import gray
 from spike4dgs.generators.keyframes import KeyStore
 from spike4dgs.generators.motion import KeyPlan
 from spike4dgs.generators.render import Still
@@ -26,8 +27,8 @@ def sparse(given: np.ndarray, images: np.ndarray, kind: str = "") -> dict[str, n
 def pictures(seed=0, n=5):
     """What stands still, n random images, and which of their pixels are given at fine ticks."""
     rng = np.random.default_rng(seed)
-    still = Still(*rng.random((2, *SHAPE), dtype=np.float32))
-    images = np.repeat(still.background[None], n, 0)
+    still = Still(*rng.random((2, *SHAPE, 3), dtype=np.float32))
+    images = np.repeat(gray(still.background)[None], n, 0)
     images[1:, :, 2:5, 3:7] = rng.random((n - 1, 2, 3, 4), dtype=np.float32)
     fast = np.zeros(SHAPE, bool)
     fast[:, 3, 4:6] = True
@@ -40,7 +41,7 @@ def store(tmp_path):
     store = KeyStore(tmp_path / "keys")
     store.set_still(still)
     for tick, image in zip(PLAN.ticks, images, strict=True):
-        store.put(tick, sparse(fast if PLAN.level(tick) else image != still.background, image))
+        store.put(tick, sparse(fast if PLAN.level(tick) else image != gray(still.background), image))
     return store
 
 
@@ -89,7 +90,7 @@ def test_means_are_those_of_the_curve_except_where_they_are_given(tmp_path):
         rng.random((4, *SHAPE), dtype=np.float32),
     )
     fast = rng.random(SHAPE) < 0.3
-    store.set_still(Still(images[0], images[0]))
+    store.set_still(Still(*np.repeat(images[0][None, ..., None], 2, 0).repeat(3, -1)))
     for tick in range(5):
         given = sparse(np.ones(SHAPE, bool), images[tick])
         store.put(tick, given | (sparse(fast, means[tick], "mean_") if tick < 4 else {}))
@@ -116,7 +117,7 @@ def test_equal_keys_give_equal_bytes(store, tmp_path):
     still, images, _ = pictures()
     other = KeyStore(tmp_path / "other")
     other.set_still(still)
-    other.put(10, sparse(images[2] != still.background, images[2]))
+    other.put(10, sparse(images[2] != gray(still.background), images[2]))
     for name in ("000010.npz", "still.npz"):
         assert (other.folder / name).read_bytes() == (store.folder / name).read_bytes()
 

@@ -24,7 +24,7 @@ from spike4dgs.generators.worlds import WORLDS
 world = WORLDS["car"].build(0, 0, 0.02)
 renderer = MultiViewRenderer(world, cameras(world, 32, 20, (4,)), seed=0, spp=32, background_spp=128)
 np.savez(
-    sys.argv[1], key=renderer.keys(0.01), again=renderer.keys(0.01), background=renderer.still().background,
+    sys.argv[1], key=renderer.keys(0.01), again=renderer.keys(0.01), background=renderer.background,
     changed=renderer.changed(0.01), traced=renderer.traced(0.01), mask=renderer.object_masks(0.01),
     depth=renderer.depths(0.01), crn=renderer.crn_frames(0.01),
 )

@@ -50,11 +50,11 @@ def truth(r) -> np.ndarray:
 def test_keys_are_the_full_rendering_inside_and_the_background_outside(r):
     key, traced, changed, mask = r.keys(T_S), r.traced(T_S), r.changed(T_S), r.object_masks(T_S)
     assert 0.02 < traced.mean() < 0.6 and (traced <= changed).all() and not changed.all()
-    full, (background, same_numbers) = r.crn_frames(T_S), r.still().arrays().values()
+    full, (background, same_numbers) = r.crn_frames(T_S), (gray_of(a) for a in r.still.arrays().values())
     assert np.array_equal(key[mask], full[mask])
     shadow = traced & ~mask  # the background and the difference that the shadow makes, from the same random numbers
     assert np.array_equal(key[shadow], np.maximum(full + (background - same_numbers), 0)[shadow])
-    assert np.array_equal(key[~changed], r.still().background[~changed])
+    assert np.array_equal(key[~changed], r.background[~changed])
 
 
 def test_keys_are_close_to_mitsubas_own_rendering(r, truth):
@@ -63,7 +63,7 @@ def test_keys_are_close_to_mitsubas_own_rendering(r, truth):
     error = key - truth
     assert np.abs(error).mean() < NOISE[r.world.name]
     assert abs(error.mean()) < 0.002
-    smooth, plain = (gaussian_filter(e, (0, 2, 2))[~traced] for e in (error, r.still().background - truth))
+    smooth, plain = (gaussian_filter(e, (0, 2, 2))[~traced] for e in (error, r.background - truth))
     assert np.abs(smooth).mean() < 0.7 * np.abs(plain).mean()  # relighting removes most of the soft change
     assert np.abs(smooth).max() < 0.03
 
@@ -102,7 +102,7 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     together.keys(0.002)  # neither what was rendered before nor the other views leave a trace
     alone = MultiViewRenderer(r.world, together.cameras[1:], seed=0, spp=SPP, background_spp=256)
     mask = alone.object_masks(T_S)[0]
-    assert alone.still().background[0].tobytes() == together.still().background[1].tobytes()
+    assert alone.background[0].tobytes() == together.background[1].tobytes()
     assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
     pixels = np.arange(WIDTH * HEIGHT)
     first, again, other = (

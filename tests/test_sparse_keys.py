@@ -25,7 +25,7 @@ def r() -> MultiViewRenderer:
 def test_a_renderer_goes_on_from_the_background_of_another(r):
     plan = KeyPlan(400, 20_000, 0.05, (20, 4, 2))
     first = r
-    still = Still.from_arrays(first.still().arrays())
+    still = Still.from_arrays(first.still.arrays())
     second = MultiViewRenderer(r.world, first.cameras, seed=0, spp=SPP, background_spp=256, still=still)
     for tick in (200, 202, 204):
         a, b = first.key_arrays(tick, plan), second.key_arrays(tick, plan)
@@ -36,7 +36,7 @@ def test_fine_keys_give_what_is_too_fast_and_the_rest_is_close(r, tmp_path):
     """Dense keys from a plan against pictures rendered at every tick: small errors, and none where keys are given."""
     plan = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1))
     store = KeyStore(tmp_path)
-    store.set_still(r.still())
+    store.set_still(r.still)
     for tick in range(10, 31):  # the disc turns steadily: one interval and its neighbours are enough
         store.put(tick, r.key_arrays(tick, plan))
     for tick in (0, 40):
