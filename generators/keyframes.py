@@ -55,7 +55,7 @@ class KeyStore:
     def still(self) -> Still:
         """What does not move. Raises UserError where the file is missing or damaged."""
         if self._loaded is None:
-            self._loaded = Still.from_arrays(_read(self._still_path, "background", "first"))
+            self._loaded = Still.from_arrays(read_arrays(self._still_path, "background", "first"))
         return self._loaded
 
     @property
@@ -67,7 +67,7 @@ class KeyStore:
 
     def set_still(self, still: Still) -> None:
         """Store what does not move. Raises UserError for values that are not finite."""
-        _write(self._still_path, still.arrays())
+        write_arrays(self._still_path, still.arrays())
         self._loaded = self._background = None
 
     def missing(self, plan: KeyPlan) -> list[int]:
@@ -76,7 +76,7 @@ class KeyStore:
 
     def put(self, tick: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Store the key of a tick. Raises UserError for values that are not finite."""
-        _write(self._path(tick), arrays)
+        write_arrays(self._path(tick), arrays)
 
     def view(self, view: int, plan: KeyPlan) -> Clip:
         """One view for the simulator: radiance at the keys' ticks or, with sub-ticks, the mean of every tick."""
@@ -108,7 +108,7 @@ class KeyStore:
         Raises UserError where the file is missing or damaged.
         """
         shape = self.background[view].shape
-        arrays = _read(self._path(tick), f"{kind}given{view}", f"{kind}values{view}")
+        arrays = read_arrays(self._path(tick), f"{kind}given{view}", f"{kind}values{view}")
         mask, values = arrays[f"{kind}given{view}"], arrays[f"{kind}values{view}"]
         if len(mask) * 8 < np.prod(shape) or (bits := np.unpackbits(mask, count=int(np.prod(shape)))).sum() != len(
             values
@@ -191,7 +191,8 @@ class _Means(Sequence[Float32]):
         return mean
 
 
-def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as `.npz`; equal arrays give equal bytes. Raises UserError for values that are not finite."""
     for array in arrays.values():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             found = f"{np.count_nonzero(~np.isfinite(array))} pixels that are not"
@@ -200,7 +201,8 @@ def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         np.savez(part, allow_pickle=False, **dict(arrays))
 
 
-def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+    """Read some arrays of such a file. Raises UserError where it is missing or damaged."""
     try:
         with open(path, "rb") as f, np.load(f) as data:
             return {name: data[name] for name in names}

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from tyro.conf import Positional
 
@@ -17,13 +17,16 @@ from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from spike4dgs.generators.executors import Run
+
 T = TypeVar("T")
 _LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
 
 
 def make_dataset(
-    worlds: Positional[tuple[str, ...]],
+    worlds: Positional[tuple[str, ...]] = (),
     *,
+    all: bool = False,
     profile: str = "small",
     out: Path = Path("data"),
     seed: int = 0,
@@ -31,15 +34,25 @@ def make_dataset(
     seconds: float | None = None,
     gain_map: bool = True,
     dark_map: bool = True,
+    shot_noise: bool = True,
+    adaptive_keys: bool = True,
+    sub_ticks: bool = True,
+    whole_frames: bool = False,
+    workers: int = 1,
+    scheduler: str | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    audit: bool = False,
     replace: bool = False,
 ) -> int:
     """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
 
     A killed run goes on where it was when the same command is given again. A scene that is there already is checked
-    and kept. OUT/ID.report.json tells what the stages took. Equal arguments give equal bytes.
+    and kept. OUT/ID.report.json tells what the stages took. Equal arguments give equal bytes, with any number of
+    workers.
 
     Args:
-        worlds: Names of worlds: car, turntable.
+        worlds: Names of worlds, such as car turntable.
+        all: Make all worlds.
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
         out: Folder in which the scene folders appear.
         seed: Seed of everything random: the world's details, the rendering, the sensors.
@@ -47,39 +60,67 @@ def make_dataset(
         seconds: Length of the clip if not the profile's, in whole milliseconds.
         gain_map: Give every pixel its own sensitivity.
         dark_map: Give every pixel its own dark rate.
+        shot_noise: Let photons arrive at random.
+        adaptive_keys: Render a pixel as often as its motion asks; else every pixel that changes at every tick (slow).
+        sub_ticks: Render instants inside a tick where the motion in one tick is too large.
+        whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
+        workers: Processes that render.
+        scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
+        device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
+        audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
         replace: Make scenes again that are there with other settings or damaged.
     """
     from rich.console import Console
 
-    from spike4dgs.benchmark.files import write_json
-    from spike4dgs.generators.scene_maker import Maker
+    from spike4dgs.generators.executors import executor
+    from spike4dgs.generators.mitsuba_variant import choose_device
 
     console = Console(highlight=False, soft_wrap=True)
-    jobs = [_job(w, profile, seed, variant, seconds, (gain_map, dark_map)) for w in dict.fromkeys(worlds)]
+    if all and worlds:
+        raise problem("worlds", "names or --all", "both", "leave one out")
+    switches = {
+        "gain_map": gain_map,
+        "dark_map": dark_map,
+        "shot_noise": shot_noise,
+        "adaptive": adaptive_keys,
+        "sub_ticks": sub_ticks,
+        "whole_frames": whole_frames,
+    }
+    names = _all_names() if all else dict.fromkeys(worlds)
+    jobs = [_job(w, profile, seed, variant, seconds, switches) for w in names]
     if not jobs:
-        raise problem("worlds", "at least one world", "none", f"choose among {_names()}")
+        raise problem("worlds", "at least one world, or --all", "none", f"choose among {_names()}")
     if seed < 0 or variant < 0:
         raise problem("--seed and --variant", "numbers from 0 up", f"{seed}, {variant}", "correct them")
+    choose_device(device)
     todo = [job for job in jobs if not _is_done(job, out, replace)]
     for job in jobs:
         if job not in todo:
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}", markup=False)
-    for job in todo:
-        start = time.perf_counter()
-        with _stages(console, job.id) as watch:
-            maker = Maker(job, out, watch)
-            folder = maker.make()
-        total = time.perf_counter() - start
-        report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}
-        write_json(out / f"{job.id}.report.json", report)
-        console.print(f"{job.id}: {total:.0f} s, written to {folder}", markup=False)
+    with executor(workers, scheduler) as run:
+        for number, job in enumerate(todo, start=1):
+            _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
     return 0
 
 
-def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, maps: tuple[bool, bool]) -> Job:
-    from spike4dgs.generators.worlds import WORLDS
+def _make(job: Job, out: Path, run: Run, with_audit: bool, console: Any, which: str) -> None:
+    """Make one scene and its report."""
+    from spike4dgs.benchmark.files import write_json
+    from spike4dgs.generators.scene_maker import Maker
 
-    if world not in WORLDS:
+    start = time.perf_counter()
+    with _stages(console, job.id + which) as watch:
+        maker = Maker(job, out, watch, run, with_audit)
+        folder = maker.make()
+    total = time.perf_counter() - start
+    report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}
+    plan = {"spacings_ticks": list(maker.plan.chain), "sub_ticks": maker.plan.sub_ticks, "keys": len(maker.plan.ticks)}
+    write_json(out / f"{job.id}.report.json", report | {"plan": plan, "audit": maker.audit})
+    console.print(f"{job.id}: {total:.0f} s, written to {folder}", markup=False)
+
+
+def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, switches: dict[str, bool]) -> Job:
+    if world not in _all_names():
         raise problem("world", f"one of {_names()}", repr(world), "correct the name")
     if profile not in PROFILES:
         raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(profile), "correct the name")
@@ -88,14 +129,17 @@ def _job(world: str, profile: str, seed: int, variant: int, seconds: float | Non
     if ticks < 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
         fix = "give seconds such as 0.02"
         raise problem("--seconds", "whole milliseconds, at least 0.002", str(seconds), fix)
-    length = round(ticks) / RATE_HZ
-    return Job(world, variant, seed, profile, PROFILES[profile], length, *maps)
+    return Job(world, variant, seed, profile, PROFILES[profile], round(ticks) / RATE_HZ, **switches)
+
+
+def _all_names() -> list[str]:
+    from spike4dgs.generators.worlds import WORLDS
+
+    return list(WORLDS)
 
 
 def _names() -> str:
-    from spike4dgs.generators.worlds import WORLDS
-
-    return ", ".join(WORLDS)
+    return ", ".join(_all_names())
 
 
 def _is_done(job: Job, out: Path, replace: bool) -> bool:

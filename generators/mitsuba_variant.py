@@ -33,6 +33,7 @@ _LLVM_PLACES = (
     "/usr/local/lib/libLLVM*",
     "/opt/homebrew/opt/llvm/lib/libLLVM*",
 )
+_CUDA_PLACES = ("/usr/lib/*/libcuda.so*", "/usr/lib64/libcuda.so*", "/usr/lib/wsl/lib/libcuda.so*")
 _PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -65,6 +66,23 @@ def pick_variant() -> str:
         file=sys.stderr,
     )
     return SAFE
+
+
+def choose_device(device: str) -> None:
+    """Let this process and its children render on "cpu" or "cuda"; "auto" leaves it to the environment variable.
+
+    Raises UserError for "cuda" where there is no NVIDIA driver.
+    """
+    if device == "auto":
+        return
+    if device == "cuda" and not any(glob.glob(place) for place in _CUDA_PLACES):
+        raise problem("--device cuda", "an NVIDIA GPU with its driver", "no libcuda", "use --device cpu")
+    chosen = os.environ.get(OVERRIDE, "")
+    if device == "cuda":
+        os.environ[OVERRIDE] = "cuda_ad_rgb"
+    elif chosen.startswith("cuda"):
+        del os.environ[OVERRIDE]
+    pick_variant.cache_clear()
 
 
 def load_mitsuba() -> ModuleType:

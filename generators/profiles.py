@@ -19,17 +19,17 @@ class Profile:
     seconds: float
     spp: int  # of key frames, inside the region that changes
     background_spp: int
-    target_spp: int  # of ground truth
-    target_background_spp: int
-    max_key_px: float  # that the fastest image point moves between two keys
+    target_spp: int  # of ground truth, inside the region that changes
+    max_key_px: float  # that a point of the picture may move between two of its keys
+    sparse_every: int  # ticks between the ground-truth frames of the cameras that are not held out
 
 
 _ALL = tuple(range(9))
 
 PROFILES: dict[str, Profile] = {
-    "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 64, 64, 256, 0.5),
-    "small": Profile(_ALL, 200, 125, 0.02, 32, 256, 256, 1024, 0.5),
-    "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 1024, 0.5),
+    "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 256, 64, 0.5, 40),
+    "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.25, 100),
+    "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 0.25, 400),
 }
 
 
@@ -45,6 +45,10 @@ class Job:
     seconds: float
     gain_map: bool = True
     dark_map: bool = True
+    shot_noise: bool = True
+    adaptive: bool = True  # False: every pixel that changes, at every tick
+    sub_ticks: bool = True  # False: never render instants inside a tick
+    whole_frames: bool = False  # True: every pixel of every key
 
     @property
     def id(self) -> str:
@@ -71,9 +75,18 @@ class Job:
             "sampling": profile,
             "gain_map": self.gain_map,
             "dark_map": self.dark_map,
+            "shot_noise": self.shot_noise,
+            "adaptive_keys": self.adaptive,
+            "sub_ticks": self.sub_ticks,
+            "whole_frames": self.whole_frames,
         }
 
     @property
     def target_ticks(self) -> range:
-        """Ticks with ground truth: every millisecond strictly inside the clip."""
+        """Ticks with ground truth at the held-out camera: every millisecond strictly inside the clip."""
         return range(TARGET_EVERY, self.n_ticks - TARGET_EVERY + 1, TARGET_EVERY)
+
+    @property
+    def sparse_ticks(self) -> range:
+        """Those of them at which all other cameras have ground truth too."""
+        return range(self.profile.sparse_every, self.target_ticks.stop, self.profile.sparse_every)

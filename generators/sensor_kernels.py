@@ -1,6 +1,7 @@
 """The inner loop of `sensor`: 64 pixels of a tick become one word.
 
 numba vectorises the loops over 64 pixels; only the collection of their sign bits is written as vector code by hand.
+With shot noise other loops run, so that without it nothing is spent on it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from numba.extending import intrinsic
 from spike4dgs.benchmark.bits import kernel
 
 THRESHOLD = 2**31  # charge units at which a pixel fires
-BELOW_THRESHOLD = 2147483520.0  # largest float32 below it
 BLOCK = 64  # pixels whose spikes make one word
 STRIP = 16  # blocks taken through all intervals of a batch before the next: 128 bytes of a row, two cache lines
 
@@ -45,6 +45,10 @@ def integrate(
     gain: Any,
     dark: Any,
     charge: Any,
+    unit: Any,
+    noise: Any,
+    key: Any,
+    means: Any,
     words: Any,
     first_block: Any,
     last_block: Any,
@@ -52,9 +56,13 @@ def integrate(
     """Fill words[:, first_block:last_block] and advance `charge`: strips outer, intervals, blocks, ticks inner.
 
     window [S + 3, P], ticks [S + 1], tangents [S, 2], gain and dark [P] or [64], charge [P], words [T, P / 64].
+    `unit`: charge units of one threshold, 2^31 without noise; `noise`: charge units of one step of `deviate`, 0 is off;
+    `key`: of its random numbers; `means`: keys are means of their interval and are used as they are.
     """
     c = np.empty(BLOCK, np.int32)
     w = np.empty(6 * BLOCK, np.float32)
+    increment = np.empty(BLOCK, np.int32)
+    pixel = np.empty(BLOCK, np.uint32)
     for strip in range(first_block, last_block, STRIP):
         for s in range(len(ticks) - 1):
             n = ticks[s + 1] - ticks[s]
@@ -66,11 +74,20 @@ def integrate(
                 g = gain[p : p + BLOCK] if len(gain) > BLOCK else gain
                 d = dark[p : p + BLOCK] if len(dark) > BLOCK else dark
                 c[:] = charge[p : p + BLOCK]
-                if _still(k):
-                    _constant(k[1], g, d, radiance_gain, c, words[start:stop, block])
+                out = words[start:stop, block]
+                constant = means or _still(k)
+                if constant:
+                    _steady(k[1], g, d, radiance_gain, unit, increment)
                 else:
-                    _prepare(k, tangents[s, 0], tangents[s, 1], g, d, np.float32(radiance_gain), n, w)
-                    _changing(w, n, c, words[start:stop, block])
+                    _prepare(k, tangents[s, 0], tangents[s, 1], g, d, np.float32(radiance_gain), unit, n, w)
+                if noise != 0:
+                    for i in range(BLOCK):
+                        pixel[i] = np.uint32((p + i) * 0x9E3779B1)
+                    _noisy(constant, increment, w, n, c, pixel, ticks[s], key, np.int32(unit), noise, out)
+                elif constant:
+                    _constant(increment, c, out)
+                else:
+                    _changing(w, n, c, out)
                 charge[p : p + BLOCK] = c
 
 
@@ -84,13 +101,17 @@ def _still(k: Any) -> bool:
 
 
 @kernel
-def _constant(k: Any, g: Any, d: Any, radiance_gain: Any, c: Any, words: Any) -> None:
-    """Ticks of 64 pixels whose radiance does not change: one integer addition each."""
-    increment = np.empty(BLOCK, np.int32)
+def _steady(k: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, increment: Any) -> None:
+    """Increments [64] of pixels whose radiance does not change."""
     for i in range(BLOCK):
-        x = (np.float64(g[i]) * radiance_gain * np.float64(k[i]) + np.float64(d[i])) * THRESHOLD
+        x = (np.float64(g[i]) * radiance_gain * np.float64(k[i]) + np.float64(d[i])) * unit
         x = 0.0 if x < 0.0 else x
-        increment[i] = np.int32(THRESHOLD - 1.0 if x > THRESHOLD - 1.0 else x)
+        increment[i] = np.int32(unit - 1.0 if x > unit - 1.0 else x)
+
+
+@kernel
+def _constant(increment: Any, c: Any, words: Any) -> None:
+    """Ticks of 64 pixels whose radiance does not change: one integer addition each."""
     for j in range(len(words)):
         for i in range(BLOCK):
             c[i] = (c[i] & np.int32(0x7FFFFFFF)) + increment[i]
@@ -100,19 +121,20 @@ def _constant(k: Any, g: Any, d: Any, radiance_gain: Any, c: Any, words: Any) ->
 
 
 @kernel
-def _prepare(k: Any, weight1: Any, weight2: Any, g: Any, d: Any, radiance_gain: Any, n: Any, w: Any) -> None:
+def _prepare(k: Any, weight1: Any, weight2: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, n: Any, w: Any) -> None:
     """Polynomial in u (rows 0..3 of `w` [6 * 64]) and limits (rows 4, 5) of the increment, in charge units."""
-    unit, top, zero = np.float32(THRESHOLD), np.float32(BELOW_THRESHOLD), np.float32(0.0)
+    one, zero = np.float32(unit), np.float32(0.0)
+    top = np.float32(unit * (1 - 2.0**-24))  # the largest float32 below one threshold
     width2, width3 = np.float32(1.0 / (12.0 * n * n)), np.float32(1.0 / (4.0 * n * n))
     for i in range(BLOCK):
-        scale = g[i] * radiance_gain * unit
+        scale = g[i] * radiance_gain * one
         d2 = k[2, i] - k[1, i]
         m1 = weight1 * (k[2, i] - k[0, i])
         m2 = weight2 * (k[3, i] - k[1, i])
         a2 = scale * (np.float32(3.0) * d2 - np.float32(2.0) * m1 - m2)
         a3 = scale * (m1 + m2 - np.float32(2.0) * d2)
-        level = scale * k[1, i] + d[i] * unit
-        level2 = scale * k[2, i] + d[i] * unit
+        level = scale * k[1, i] + d[i] * one
+        level2 = scale * k[2, i] + d[i] * one
         w[i] = level + a2 * width2
         w[BLOCK + i] = scale * m1 + a3 * width3
         w[2 * BLOCK + i] = a2
@@ -131,12 +153,70 @@ def _changing(w: Any, n: Any, c: Any, words: Any) -> None:
     for j in range(len(words)):
         u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
         for i in range(BLOCK):
-            cubic = w[2 * BLOCK + i] + u * w[3 * BLOCK + i]
-            x = w[i] + u * (w[BLOCK + i] + u * cubic)
-            low, high = w[4 * BLOCK + i], w[5 * BLOCK + i]
-            x = low if x < low else x
-            x = high if x > high else x
-            c[i] = (c[i] & np.int32(0x7FFFFFFF)) + np.int32(x)
+            c[i] = (c[i] & np.int32(0x7FFFFFFF)) + np.int32(_along(w, i, u))
         words[j] = _sign_bits(c)  # type: ignore[call-arg]
     for i in range(BLOCK):
         c[i] &= np.int32(0x7FFFFFFF)
+
+
+@kernel
+def _along(w: Any, i: Any, u: Any) -> Any:
+    """Increment of pixel i at u."""
+    cubic = w[2 * BLOCK + i] + u * w[3 * BLOCK + i]
+    x = w[i] + u * (w[BLOCK + i] + u * cubic)
+    low, high = w[4 * BLOCK + i], w[5 * BLOCK + i]
+    x = low if x < low else x
+    return high if x > high else x
+
+
+# ---------------------------------------------------------------- shot noise
+
+
+@kernel
+def mix(x: Any) -> Any:
+    """32 bits in, 32 well mixed bits out, one to one (multiplications and shifts of Ellis' lowbias32)."""
+    x = np.uint32(x ^ (x >> np.uint32(16)))
+    x = np.uint32(x * np.uint32(0x7FEB352D))
+    x = np.uint32(x ^ (x >> np.uint32(15)))
+    x = np.uint32(x * np.uint32(0x846CA68B))
+    return np.uint32(x ^ (x >> np.uint32(16)))
+
+
+@kernel
+def deviate(pixel: Any, tick: Any) -> Any:
+    """A nearly Gaussian integer in -510 .. 510, variance 21845: the sum of four random bytes, less its mean.
+
+    A function of the hashes of pixel and tick alone.
+    """
+    x = mix(np.uint32(pixel ^ tick))
+    pairs = np.uint32((x & np.uint32(0x00FF00FF)) + ((x >> np.uint32(8)) & np.uint32(0x00FF00FF)))
+    return np.int32((pairs & np.uint32(0xFFFF)) + (pairs >> np.uint32(16))) - np.int32(510)
+
+
+@kernel
+def _noisy(
+    constant: Any,
+    increment: Any,
+    w: Any,
+    n: Any,
+    c: Any,
+    pixel: Any,
+    tick: Any,
+    key: Any,
+    one: Any,
+    noise: Any,
+    words: Any,
+) -> None:
+    """Ticks of 64 pixels whose every spike takes its own, slightly different charge; see `sensor`."""
+    for j in range(len(words)):
+        u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
+        for i in range(BLOCK):
+            c[i] = c[i] + (increment[i] if constant else np.int32(_along(w, i, u)))
+        words[j] = _sign_bits(c)  # type: ignore[call-arg]
+        if words[j] == 0:
+            continue
+        now = mix(np.uint32(np.uint32(tick + j) ^ key))
+        for i in range(BLOCK):
+            spent = one + noise * deviate(pixel[i], now)
+            left = np.int32(c[i] - (spent if c[i] < 0 else np.int32(0)))
+            c[i] = left if left >= 0 else np.int32(0x7FFFFFFF)  # a full well

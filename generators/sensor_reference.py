@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.sensor import Float32, Int32, Keys, Sensor
+from spike4dgs.generators.sensor import DEVIATE_SD, Float32, Int32, Keys, Sensor
 from spike4dgs.generators.sensor_kernels import THRESHOLD
 
 Float64 = NDArray[np.float64]
@@ -47,18 +47,38 @@ def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[F
 
 def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
     """Spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
+    sd = 0.0 if sensor.photons is None else sensor.photons**-0.5
+    height, width = charge.shape
+    pixels = np.arange(height * width, dtype=np.uint64).reshape(height, width)[::-1]  # as the file numbers them
     level = charge / THRESHOLD
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
-    for mean in means:
+    for tick, mean in enumerate(means):
         level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1.0)
         fired = level >= 1.0
         yield fired, level
-        level = level - fired
+        level = level - fired * (1 + sd * deviates(pixels, tick, sensor.noise_key))
+        level = np.minimum(level, 1 - 2**-31)  # a full well
+
+
+def deviates(pixels: NDArray[np.uint64], tick: int, key: int) -> Float64:
+    """The simulator's random numbers of a tick, mean 0 and variance 1: four bytes of a 32-bit hash, summed."""
+
+    def mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B), (16, 1)):
+            x = ((x ^ (x >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
+        return x
+
+    hashed = (pixels * np.uint64(0x9E3779B1)) & np.uint64(0xFFFFFFFF)
+    x = mixed(hashed ^ mixed(np.array([tick ^ key], dtype=np.uint64)))
+    total = sum((x >> np.uint64(shift)) & np.uint64(255) for shift in (0, 8, 16, 24))
+    return (np.asarray(total, dtype=np.float64) - 510) / DEVIATE_SD
 
 
 def simulate_reference(
-    keys: Keys, key_ticks: Sequence[int], n_ticks: int, sensor: Sensor, charge: Int32
+    keys: Keys, key_ticks: Sequence[int], n_ticks: int, sensor: Sensor, charge: Int32, means: bool = False
 ) -> NDArray[np.bool_]:
     """Spikes [n_ticks, H, W], upright and unpacked: the arguments are those of `sensor.simulate`."""
+    if means:
+        return np.stack([fired for fired, _ in fire((_exact(key) for key in keys), sensor, charge)])
     return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge)])

@@ -50,15 +50,6 @@ class Sight:
         self._scene, self._tracer = scene, tracer
         self._last: tuple[float, _Look] | None = None
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the moving things, in the order of their numbers 1, 2, ... in `geometry`."""
-        names = list(self.world.instances)
-        for name, surface in self.world.deforming.items():
-            several = surface.bodies is not None
-            names += [f"{name}/{b}" for b in range(int(surface.bodies.max()) + 1)] if several else [name]
-        return tuple(names)
-
     def object_masks(self, t_s: float) -> np.ndarray:
         """Bool: the ray through the pixel's centre meets a moving thing first."""
         return self._look(t_s).seen.reshape(self.shape)
@@ -95,8 +86,8 @@ class Sight:
     def geometry(self, t_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Depth [C, H, W] float32, thing numbers [C, H, W] uint32 and optical flow [C, H, W, 2] float32, in px.
 
-        Number 0 stands still; k is `names[k - 1]`. Flow is the way of the pixel's surface point from `t_s` to
-        `t_s + dt_s`, whether or not it is seen then.
+        Number 0 stands still; k is `world.thing_names[k - 1]`. Flow is the way of the pixel's surface point from `t_s`
+        to `t_s + dt_s`, whether or not it is seen then.
         """
         look = self._look(t_s)
         seen = np.flatnonzero(look.seen)

@@ -129,7 +129,7 @@ def test_speeds_are_those_of_warped_points_and_shadows(r):
     exact = maximum_filter(np.linalg.norm(flow, axis=-1) / 1e-4, 7)
     inner = erode(mask, np.ones((9, 9)))
     np.testing.assert_allclose(speed[inner], exact[inner], rtol=0.02, atol=20)
-    assert (ids[mask] > 0).all() and (ids[~mask] == 0).all() and ids.max() <= len(r.names)
+    assert (ids[mask] > 0).all() and (ids[~mask] == 0).all() and ids.max() <= len(r.world.thing_names)
     assert (speed[~r.traced(T_S)[1]] == 0).all()
     if r.world.name == "car":  # on the flat road the shadow keeps up with the car: no faster than its fastest point
         shadow = r.traced(T_S)[1] & (maximum_filter(mask, 9) == 0)
@@ -167,7 +167,7 @@ def test_deforming_surfaces_have_masks_numbers_and_flow():
     flaps = two_flaps()
     (camera,) = cameras(flaps, 2 * WIDTH, 2 * HEIGHT, (4,))
     r = MultiViewRenderer(flaps, [camera], seed=0, spp=16, background_spp=64)
-    assert r.names == ("flap/0", "flap/1")
+    assert r.world.thing_names == ("flap/0", "flap/1")
     depth, ids, flow = (a[0] for a in r.geometry(T_S, 1e-3))
     before, after = (flaps.moving_points(t) for t in (T_S, T_S + 1e-3))
     for body in (0, 1):

@@ -31,7 +31,7 @@ class Lazy:
 
 
 def stream(keys, ticks, n, sensor, charge, threads=1):
-    packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads)))
+    packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads=threads)))
     return SpikeStream(packed, charge.shape[1], charge.shape[0], 20000.0)
 
 

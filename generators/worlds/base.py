@@ -90,6 +90,15 @@ class WorldScene:
     notes: Mapping[str, float]
     deforming: Mapping[str, Deforming] = field(default_factory=dict)
 
+    @property
+    def thing_names(self) -> tuple[str, ...]:
+        """Names of the moving things: instances, then deforming surfaces, or the bodies of those that have several."""
+        names = list(self.instances)
+        for name, surface in self.deforming.items():
+            bodies = surface.bodies
+            names += [name] if bodies is None else [f"{name}/{b}" for b in range(int(bodies.max()) + 1)]
+        return tuple(names)
+
     def moving_points(self, t_s: float) -> np.ndarray:
         """World positions of all moving vertices at `t_s`, always in the same order: [N, 3] float64."""
         poses = self.poses(t_s)

@@ -1,0 +1,68 @@
+"""Statistics of a stream that tell one camera, or one simulator, from another.
+
+- Adjacent intervals: a pixel that keeps the charge above the threshold and sees steady light has intervals of two
+  neighbouring lengths between its spikes; one that drops the charge has one, one with much temporal noise has many.
+- Excess count variance: over windows of a recording, a pixel's count varies by f (1 - f) around its mean even without
+  noise, f being the fraction of the mean; the unbiased variance of the counts minus that is temporal noise, plus
+  f (1 - f) / (windows - 1) from the estimate itself, which a noise-free pixel shows too.
+- Local gain spread: each pixel over the median of the 5x5 around it; the spread of that from its median absolute
+  deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+WINDOWS = (10, 20, 40, 60)  # ticks
+
+
+@dataclass(frozen=True)
+class StreamStatistics:
+    """Of the pixels looked at.
+
+    Attributes:
+        one_interval, two_intervals: share of pixels with intervals of one length; of exactly two neighbouring lengths.
+        excess_variance: excess count variance for each of the WINDOWS.
+    """
+
+    one_interval: float
+    two_intervals: float
+    excess_variance: tuple[float, ...]
+
+
+def stream_statistics(spikes: NDArray[np.bool_], pixels: NDArray[np.bool_] | None = None) -> StreamStatistics:
+    """Statistics of an unpacked recording [T, H, W]; only `pixels` [H, W] with three spikes or more count."""
+    chosen = spikes.reshape(len(spikes), -1) if pixels is None else spikes[:, pixels]
+    chosen = chosen[:, chosen.sum(0) >= 3]
+    shortest, longest = _interval_range(chosen)
+    one, two = float((shortest == longest).mean()), float((longest == shortest + 1).mean())
+    return StreamStatistics(one, two, tuple(excess_variance(chosen, window) for window in WINDOWS))
+
+
+def excess_variance(spikes: NDArray[np.bool_], window: int) -> float:
+    """Mean over the pixels of [T, P]: unbiased variance of the counts in windows, minus f (1 - f)."""
+    n = len(spikes) // window
+    counts = spikes[: n * window].reshape(n, window, -1).sum(1)
+    fraction = counts.mean(0) % 1
+    return float((counts.var(0, ddof=1) - fraction * (1 - fraction)).mean())
+
+
+def local_spread(image: NDArray[np.floating]) -> float:
+    """Robust relative spread of pixels [H, W] against their neighbours."""
+    relative = image / median_filter(image, 5) - 1
+    return float(1.4826 * np.median(np.abs(relative - np.median(relative))))
+
+
+def _interval_range(spikes: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Shortest and longest interval of each pixel of [T, P]."""
+    pixel, tick = np.nonzero(spikes.T)
+    same = pixel[1:] == pixel[:-1]
+    length, owner = np.diff(tick)[same], pixel[1:][same]
+    shortest, longest = np.full(spikes.shape[1], len(spikes)), np.zeros(spikes.shape[1], np.int64)
+    np.minimum.at(shortest, owner, length)
+    np.maximum.at(longest, owner, length)
+    return shortest, longest

@@ -1,0 +1,87 @@
+"""What a camera records of the radiance: its spikes, its calibration recordings, and what other sensors would see.
+
+One call writes everything of one camera, its spikes last.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene import Target
+from spike4dgs.benchmark.scene_writer import stream_name
+from spike4dgs.benchmark.spikes import SpikeWriter
+from spike4dgs.generators import calibration, conventional, events
+from spike4dgs.generators.keyframes import KeyStore
+from spike4dgs.generators.motion import KeyPlan
+from spike4dgs.generators.profiles import RATE_HZ, Job
+from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor_maps import dark_map, gain_map, write_maps
+
+CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
+
+
+def is_done(scene: Path, camera: Camera) -> bool:
+    """Whether `write_camera` has finished for this camera."""
+    return (scene / stream_name(camera.id)).is_file()
+
+
+def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: int, plan: KeyPlan) -> None:
+    """Write truth maps, calibration recordings, conventional frames, events and spikes of one camera."""
+    sensor = sensor_of(job, camera)
+    size, entropy = (camera.height, camera.width), [job.seed, job.variant, *f"{job.world} {camera.id}".encode()]
+    write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
+    calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
+    instants = store.instants(view, plan)
+    for tick, image in conventional.exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
+        write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(image))
+    found = events.events(store.instants(view, plan).keys, instants.ticks, job.n_ticks, RATE_HZ)
+    events.write_events(scene / f"events/{camera.id}.npz", found)
+    clip, charge = store.view(view, plan), random_charge(*size, entropy)
+    with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
+        for packed in simulate(clip.keys, clip.ticks, job.n_ticks, sensor, charge, means=clip.means):
+            writer.write(packed)
+
+
+def sensor_of(job: Job, camera: Camera) -> Sensor:
+    """A camera's sensor; its maps belong to the camera and not to the world."""
+    pixels = camera.height, camera.width, job.seed, camera.id
+    return Sensor(
+        gain=gain_map(*pixels) if job.gain_map else None,
+        dark=dark_map(*pixels) if job.dark_map else None,
+        photons=PHOTONS_PER_SPIKE if job.shot_noise else None,
+        noise_seed=(job.seed, job.variant, *f"{job.world} {camera.id} photons".encode()),
+    )
+
+
+def sensor_facts(job: Job) -> dict[str, Any]:
+    """`sensor` of scene.json."""
+    return {
+        "model": "integrate-and-fire/2",
+        "rows_bottom_up": True,
+        "reset": "subtractive",
+        "most_spikes_per_tick": 1,
+        "gain_map": job.gain_map,
+        "dark_map": job.dark_map,
+        "photons_per_spike": PHOTONS_PER_SPIKE if job.shot_noise else None,
+    }
+
+
+def extras(job: Job) -> dict[str, dict[str, Any]]:
+    """What scene.json says of the files that `write_camera` and the ground truth add."""
+    return {
+        "ground_truth": {
+            "images": "linear radiance, half float: R, G, B and gray Y; 1 is white",
+            "geometry": "Z: metres along the optical axis; id: see instances; flow.x, flow.y: px to 1 ms later",
+            "sparse_every_ticks": job.profile.sparse_every,
+        },
+        "conventional": {"fps": conventional.FPS, "exposure_s": conventional.EXPOSURE_S, "coding": "8-bit sRGB gray"},
+        "events": {"threshold": events.THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"},
+        "calibration": {
+            "flat_radiance": calibration.FLAT_RADIANCE,
+            "flat_ticks": calibration.FLAT_TICKS,
+            "dark_ticks": calibration.DARK_TICKS,
+        },
+    }

@@ -1,0 +1,176 @@
+"""The rendering of a scene in units that any process can do: each is a function of a few arguments, and returns arrays.
+
+A task object travels to its worker once and is then called for one chunk of ticks after another; what it has loaded
+(the world, Mitsuba's scene) stays with it there. Nothing is read from or written to disk, so that a worker on another
+machine needs no common file system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.generators.motion import KeyPlan, key_plan
+from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
+from spike4dgs.generators.render import MultiViewRenderer, Still
+from spike4dgs.generators.rig import HELD_OUT_VIEW, cameras
+from spike4dgs.generators.worlds import WORLDS, WorldScene
+
+_POINTS_PER_VIEW = 250  # of the sparse model
+
+
+@lru_cache(maxsize=1)
+def world_of(job: Job) -> WorldScene:
+    """The world as a job builds it."""
+    return WORLDS[job.world].build(job.seed, job.variant, job.seconds)
+
+
+@lru_cache(maxsize=1)
+def cameras_of(job: Job) -> tuple[Camera, ...]:
+    """The cameras of a job's profile."""
+    p = job.profile
+    return cameras(world_of(job), p.width, p.height, p.views)
+
+
+@lru_cache(maxsize=1)
+def plan_of(job: Job) -> KeyPlan:
+    """At which ticks a job renders which pixels."""
+    motion = {"adaptive": job.adaptive, "sub_ticks": job.sub_ticks}
+    return key_plan(world_of(job), cameras_of(job), job.n_ticks, RATE_HZ, job.profile.max_key_px, **motion)
+
+
+def held_out_view(job: Job) -> int:
+    """Index of the held-out camera among the job's."""
+    return job.profile.views.index(HELD_OUT_VIEW)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Its fields travel; what it has cached stays behind."""
+
+    job: Job
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+class Stills(NamedTuple):
+    """What is rendered once for a scene."""
+
+    still: Still
+    target_first: NDArray[np.float32]  # [C, H, W, 3], what does not move with the noise of ground truth
+    points: NDArray[np.float64]  # [N, 3] on still surfaces, for the sparse model
+
+
+@dataclass(frozen=True, eq=False)
+class RenderStills(_Task):
+    """Renders what does not move. Called with anything."""
+
+    def __call__(self, chunk: object) -> Stills:
+        """The result."""
+        p = self.job.profile
+        renderer = MultiViewRenderer(
+            world_of(self.job), cameras_of(self.job), seed=self.job.seed, spp=p.spp, background_spp=p.background_spp
+        )
+        first = _target_renderer(self.job, cameras_of(self.job), None).still_on(renderer.still.background).first
+        return Stills(renderer.still, first, _surface_points(renderer))
+
+
+@dataclass(frozen=True, eq=False)
+class RenderKeys(_Task):
+    """Renders key frames. Called with ticks; returns (tick, what `KeyStore.put` takes) for each."""
+
+    still: Still
+
+    @cached_property
+    def _renderer(self) -> MultiViewRenderer:
+        p, job = self.job.profile, self.job
+        return MultiViewRenderer(
+            world_of(job),
+            cameras_of(job),
+            seed=job.seed,
+            spp=p.spp,
+            background_spp=p.background_spp,
+            still=self.still,
+            whole_frames=job.whole_frames,
+        )
+
+    def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
+        """The keys of `ticks`."""
+        return [(tick, self._renderer.key_arrays(tick, plan_of(self.job))) for tick in ticks]
+
+
+class Truth(NamedTuple):
+    """Ground truth of one camera at one tick."""
+
+    view: int
+    tick: int
+    rgb: NDArray[np.float32]  # [H, W, 3]
+    mask: NDArray[np.bool_]  # [H, W] sees a moving thing
+    depth: NDArray[np.float32]  # [H, W]
+    ids: NDArray[np.uint32]  # [H, W]
+    flow: NDArray[np.float32]  # [H, W, 2] px within the next millisecond
+
+
+@dataclass(frozen=True, eq=False)
+class RenderTargets(_Task):
+    """Renders ground truth. Called with ticks; returns it for the held-out camera, at sparse ticks for all cameras."""
+
+    still: Still  # its first part has the noise of ground truth
+
+    @cached_property
+    def _every_view(self) -> MultiViewRenderer:
+        return _target_renderer(self.job, cameras_of(self.job), self.still)
+
+    @cached_property
+    def _held_out(self) -> MultiViewRenderer:
+        view = held_out_view(self.job)
+        return _target_renderer(self.job, cameras_of(self.job)[view : view + 1], self.still.views([view]))
+
+    def __call__(self, ticks: Sequence[int]) -> list[Truth]:
+        """The ground truth of `ticks`."""
+        return [truth for tick in ticks for truth in self._at(tick)]
+
+    def _at(self, tick: int) -> list[Truth]:
+        t_s, everywhere = tick / RATE_HZ, tick in self.job.sparse_ticks
+        renderer = self._every_view if everywhere else self._held_out
+        views = range(len(cameras_of(self.job))) if everywhere else [held_out_view(self.job)]
+        pictures = (renderer.keys(t_s), renderer.object_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
+        return [Truth(view, tick, *one) for view, *one in zip(views, *pictures, strict=True)]
+
+
+def _target_renderer(job: Job, views: Sequence[Camera], still: Still | None) -> MultiViewRenderer:
+    """Other random numbers than the keys', so that noise in the streams is not noise in the truth."""
+    p = job.profile
+    background_spp = max(p.background_spp, p.target_spp)
+    return MultiViewRenderer(
+        world_of(job),
+        views,
+        seed=job.seed + 1,
+        spp=p.target_spp,
+        background_spp=background_spp,
+        color=True,
+        still=still,
+    )
+
+
+def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:
+    """Points [N, 3] on still surfaces at t = 0: a coarse grid of every view's pixels, for the sparse model."""
+    depths, moving = renderer.depths(0.0), renderer.object_masks(0.0)
+    found = []
+    for camera, depth, mask in zip(renderer.cameras, depths, moving, strict=True):
+        step = max(1, round(np.sqrt(depth.size / _POINTS_PER_VIEW)))
+        v, u = (g.ravel() for g in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
+        keep = np.isfinite(depth[v, u]) & ~mask[v, u]
+        uv = np.stack([u[keep], v[keep]], axis=1) + 0.5
+        found.append(camera.unproject(uv, depth[v, u][keep].astype(np.float64)))
+    return np.concatenate(found)
