@@ -44,7 +44,7 @@ def contact_sheet(scene: Scene, path: Path) -> None:
     ms = scene.n_ticks * 1e3 / scene.rate_hz
     size = f"{scene.meta['width']}x{scene.meta['height']}"
     figure.suptitle(
-        f"{scene.id}: {scene.meta['title']}. {len(scene.cameras)} cameras, {size}, {ms:g} ms, {scene.rate_hz / 1e3:g} kHz"
+        f"{scene.id}: {scene.meta['title']}. {len(scene.cameras)} cameras, {size}, {ms:g} ms, {scene.rate_hz:g} Hz"
     )
     with atomic_path(path) as part:
         figure.savefig(part, dpi=100, metadata={"Software": None}, pil_kwargs={"optimize": True})

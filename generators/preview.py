@@ -12,14 +12,14 @@ from spike4dgs.benchmark.images import encode_srgb
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.generators.sensor import Float32
 
-_FRAMES, _FRAME_MS, _QUALITY = 60, 50, 60
-_WINDOW = 8  # ticks of a count picture
+_FRAMES, _FRAME_MS, _QUALITY = 45, 60, 35
+_WINDOW = 16  # ticks of a count picture
 
 
 def preview(
     keys: Sequence[Float32], key_ticks: Sequence[int], stream: SpikeStream, radiance_gain: float, path: Path
 ) -> None:
-    """Write an endless WebP of about 60 frames. `keys` are radiance [H, W] at `key_ticks`; equal input, equal bytes."""
+    """Write an endless WebP of about 45 frames. `keys` are radiance [H, W] at `key_ticks`; equal input, equal bytes."""
     from PIL import Image
 
     last = stream.n_ticks - _WINDOW

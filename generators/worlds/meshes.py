@@ -140,7 +140,7 @@ def tube(path: Sequence[Sequence[float]], radius: float | Sequence[float], sides
     r = np.broadcast_to(np.asarray(radius, np.float64), (len(p),))
     tangent = np.gradient(p, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    helper = np.eye(3)[np.argmin(np.abs(tangent).sum(0))]
+    helper = np.eye(3)[np.argmin(np.abs(tangent).max(0))]  # the axis that no part of the line is nearly parallel to
     n = np.cross(tangent, helper)
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     b = np.cross(tangent, n)
