@@ -1,14 +1,17 @@
-"""World `turntable`: letters and toy blocks on a disc that spins on a desk."""
+"""World `turntable`: letters and toy blocks on a disc that spins on a desk.
+
+Even variants turn about 5 times a second; odd ones are hard: 20 to 25 times.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.desk import BLOCKS, INK, room
+from spike4dgs.generators.worlds.lamp import Lamp
 from spike4dgs.generators.worlds.materials import Colour, Material
 from spike4dgs.generators.worlds.meshes import (
     Mesh,
@@ -31,17 +34,17 @@ class _Setup:
     turns_per_s: float = 5.0
     first_letter: int = 0
     start_rad: float = 0.2
-    lamp: tuple[float, float, float] = (-0.85, -0.75, 1.7)
-    lamp_power: float = 1.0
+    lamp: Lamp = Lamp()
 
 
 def _draw(variant: int, rng: np.random.Generator) -> _Setup:
     if variant == 0:
         return _Setup()
     side = rng.choice([-1.0, 1.0])
-    lamp = (side * rng.uniform(0.5, 1.0), rng.uniform(-0.9, -0.5), rng.uniform(1.5, 1.9))
-    turns = rng.uniform(4.0, 5.5) * rng.choice([-1.0, 1.0])
-    return _Setup(turns, int(rng.integers(8)), rng.uniform(0, 2 * np.pi), lamp, rng.uniform(0.85, 1.1))
+    place = (side * rng.uniform(0.5, 1.0), rng.uniform(-0.9, -0.5), rng.uniform(1.5, 1.9))
+    slow, fast = rng.uniform(4.0, 5.5), rng.uniform(20.0, 25.0)
+    turns = (fast if variant % 2 else slow) * rng.choice([-1.0, 1.0])
+    return _Setup(turns, int(rng.integers(8)), rng.uniform(0, 2 * np.pi), Lamp(place, rng.uniform(0.85, 1.1)))
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
@@ -60,54 +63,20 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         static=room(rng),
         groups={"disc": _disc_parts(setup, rng)},
         instances={"disc": "disc"},
-        emitters=_emitters(setup),
+        emitters=setup.lamp.emitters(),
         poses=poses,
         exposure=1.25,
         rig=RigSpec(
             center=(0.0, -1.12, 1.02), target=(0.0, 0.03, 0.02), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
         ),
-        shadow_sources=_lamp_points(setup),
+        shadow_sources=setup.lamp.points,
         depth_range=(0.7, 4.0),
-        notes={"turns_per_s": setup.turns_per_s, "disc_radius_m": DISC_RADIUS_M},
-    )
-
-
-# ---------------------------------------------------------------- light
-
-_LAMP_HALF_M = 0.16
-
-
-def _lamp_frame(setup: _Setup) -> np.ndarray:
-    """Pose [4, 4] of the square lamp: its z axis shines on the disc."""
-    origin = np.array(setup.lamp)
-    forward = np.array([0.0, 0.0, 0.1]) - origin
-    forward /= np.linalg.norm(forward)
-    left = np.cross([0.0, 0.0, 1.0], forward)
-    left /= np.linalg.norm(left)
-    frame = np.eye(4)
-    frame[:3] = np.stack([left, np.cross(forward, left), forward, origin], 1)
-    return frame
-
-
-def _lamp_points(setup: _Setup) -> np.ndarray:
-    """Homogeneous points [5, 4]: the middle and the corners of the lamp."""
-    corners = np.array([(0, 0, 0, 1)] + [(a, b, 0, 1) for a in (-1, 1) for b in (-1, 1)], np.float64)
-    corners[:, :2] *= _LAMP_HALF_M
-    return corners @ _lamp_frame(setup).T
-
-
-def _emitters(setup: _Setup) -> dict[str, dict[str, Any]]:
-    """One square lamp, sampled, and weak light from everywhere that only BSDF sampling finds (less noise)."""
-    power = 62.0 * setup.lamp_power
-    scale = np.diag([_LAMP_HALF_M, _LAMP_HALF_M, 1.0, 1.0])
-    return {
-        "lamp": {
-            "type": "rectangle",
-            "to_world": _lamp_frame(setup) @ scale,
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [power, power * 0.95, power * 0.88]}},
+        notes={
+            "speed_m_s": 2 * np.pi * DISC_RADIUS_M * abs(setup.turns_per_s),
+            "length_m": 2 * DISC_RADIUS_M,
+            "turns_per_s": setup.turns_per_s,
         },
-        "room": {"type": "constant", "radiance": {"type": "rgb", "value": [0.40, 0.43, 0.48]}, "sampling_weight": 0.0},
-    }
+    )
 
 
 # ---------------------------------------------------------------- the disc

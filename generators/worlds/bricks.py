@@ -1,0 +1,191 @@
+"""World `bricks`: a ball bursts a wall of toy bricks on a desk. Rigid bodies by MuJoCo, one step per tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spike4dgs.generators.worlds import desk
+from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.lamp import Lamp
+from spike4dgs.generators.worlds.materials import Colour, Material
+from spike4dgs.generators.worlds.meshes import Mesh, ellipsoid, merge, quad
+from spike4dgs.generators.worlds.rigid_bodies import Body, owners, simulate
+from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, plain
+
+BRICK_M = (0.084, 0.044, 0.040)  # x, y, z
+COLUMNS, ROWS = 6, 8
+BALL_M = 0.042
+_WALL_Y = 0.02
+_AFTER_IMPACT_S = 0.035  # the middle of the clip
+_TEXELS = 900  # per metre of the painted front
+_CELL = 24  # texels of a brick's own colour
+
+_PAINTS: tuple[tuple[Colour, ...], ...] = (
+    ((0.68, 0.16, 0.08), (0.74, 0.40, 0.06), (0.70, 0.58, 0.14), (0.58, 0.11, 0.07)),
+    ((0.10, 0.30, 0.52), (0.16, 0.46, 0.50), (0.30, 0.36, 0.62), (0.08, 0.20, 0.40)),
+    ((0.20, 0.46, 0.16), (0.48, 0.54, 0.12), (0.12, 0.34, 0.20), (0.66, 0.60, 0.20)),
+)
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """What one variant draws. Variant 0 keeps these values."""
+
+    speed_m_s: float = 13.0
+    aim: tuple[float, float] = (-0.03, 0.17)  # x and z where the ball hits
+    heading_deg: float = 62.0  # of the ball, from +x
+    paint: int = 0
+    word: str = "SPIKE"
+    lamp: Lamp = Lamp((-0.75, -0.85, 1.55), 0.95)
+
+
+def _draw(variant: int, rng: np.random.Generator) -> _Shot:
+    if variant == 0:
+        return _Shot()
+    lamp = Lamp(
+        (rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.9), rng.uniform(-0.95, -0.6), rng.uniform(1.4, 1.8)),
+        rng.uniform(0.85, 1.0),
+    )
+    aim, heading = (rng.uniform(-0.10, 0.10), rng.uniform(0.11, 0.24)), rng.uniform(50, 125)
+    word = ("SPIKE", "GAUSS", "20KHZ", "BRICK")[int(rng.integers(4))]
+    return _Shot(rng.uniform(11.0, 16.0), aim, heading, int(rng.integers(len(_PAINTS))), word, lamp)
+
+
+def build(seed: int, variant: int, duration_s: float) -> WorldScene:
+    """The ball meets the wall 35 ms before half of `duration_s`; the simulation begins a little earlier."""
+    rng = rng_for("bricks", seed, variant)
+    shot = _draw(variant, rng)
+    impact_s = duration_s / 2 - _AFTER_IMPACT_S
+    start_s = min(0.0, impact_s - 0.002)
+    places = _places()
+    bodies = [Body("box", tuple(v / 2 for v in BRICK_M), p, density=650.0) for p in places]
+    path = simulate([*bodies, _ball(shot, impact_s - start_s)], start_s, duration_s)
+    meshes, picture = _bricks(places, shot, rng)
+    mesh, (owner, bodies_of_faces) = merge(meshes), owners(meshes)
+
+    def ball_pose(t_s: float) -> dict[str, np.ndarray]:
+        turn, shift = path.at(t_s)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn[-1], shift[-1]
+        return {"ball": pose}
+
+    stripes = cloth((48, 96), rng, [(0.80, 0.78, 0.72), (0.08, 0.16, 0.42)], 12)
+    return WorldScene(
+        name="bricks",
+        seed=seed,
+        variant=variant,
+        duration_s=duration_s,
+        static=_room(rng),
+        groups={"ball": (Part(ellipsoid((BALL_M,) * 3, (0, 0, 0), 40), Material(stripes, 0.12)),)},
+        instances={"ball": "ball"},
+        emitters=shot.lamp.emitters(),
+        poses=ball_pose,
+        exposure=1.2,
+        rig=RigSpec(
+            center=(-0.22, -0.98, 0.62), target=(0.0, 0.05, 0.13), spacing_m=(0.07, 0.06), toe_in=0.8, fov_x_deg=39.0
+        ),
+        shadow_sources=shot.lamp.points,
+        depth_range=(0.35, 4.0),
+        notes={"speed_m_s": shot.speed_m_s, "length_m": 2 * BALL_M, "brick_length_m": BRICK_M[0]},
+        deforming={
+            "brick": Deforming(
+                Part(mesh, Material(picture, 0.35)),
+                lambda t_s: path.vertices(t_s, mesh.vertices, owner),
+                bodies_of_faces,
+            )
+        },
+    )
+
+
+def _places() -> list[tuple[float, float, float]]:
+    """Centres of the bricks in running bond; every other row is half a brick to the side."""
+    w, _, h = BRICK_M
+    return [
+        ((k - (COLUMNS - 1) / 2 + (0.25 if row % 2 else -0.25)) * w, _WALL_Y, (row + 0.5) * h)
+        for row in range(ROWS)
+        for k in range(COLUMNS)
+    ]
+
+
+def _ball(shot: _Shot, flight_s: float) -> Body:
+    """The ball such that it touches the wall's front after `flight_s`; its fall meanwhile is made up for."""
+    a = np.radians(shot.heading_deg)
+    velocity = shot.speed_m_s * np.array([np.cos(a), np.sin(a), 0.0])
+    touch = np.array([shot.aim[0], _WALL_Y - BRICK_M[1] / 2 - BALL_M, shot.aim[1]])
+    begin = touch - velocity * flight_s
+    velocity[2] = 4.905 * flight_s
+    begin[2] = shot.aim[1]
+    return Body(
+        "sphere",
+        (BALL_M,),
+        tuple(begin.tolist()),
+        velocity=tuple(velocity.tolist()),
+        spin=(8.0, 0, 20.0),
+        density=2600.0,
+    )
+
+
+def _room(rng: np.random.Generator) -> dict[str, Part]:
+    """The desk without what lies where bricks fly."""
+    away = ("pot", "pencils", "mug", "die", "sheet", "ruler")
+    return {name: part for name, part in desk.room(rng).items() if name not in away}
+
+
+# ---------------------------------------------------------------- bricks
+
+
+def _bricks(
+    places: list[tuple[float, float, float]], shot: _Shot, rng: np.random.Generator
+) -> tuple[list[Mesh], np.ndarray]:
+    """One box for each brick, in its own coordinates, and their picture: the painted front, then a cell for each."""
+    colours = [np.array(_PAINTS[shot.paint][int(k)]) * rng.uniform(0.8, 1.2) for k in rng.integers(0, 4, len(places))]
+    width, height = (COLUMNS + 0.5) * BRICK_M[0], ROWS * BRICK_M[2]
+    front_h, front_w = round(height * _TEXELS), round(width * _TEXELS)
+    per_row = front_w // _CELL
+    cell_rows = -(-len(places) // per_row)
+    picture = plain((front_h + cell_rows * _CELL, front_w), (0.3, 0.3, 0.3))
+    c = Canvas(picture, _TEXELS)
+    for (x, _, z), colour in zip(places, colours, strict=True):
+        left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
+        c.rectangle(left, top, left + BRICK_M[0], top + BRICK_M[2], tuple(colour))
+    c.text(shot.word, width / 2, height / 2, 0.126, (0.84, 0.82, 0.76))
+    c.text(shot.word, width / 2, height / 2 - 0.002, 0.122, (0.04, 0.05, 0.09))
+    for x, _, z in places:  # an edge around every brick
+        left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
+        c.line([(left, top), (left + BRICK_M[0], top)], 0.003, (0.78, 0.74, 0.66), 0.7)
+        c.line([(left, top), (left, top + BRICK_M[2])], 0.003, (0.15, 0.12, 0.10), 0.7)
+    picture = c.picture
+    meshes = []
+    for k, ((x, _, z), colour) in enumerate(zip(places, colours, strict=True)):
+        row, column = divmod(k, per_row)
+        y0, x0 = front_h + row * _CELL, column * _CELL
+        picture[y0 : y0 + _CELL, x0 : x0 + _CELL] = colour
+        corner = np.array([x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2]) * _TEXELS
+        front = (corner, np.array([BRICK_M[0], BRICK_M[2]]) * _TEXELS)
+        own = (np.array([x0 + 2.0, y0 + 2.0]), np.full(2, _CELL - 4.0))
+        meshes.append(_brick(front, own, np.array(picture.shape[1::-1], np.float64)))
+    picture *= (0.86 + 0.22 * fractal(picture.shape[:2], rng, 32, 1))[..., None]
+    return meshes, picture
+
+
+def _brick(front: tuple[np.ndarray, np.ndarray], own: tuple[np.ndarray, np.ndarray], size: np.ndarray) -> Mesh:
+    """A box about the origin whose front face shows one rectangle (corner, extent, texels) and the others another."""
+    sx, sy, sz = BRICK_M
+    faces = [
+        ((0, -sy / 2, 0), (sx, 0, 0), (0, 0, sz), front),
+        ((0, sy / 2, 0), (-sx, 0, 0), (0, 0, sz), own),
+        ((sx / 2, 0, 0), (0, sy, 0), (0, 0, sz), own),
+        ((-sx / 2, 0, 0), (0, -sy, 0), (0, 0, sz), own),
+        ((0, 0, sz / 2), (sx, 0, 0), (0, sy, 0), own),
+        ((0, 0, -sz / 2), (sx, 0, 0), (0, -sy, 0), own),
+    ]
+    sides = []
+    for centre, right, up, (corner, extent) in faces:
+        side = quad(centre, right, up)
+        sides.append(Mesh(side.vertices, side.faces, (corner + side.uv * extent) / size, smooth=False))
+    return merge(sides)
+
+
+WORLD = World("bricks", "A ball bursts a wall of toy bricks", build)
