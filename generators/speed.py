@@ -1,25 +1,26 @@
-"""`speed simulate`: the spike simulator beside a plain vectorised numpy integrate-and-fire, with the errors."""
+"""`speed simulate`: the spike simulator beside plain numpy and, where it is installed, spikezoo's; with errors."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import time
+import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.spikes import UInt8, count_bits, pack
+from spike4dgs.benchmark.timing import show_table, time_ms
 from spike4dgs.generators import sensor as camera
-from spike4dgs.generators.sensor import Float32, Int32, Keys, Sensor, random_charge
+from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Float32, Int32, Keys, Sensor, random_charge
 from spike4dgs.generators.sensor_kernels import THRESHOLD
 from spike4dgs.generators.sensor_maps import dark_map, gain_map
 from spike4dgs.generators.sensor_reference import fire, tick_means
 
-COLUMNS = ("simulator", "threads", "ms", "million_pixel_ticks_per_s", "ratio", "max_count_error", "pixels_off_percent")
+COLUMNS = ("simulator", "threads", "ms", "Mpx-ticks/s", "x numpy", "x spikezoo", "largest count error", "pixels off, %")
+_SPIKEZOO = "spikezoo video2spike_simulation"
 
 
 def simulate_numpy(
@@ -42,6 +43,9 @@ def simulate_numpy(
             yield pack(fired[None])
 
 
+Clip = tuple[Keys, NDArray[np.int64], int, Sensor, Int32]
+
+
 def exact_counts(
     keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32
 ) -> NDArray[np.int64]:
@@ -61,70 +65,82 @@ def pattern(height: int, width: int, n_keys: int, moving: float) -> Float32:
 
 
 def simulate(argv: Sequence[str] = ()) -> int:
-    """Print pixel-ticks per second of the simulator on one and two threads and of plain numpy, each with its errors."""
+    """Time the simulator on one and two threads, plain numpy, and spikezoo; print speeds, ratios and errors.
+
+    spikezoo's function takes one frame for each tick: it gets them ready-made, and models neither maps nor noise.
+    """
     p = argparse.ArgumentParser("spike4dgs speed simulate", description=simulate.__doc__)
     p.add_argument("--width", type=int, default=400)
     p.add_argument("--height", type=int, default=250)
     p.add_argument("--ticks", type=int, default=1000)
     p.add_argument("--spacing", type=int, default=10, help="ticks between key frames")
     p.add_argument("--moving", type=float, default=1.0, help="share of the picture that moves")
-    p.add_argument("--repeats", type=int, default=5, help="the best of so many runs counts (numpy: of one)")
+    p.add_argument("--repeats", type=int, default=5, help="the median of so many runs counts")
     p.add_argument("--csv", type=Path, help="write the table here too")
     a = p.parse_args(list(argv))
     n_keys = -(-a.ticks // a.spacing) + 1
     keys, ticks = pattern(a.height, a.width, n_keys, a.moving), np.arange(n_keys, dtype=np.int64) * a.spacing
-    pixels = (a.height, a.width, 0, "cam_00")
-    sensor, charge = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels)), random_charge(a.height, a.width, [0])
-    clip = (keys, ticks, a.ticks, sensor, charge)
-    exact = exact_counts(*clip)
-    runs: list[tuple[str, str, int, Callable[[], Iterator[UInt8]]]] = [
-        ("numpy, float32", "1", 1, lambda: simulate_numpy(*clip)),
-        ("spike4dgs", "1", a.repeats, lambda: camera.simulate(*clip, threads=1)),
-        ("spike4dgs", "2", a.repeats, lambda: camera.simulate(*clip, threads=2)),
-        (
-            "spike4dgs, maps off",
-            "2",
-            a.repeats,
-            lambda: camera.simulate(keys, ticks, a.ticks, Sensor(), charge, threads=2),
-        ),
+    pixels, charge = (a.height, a.width, 0, "cam_00"), random_charge(a.height, a.width, [0])
+    plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
+    noisy = Sensor(gain=maps.gain, dark=maps.dark, photons=PHOTONS_PER_SPIKE)
+
+    def clip(sensor: Sensor) -> Clip:
+        return keys, ticks, a.ticks, sensor, charge
+
+    def ours(sensor: Sensor, threads: int) -> Callable[[], UInt8]:
+        return lambda: np.concatenate(list(camera.simulate(*clip(sensor), threads=threads)))
+
+    exact = {id(s): exact_counts(*clip(s)) for s in (plain, maps, noisy)}
+    timed = []
+    runs: list[tuple[str, str, Sensor, Callable[[], UInt8]]] = [
+        ("numpy, tick by tick, maps", "1", maps, lambda: np.concatenate(list(simulate_numpy(*clip(maps))))),
+        ("spike4dgs, maps and shot noise", "1", noisy, ours(noisy, 1)),
+        ("spike4dgs, maps and shot noise", "2", noisy, ours(noisy, 2)),
+        ("spike4dgs, maps", "2", maps, ours(maps, 2)),
+        ("spike4dgs, neither", "2", plain, ours(plain, 2)),
     ]
-    exact_off = exact_counts(keys, ticks, a.ticks, Sensor(), charge)
-    rows: list[dict[str, str]] = []
-    slowest = 0.0
-    for name, threads, repeats, run in runs:
-        seconds, packed = _best(run, repeats)
-        slowest = slowest or seconds
-        off = np.abs(count_bits(packed, a.height * a.width).astype(np.int64) - (exact_off if "off" in name else exact))
-        speed = a.height * a.width * a.ticks / seconds / 1e6
-        values = (name, threads, f"{seconds * 1e3:.1f}", f"{speed:.0f}", f"{slowest / seconds:.1f}")
-        errors = (f"{off.max()}", f"{(off > 0).mean() * 100:.4f}")
-        rows.append(dict(zip(COLUMNS, values + errors, strict=True)))
-    _show(rows, f"{a.ticks} ticks of {a.width}x{a.height}, a key every {a.spacing} ticks; errors against float64")
-    if a.csv:
-        with atomic_path(a.csv) as part, open(part, "w", newline="") as f:
-            writer = csv.DictWriter(f, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
+    if (other := _spikezoo()) is not None:
+        frames = np.stack([m.astype(np.float32) for m in tick_means(keys, ticks.tolist(), a.ticks)])
+        runs.append((_SPIKEZOO, "1", plain, lambda: pack(other(frames, 1 / plain.radiance_gain))))
+    for name, threads, sensor, run in runs:
+        last: list[UInt8] = []
+        _, ms = time_ms(lambda run=run, last=last: last.append(run()), a.repeats if "spike4dgs" in name else 1)  # type: ignore[misc]
+        off = np.abs(count_bits(last[-1], a.height * a.width).astype(np.int64) - exact[id(sensor)])
+        timed.append((name, threads, ms, off))
+    numpy_ms = timed[0][2]
+    zoo_ms = timed[-1][2] if timed[-1][0] == _SPIKEZOO else None
+    rows = [
+        [
+            name,
+            threads,
+            f"{ms:.1f}",
+            f"{a.height * a.width * a.ticks / ms / 1e3:.0f}",
+            f"{numpy_ms / ms:.1f}",
+            f"{zoo_ms / ms:.1f}" if zoo_ms else "-",
+            str(off.max()),
+            f"{100 * (off > 0).mean():.3f}",
+        ]
+        for name, threads, ms, off in timed
+    ]
+    if zoo_ms is None:
+        rows.append([f"{_SPIKEZOO}: not installed", *["-"] * (len(COLUMNS) - 1)])
+    title = f"{a.ticks} ticks of {a.width}x{a.height}, a key every {a.spacing} ticks; errors against float64"
+    show_table(title, COLUMNS, rows, a.csv)
     return 0
 
 
-def _best(run: Callable[[], Iterator[UInt8]], repeats: int) -> tuple[float, UInt8]:
-    """Shortest wall time of the runs, after one that is not counted (compilation), and the last run's packed rows."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        chunks = list(run())
-        times.append(time.perf_counter() - start)
-    return min(times[1:]), np.concatenate(chunks)
-
-
-def _show(rows: list[dict[str, str]], title: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, box=None)
-    for column in COLUMNS:
-        table.add_column(column.replace("_", " "), justify="left" if column == "simulator" else "right")
-    for row in rows:
-        table.add_row(*row.values())
-    Console(width=120).print(table)
+def _spikezoo() -> Callable[..., Any] | None:
+    """spikezoo's simulator, from its one file: importing the package would load its networks."""
+    found = importlib.util.find_spec("spikezoo")
+    if found is None or not found.submodule_search_locations:
+        return None
+    path = Path(next(iter(found.submodule_search_locations))) / "utils/spike_utils.py"
+    spec = importlib.util.spec_from_file_location("_spikezoo_spike_utils", path)
+    if spec is None or spec.loader is None:
+        return None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except ImportError:
+        return None
+    return getattr(module, "video2spike_simulation", None)

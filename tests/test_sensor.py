@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -215,3 +217,82 @@ def test_bad_input_is_named():
             list(simulate(keys, bad_ticks, bad_n, Sensor(), charge))
     with pytest.raises(UserError, match="gain map"):
         list(simulate(keys, ticks, n, Sensor(gain=np.ones((2, 2), np.float32)), charge))
+
+
+# ---------------------------------------------------------------- shot noise and tick means
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 40), st.sampled_from([100.0, 5e3, 5e4]), st.booleans(), st.integers(0, 2**31))
+def test_shot_noise_is_the_twins_bit_for_bit(height, width, photons, on, seed):
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum([0, *rng.integers(1, 9, 12)])
+    keys = rng.uniform(0, 2.2, (13, height, width)).astype(np.float32)  # up to saturation
+    sensor = replace(maps(height, width, on), photons=photons, noise_seed=(seed,))
+    charge = random_charge(height, width, [seed])
+    n = int(ticks[-1]) - 1
+    s = stream(keys, ticks, n, sensor, charge, threads=1)
+    exact = simulate_reference(keys, ticks.tolist(), n, sensor, charge)
+    assert np.array_equal(s.packed, stream(keys, ticks, n, sensor, charge, threads=3).packed)
+    spikes = s.window(0, n)
+    assert np.abs(spikes.sum(0).astype(int) - exact.sum(0)).max() <= 1
+    assert (spikes != exact).mean() < 0.02  # float32 rounding moves a few spikes by a tick
+
+
+def test_intervals_vary_as_photons_do():
+    """Against a plain simulation that draws a Poisson number of photons in every tick."""
+    n, photons, rate = 20_000, 400, 0.11
+    shape, rng = (20, 30), np.random.default_rng(0)
+    light = np.full(shape, rate / 0.6, np.float32)
+    charge = random_charge(*shape, [5])
+    sensor = Sensor(photons=photons, noise_seed=(5,))
+    ours = stream([light, light], [0, n], n, sensor, charge).window(0, n)
+    level, plain = charge / THRESHOLD * photons, np.empty((n, *shape), bool)
+    for tick in range(n):
+        level = level + rng.poisson(rate * photons, shape)
+        plain[tick] = level >= photons
+        level -= photons * plain[tick]
+
+    def spread(spikes: np.ndarray, lag: int) -> tuple[float, float]:
+        """Mean and variance of the time over `lag` intervals, over all pixels."""
+        times = [np.flatnonzero(spikes[:, y, x]) for y in range(shape[0]) for x in range(shape[1])]
+        spans = np.concatenate([t[lag:] - t[:-lag] for t in times])
+        return float(spans.mean()), float(spans.var())
+
+    for lag in (1, 4, 16):
+        (mean, variance), (plain_mean, plain_variance) = spread(ours, lag), spread(plain, lag)
+        assert mean == pytest.approx(plain_mean, rel=1e-3) == pytest.approx(lag / rate, rel=2e-3)
+        assert variance == pytest.approx(plain_variance, rel=0.05)
+        tick = 1 / 6  # of reading out at whole ticks: the variance of the difference of two uniform numbers
+        assert variance - tick == pytest.approx(lag / photons / rate**2, rel=0.10)
+
+
+def test_a_full_well_stays_full_with_noise():
+    light = np.full((4, 16), 5.0, np.float32)
+    sensor = Sensor(photons=100, noise_seed=(1,))
+    s = stream([light, light], [0, 3000], 3000, sensor, random_charge(4, 16, [0]))
+    assert (s.counts(0, 3000) >= 2700).all()  # a spike may ask for more than one tick's charge, never for much more
+    off = stream([light, light], [0, 3000], 3000, Sensor(), random_charge(4, 16, [0]))
+    assert (off.counts(1, 3000) == 2999).all()
+
+
+def test_noise_differs_between_seeds_and_not_between_runs():
+    light = np.full((8, 16), 0.5, np.float32)
+    clip = ([light, light], [0, 500], 500)
+    charge = random_charge(8, 16, [0])
+    first, again, other = (stream(*clip, Sensor(photons=1000, noise_seed=(seed,)), charge).packed for seed in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_tick_means_are_taken_as_they_are():
+    rng = np.random.default_rng(0)
+    means = rng.uniform(0, 1.5, (70, 5, 13)).astype(np.float32)
+    charge = random_charge(5, 13, [0])
+    for sensor in (maps(5, 13, True), replace(maps(5, 13, True), photons=5e4)):
+        packed = np.concatenate(list(simulate(means, range(70), 70, sensor, charge, means=True)))
+        spikes = SpikeStream(packed, 13, 5, 20000.0).window(0, 70)
+        assert np.array_equal(spikes, simulate_reference(means, range(70), 70, sensor, charge, means=True))
+    with pytest.raises(UserError, match="mean of every tick"):
+        next(simulate(means[:35], range(0, 70, 2), 70, Sensor(), charge, means=True))
+    with pytest.raises(UserError, match="photons per spike"):
+        next(simulate(means, range(70), 69, Sensor(photons=10), charge))

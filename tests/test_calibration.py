@@ -1,0 +1,69 @@
+"""Calibration from flat-field and dark recordings: what comes out is what the camera was made with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.benchmark.cameras import look_at
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.spikes import SpikeStream, open_stream, pack
+from spike4dgs.generators import calibration
+from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Sensor
+from spike4dgs.generators.sensor_maps import dark_map, gain_map
+
+WIDTH, HEIGHT = 200, 125
+
+
+def recordings(folder, sensor):
+    up = np.array([0.0, 0.0, 1.0])
+    camera = look_at("cam_00", np.array([0, -3.0, 1]), np.zeros(3), up, focal=200, width=WIDTH, height=HEIGHT)
+    calibration.write_calibration(folder, camera, sensor, [1, 2])
+    return [open_stream(folder / name / "cam_00.dat", WIDTH, HEIGHT, 2e4) for name in ("flat", "dark")]
+
+
+def rms(found, truth):
+    return float(np.sqrt(np.mean((found / truth - 1) ** 2)))
+
+
+def test_maps_are_recovered_from_what_a_scene_ships(tmp_path):
+    pixels = HEIGHT, WIDTH, 0, "cam_00"
+    sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+    flat, dark = recordings(tmp_path, sensor)
+    assert (flat.n_ticks, dark.n_ticks) == (calibration.FLAT_TICKS, calibration.DARK_TICKS)
+    found = calibration.estimate(flat, dark, calibration.FLAT_RADIANCE)
+    assert rms(found.gain, sensor.gain) < 0.002  # asked for: 0.01
+    assert rms(found.dark, sensor.dark) < 0.02  # asked for: 0.20
+    assert found.radiance_gain == pytest.approx(0.6, rel=1e-3)
+    counted = flat.counts(0, flat.n_ticks) / flat.n_ticks - dark.counts(0, dark.n_ticks) / dark.n_ticks
+    assert rms(found.gain, sensor.gain) < 0.5 * rms(counted / counted.mean(), sensor.gain)  # better than counting
+
+
+def test_an_ideal_camera_comes_out_flat_and_dark(tmp_path):
+    found = calibration.estimate(*recordings(tmp_path, Sensor()), calibration.FLAT_RADIANCE)
+    assert np.abs(found.gain - 1).max() < 0.01
+    assert found.dark.max() < 1 / calibration.DARK_TICKS
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 21), st.integers(1, 60), st.booleans(), st.integers(0, 2**31))
+def test_rates_are_those_of_the_unpacked_spikes(height, width, n, bottom_up, seed):
+    rng = np.random.default_rng(seed)
+    spikes = rng.random((n, height, width)) < rng.random((height, width))
+    stream = SpikeStream(pack(spikes, bottom_up), width, height, 2e4, bottom_up)
+    expected = np.zeros((height, width))
+    for y, x in np.ndindex(height, width):
+        t = np.flatnonzero(spikes[:, y, x])
+        expected[y, x] = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else (1 if len(t) else 0.5) / n
+    np.testing.assert_allclose(calibration.rates(stream), expected)
+
+
+def test_recordings_that_do_not_fit_are_refused():
+    dark = SpikeStream(pack(np.zeros((40, 8, 16))), 16, 8, 2e4)
+    other = SpikeStream(pack(np.zeros((40, 8, 24))), 24, 8, 2e4)
+    with pytest.raises(UserError, match="one size"):
+        calibration.estimate(other, dark, 0.7)
+    with pytest.raises(UserError, match="no more spikes than in the dark"):
+        calibration.estimate(dark, dark, 0.7)

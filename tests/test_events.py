@@ -1,0 +1,89 @@
+"""Events against closed forms and a plain loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators.events import THRESHOLD, Events, events, read_events, write_events
+
+RATE = 20_000
+
+
+def plain_events(keys, ticks, threshold):
+    """The model again, one pixel and one event after the other, exact times."""
+    logs = np.log(np.maximum(np.asarray(keys, np.float64), 1e-3))
+    found = []
+    for y, x in np.ndindex(*logs.shape[1:]):
+        level = logs[0, y, x]
+        for k in range(len(ticks) - 1):
+            a, b = logs[k, y, x], logs[k + 1, y, x]
+            while abs(b - level) >= threshold and a != b:
+                level += threshold * np.sign(b - level)
+                share = min(max((level - a) / (b - a), 0), 1)
+                t = (ticks[k] + share * (ticks[k + 1] - ticks[k])) * 1e6 / RATE
+                found.append((t, y, x, int(b > a)))
+    return sorted(found)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 6), st.integers(2, 8), st.sampled_from([0.1, 0.2, 0.5]), st.integers(0, 2**31))
+def test_events_are_those_of_a_plain_loop(height, width, n, threshold, seed):
+    rng = np.random.default_rng(seed)
+    keys = np.exp(rng.normal(-1, 0.5, (n, height, width))).astype(np.float32)
+    ticks = np.cumsum([0, *rng.integers(1, 21, n - 1)]).tolist()
+    found, expected = events(keys, ticks, ticks[-1] + 1, RATE, threshold), plain_events(keys, ticks, threshold)
+    assert len(found.t) == len(expected)
+    assert (np.diff(found.t) >= 0).all()
+    key = lambda rows: sorted((y, x, p, round(t)) for t, y, x, p in rows)  # noqa: E731
+    ours = key(zip(found.t, found.y, found.x, found.p, strict=True))
+    for a, b in zip(ours, key(expected), strict=True):
+        assert a[:3] == b[:3] and abs(a[3] - b[3]) <= 2
+    # what the events say of the light is within a threshold of the truth
+    logs = np.log(np.maximum(keys.astype(np.float64), 1e-3))
+    told = logs[0].copy()
+    np.add.at(told, (found.y, found.x), threshold * (2.0 * found.p - 1))
+    assert np.abs(told - logs[-1]).max() < threshold + 1e-9
+
+
+def test_a_ramp_has_as_many_events_as_thresholds():
+    growth = np.array([[0.0, 0.5, 1.05, -0.7]])
+    keys = [np.exp(-1 + growth * k / 4).astype(np.float32) for k in range(5)]
+    found = events(keys, [0, 20, 40, 60, 80], 80, RATE)
+    for x, total in enumerate(growth[0]):
+        mine = found.x == x
+        assert mine.sum() == int(abs(total) / THRESHOLD + 1e-6)
+        assert (found.p[mine] == (total > 0)).all()
+        ideal = 4000 * THRESHOLD * np.arange(1, mine.sum() + 1) / max(abs(total), 1e-9)
+        assert np.abs(found.t[mine] - ideal).max(initial=0) <= 2
+
+
+def test_nothing_moves_nothing_happens():
+    still = np.random.default_rng(0).random((6, 9), dtype=np.float32)
+    assert len(events([still] * 4, [0, 5, 10, 15], 15, RATE).t) == 0
+
+
+def test_events_after_the_clip_are_left_out():
+    keys = [np.full((1, 1), v, np.float32) for v in (0.1, 0.1, 0.9)]
+    assert len(events(keys, [0, 20, 40], 20, RATE).t) == 0
+    assert len(events(keys, [0, 20, 40], 40, RATE).t) == 10
+
+
+def test_files_come_back_and_damage_is_named(tmp_path):
+    found = Events(
+        np.array([1, 5]), np.array([3, 4], np.uint16), np.array([0, 1], np.uint16), np.array([1, 0], np.uint8)
+    )
+    path = tmp_path / "events/cam.npz"
+    write_events(path, found)
+    assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(read_events(path), found, strict=True))
+    first = path.read_bytes()
+    write_events(path, found)
+    assert path.read_bytes() == first
+    path.write_bytes(first[: len(first) // 2])
+    with pytest.raises(UserError, match="damaged data"):
+        read_events(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_events(tmp_path / "none.npz")
