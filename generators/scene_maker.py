@@ -183,22 +183,22 @@ class Maker:
             pass
 
     def _render_targets(self) -> None:
-        missing = sorted({t.tick for t in self.targets if not mask_file(self._scene, t).is_file()})
+        missing = {t for t in self.targets if not mask_file(self._scene, t).is_file()}
         if not missing:
             return
         still = Still(self.store.still().background, read_arrays(self._work / "targets.npz", "first")["first"])
         light_range = lru_cache(maxsize=None)(lambda view: self.store.range(view, self.plan))
 
-        def truths() -> Iterator[int]:
-            for chunk in self.run(tasks.RenderTargets(self.job, still), chunked(missing, 2)):
+        def truths() -> Iterator[Target]:
+            ticks = chunked(sorted({t.tick for t in missing}), 2)
+            for chunk in self.run(tasks.RenderTargets(self.job, still), ticks):
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
-                    write_truth(self._scene, target, truth, ground, lambda view=truth.view: light_range(view))
-                    yield truth.tick
+                    if target in missing:
+                        write_truth(self._scene, target, truth, ground, lambda view=truth.view: light_range(view))
+                        yield target
 
-        every_view = sum(tick in self.job.sparse_ticks for tick in missing)
-        total = len(missing) + every_view * (len(self.cameras) - 1)
-        for _ in self.watch("ground truth", truths(), total):
+        for _ in self.watch("ground truth", truths(), len(missing)):
             pass
 
     def _simulate(self) -> None:

@@ -16,36 +16,62 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.images import gray, read_geometry
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.generators import make_dataset as command
-from spike4dgs.generators import scene_maker
+from spike4dgs.generators import scene_maker, tasks
+from spike4dgs.generators.ground_truth import moving_region
+from spike4dgs.generators.motion import KeyPlan
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.scene_maker import Maker, moving_region
+from spike4dgs.generators.render import Still
+from spike4dgs.generators.scene_maker import Maker
 from spike4dgs.generators.worlds import WORLDS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 
 
+PLAN = KeyPlan(80, 20_000, 0.5, (20, 10))
+
+
 class FakeRenderer:
     """Pictures without Mitsuba: a bright square over noise, to the right with time."""
 
-    def __init__(self, world, cameras, *, seed, spp, background_spp):
-        self.cameras = tuple(cameras)
+    def __init__(self, world, cameras, *, seed, spp, background_spp, color=False, still=None, whole_frames=False):
+        self.cameras, self.color = tuple(cameras), color
         self.shape = (len(cameras), cameras[0].height, cameras[0].width)
-        self._still = np.random.default_rng(seed).uniform(0.2, 0.4, self.shape).astype(np.float32)
+        noise = [
+            np.random.default_rng([0, *c.id.encode()]).uniform(0.2, 0.4, self.shape[1:]).astype(np.float32)
+            for c in cameras
+        ]
+        self.still = still or Still(*np.repeat(np.stack(noise)[None, ..., None], 2, 0).repeat(3, -1))
 
-    def backgrounds(self):
-        return self._still
+    def still_on(self, background):
+        return Still(background, background)
 
     def object_masks(self, t_s):
         x = np.arange(self.shape[2]) - 10 - 5000 * t_s
         return np.broadcast_to((np.abs(x) < 5) & (np.abs(np.arange(self.shape[1]) - 20) < 6)[:, None], self.shape)
 
+    traced = object_masks
+
     def keys(self, t_s):
-        return np.where(self.object_masks(t_s), np.float32(0.9), self._still)
+        rgb = np.where(self.object_masks(t_s)[..., None], np.float32(0.9), self.still.background)
+        return rgb if self.color else gray(rgb)
+
+    reference_frames = None
+
+    def key_arrays(self, tick, plan):
+        mask = self.object_masks(tick / 20_000)
+        given = {f"given{v}": np.packbits(m) for v, m in enumerate(mask)}
+        values = gray(np.full(3, 0.9, np.float32))
+        return given | {f"values{v}": np.full(m.sum(), values, np.float32) for v, m in enumerate(mask)}
 
     def depths(self, t_s):
         return np.full(self.shape, 5.0, np.float32)
+
+    def geometry(self, t_s, dt_s):
+        flow = np.zeros((*self.shape, 2), np.float32)
+        return self.depths(t_s), self.object_masks(t_s).astype(np.uint32), flow
 
 
 @cache
@@ -55,9 +81,9 @@ def car():
 
 @pytest.fixture
 def fake(monkeypatch):
-    monkeypatch.setattr(Maker, "world", property(lambda maker: car()))
-    monkeypatch.setattr(scene_maker, "max_image_speed", lambda world, cameras, seconds: 1000.0)  # a key every 10 ticks
-    monkeypatch.setattr(scene_maker, "MultiViewRenderer", FakeRenderer)
+    monkeypatch.setattr(tasks, "world_of", lambda job: car())
+    monkeypatch.setattr(tasks, "plan_of", lambda job: PLAN)
+    monkeypatch.setattr(tasks, "MultiViewRenderer", FakeRenderer)
     monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
 
 
@@ -80,16 +106,23 @@ def test_a_scene_is_whole_and_true(fake, tmp_path):
     assert not list(scene.manifest.problems())
     assert scene.meta["source"]["seed"] == 0
     assert scene.meta["source"]["versions"]["mitsuba_variant"] == "fake"
+    assert set(scene.meta["splits"]) == {"center", "corner", "views-3"}
+    assert [t.tick for t in open_scene(folder, split="corner").targets] == [40]
+    assert scene.meta["instances"]["1"] == "body" and set(scene.meta["instances"].values()) >= {"rim0", "rim3"}
     renderer = FakeRenderer(None, [scene.cameras["cam_04"]], seed=1, spp=0, background_spp=0)
     for target in scene.targets:
         truth = renderer.keys(target.tick / 20_000)[0]
         assert np.abs(scene.ground_truth(target) - truth).max() < 1e-3  # half floats
+        geometry = read_geometry(scene.manifest.path(f"geometry/{target.name}.exr"))
+        assert np.array_equal(geometry.ids > 0, renderer.object_masks(target.tick / 20_000)[0])
         mask = scene.moving(target)
         assert mask[renderer.object_masks(target.tick / 20_000)[0]].all()
         assert mask.mean() < 0.2
     counts = scene.stream("cam_00").counts(0, 80)
-    still = FakeRenderer(None, list(scene.cameras.values()), seed=0, spp=0, background_spp=0).backgrounds()[0]
+    still = FakeRenderer(None, [scene.cameras["cam_00"]], seed=0, spp=0, background_spp=0).still.background[0, ..., 0]
     assert np.abs(counts[:10] / 80 / 0.6 - still[:10]).mean() < 0.05
+    for name in ("sheet.png", "preview.webp", "croissant.json", "events/cam_00.npz", "calibration/dark/cam_02.dat"):
+        assert name in scene.manifest.files
     with np.load(folder / "truth/cam_00.npz") as maps:
         assert set(maps) == {"gain", "dark"}
     assert not (tmp_path / ".work").exists()
@@ -122,7 +155,7 @@ def test_resumes_after_an_interruption_at_every_step(fake, tmp_path):
             hidden = tmp_path / "cut" / ".work" / JOB.id / "scene" / "images"
             hidden.mkdir(parents=True, exist_ok=True)
             (hidden / ".000020.99.part.exr").write_bytes(b"left by a killed process")
-    assert stops >= 9 + 3 + 4
+    assert stops >= 8
     assert files(folder) == whole
 
 
@@ -161,7 +194,7 @@ def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
     assert command.make_dataset(("car",), profile="tiny", out=tmp_path) == 0
     before = files(tmp_path / "car-0-tiny")
     report = json.loads((tmp_path / "car-0-tiny.report.json").read_text())
-    assert set(report["stages_s"]) == {"key frames", "ground truth", "spikes", "description"}
+    assert set(report["stages_s"]) == {"background", "key frames", "ground truth", "streams", "description"}
     capsys.readouterr()
     assert command.make_dataset(("car",), profile="tiny", out=tmp_path) == 0
     assert "kept" in capsys.readouterr().out
@@ -193,7 +226,7 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
 @pytest.mark.parametrize(
     ("worlds", "options", "words"),
     [
-        (("moon",), {}, "world: expected one of car, turntable"),
+        (("moon",), {}, "world: expected one of jaywalk, bicycle, "),
         ((), {}, "at least one world"),
         (("car",), {"profile": "huge"}, "--profile: expected one of tiny, small, paper"),
         (("car",), {"seconds": 0.0}, "--seconds"),
@@ -237,9 +270,9 @@ def test_moving_region_has_the_object_and_its_moving_shadow_only():
     assert np.array_equal(moving_region(thing, image, still, varies), expected)
 
 
-def start(out):
+def start(out, *more):
     code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["make-dataset", "car", "--profile", "tiny", "--out", str(out)]
+    arguments = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), *more]
     return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
@@ -254,16 +287,33 @@ def kill_when(process, pattern: str, folder: Path, count: int):
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, bytes]:
+    """The files of a real tiny scene, made by one process without interruption."""
+    out = tmp_path_factory.mktemp("whole")
+    output, _ = (process := start(out)).communicate(timeout=300)
+    assert process.returncode == 0, output.decode()
+    return files(out / "car-0-tiny")
+
+
 @pytest.mark.slow
-def test_mitsuba_scene_survives_sigkill(tmp_path):
-    """The real thing: killed among the key frames and among the ground truth, then equal to an uninterrupted run's."""
-    whole = start(tmp_path / "whole")  # beside the others, to save time
-    work = tmp_path / "cut/.work/car-0-tiny"
-    kill_when(start(tmp_path / "cut"), "keys/0*.npz", work, 2)
-    assert not (tmp_path / "cut/car-0-tiny").exists()
-    kill_when(start(tmp_path / "cut"), "scene/images/*/*.exr", work, 1)
-    for process in (whole, start(tmp_path / "cut")):
-        output, _ = process.communicate(timeout=200)
-        assert process.returncode == 0, output.decode()
-    assert files(tmp_path / "cut/car-0-tiny") == files(tmp_path / "whole/car-0-tiny")
-    assert open_scene(tmp_path / "cut/car-0-tiny").revision == open_scene(tmp_path / "whole/car-0-tiny").revision
+def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
+    """Killed among the key frames and among the ground truth, then finished by two workers: the same bytes."""
+    work = tmp_path / ".work/car-0-tiny"
+    kill_when(start(tmp_path), "keys/0*.npz", work, 2)
+    assert not (tmp_path / "car-0-tiny").exists()
+    kill_when(start(tmp_path, "--workers", "2"), "scene/images/*/*.exr", work, 1)
+    output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
+    assert process.returncode == 0, output.decode()
+    found = files(tmp_path / "car-0-tiny")
+    assert found["manifest.json"] == whole["manifest.json"] and found == whole
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_scene(whole, tmp_path):
+    from distributed import LocalCluster
+
+    quiet = {"processes": True, "n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**quiet, silence_logs=50) as cluster:
+        command.make_dataset(("car",), profile="tiny", out=tmp_path, scheduler=cluster.scheduler_address)
+    assert files(tmp_path / "car-0-tiny") == whole
