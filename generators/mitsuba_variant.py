@@ -50,12 +50,15 @@ def pick_variant() -> str:
     """The variant for this process: `SPIKE4DGS_MITSUBA_VARIANT` where set, else the probe's answer.
 
     Says on stderr, in one line, why it fell back to the scalar variant and what would make rendering faster.
-    Raises UserError for an unknown name in the environment variable.
+    Raises UserError for an unknown name in the environment variable, or one that does not work here.
     """
     wanted = os.environ.get(OVERRIDE)
     if wanted:
         if wanted not in SUPPORTED:
             raise problem(OVERRIDE, " or ".join(SUPPORTED), wanted, "unset it to let the program choose")
+        if wanted == FAST and (why_not := _cached_probe()):
+            fix = "install libLLVM 19 (Debian: apt-get install libllvm19), or unset it"
+            raise problem(OVERRIDE, f"a libLLVM with which {FAST} works", why_not, fix)
         return wanted
     why_not = _cached_probe()
     if not why_not:

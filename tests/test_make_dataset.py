@@ -14,10 +14,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion, map_coordinates
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.images import gray, read_geometry
-from spike4dgs.benchmark.scene import open_scene
+from spike4dgs.benchmark.scene import Target, open_scene
 from spike4dgs.generators import make_dataset as command
 from spike4dgs.generators import scene_maker, tasks
 from spike4dgs.generators.ground_truth import moving_region
@@ -287,13 +288,67 @@ def kill_when(process, pattern: str, folder: Path, count: int):
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.mark.parametrize("worlds", [("car",), ()])
+def test_folders_that_cannot_be_written_are_one_error(worlds, fake, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(UserError, match="file"):
+        command.make_dataset(worlds, all=not worlds, profile="tiny", out=tmp_path / "file" / "data")
+    assert (tmp_path / "file").read_text() == "no folder"
+
+
+def test_worlds_are_named_or_all(tmp_path):
+    with pytest.raises(UserError, match="names or --all"):
+        command.make_dataset(("car",), all=True, out=tmp_path)
+
+
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> dict[str, bytes]:
-    """The files of a real tiny scene, made by one process without interruption."""
+def made(tmp_path_factory) -> Path:
+    """A real tiny scene and its report, made by one process without interruption."""
     out = tmp_path_factory.mktemp("whole")
-    output, _ = (process := start(out)).communicate(timeout=300)
+    output, _ = (process := start(out, "--audit")).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
-    return files(out / "car-0-tiny")
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(made) -> dict[str, bytes]:
+    return files(made / "car-0-tiny")
+
+
+@pytest.mark.slow
+def test_the_audit_finds_noise_and_no_more(made):
+    report = json.loads((made / "car-0-tiny.report.json").read_text())
+    ticks, truth = (report["audit"][k] for k in ("ticks", "ground_truth"))
+    assert not all(row["is_key"] for row in ticks["each"]) and len(ticks["each"]) == 4 * 3
+    assert ticks["total"]["psnr_db"] > 36 and truth["total"]["psnr_db"] > 40  # 16 and 64 samples a pixel
+    assert ticks["total"]["mean_percent"] < 5 and truth["total"]["mean_percent"] < 4
+    assert ticks["total"]["mean_percent_moving"] > truth["total"]["mean_percent_moving"] > 0
+    assert report["plan"]["keys"] == 5
+
+
+@pytest.mark.slow
+def test_flow_and_depth_of_a_scene_carry_its_pictures_over(made):
+    """Ground truth warped by its flow is the next frame, and depth warps one camera's picture into another's."""
+    scene = open_scene(made / "car-0-tiny")
+    tick, (camera, other) = 40, ("cam_04", "cam_00")
+    here, later, there = (
+        scene.ground_truth(Target(c, t)) for c, t in ((camera, tick), (camera, tick + 20), (other, tick))
+    )
+    geometry = read_geometry(scene.manifest.path(f"geometry/{camera}/{tick:06d}.exr"))
+    v, u = np.mgrid[: here.shape[0], : here.shape[1]] + 0.5
+    moving = binary_erosion(geometry.ids > 0, iterations=2)
+
+    def sampled(image, uv):
+        return map_coordinates(image, [uv[..., 1] - 0.5, uv[..., 0] - 0.5], order=1, mode="nearest")
+
+    flowed = sampled(later, np.stack([u, v], -1) + geometry.flow)
+    assert np.abs(flowed - here)[moving].mean() < 0.7 * np.abs(later - here)[moving].mean()
+    assert (geometry.flow[geometry.ids == 0] == 0).all()
+    a, b = scene.cameras[camera], scene.cameras[other]
+    uv, _ = b.project(a.unproject(np.stack([u.ravel(), v.ravel()], 1), geometry.depth.ravel().astype(np.float64)))
+    warped = sampled(there, uv.reshape(*here.shape, 2))
+    seen = ((uv > 1) & (uv < [b.width - 1, b.height - 1])).all(1).reshape(here.shape)
+    assert np.median(np.abs(warped - here)[seen]) < 0.6 * np.median(np.abs(there - here)[seen])
 
 
 @pytest.mark.slow
