@@ -34,9 +34,10 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     mean absolute error; over the whole picture and where something moves or is lit differently.
     """
     rng = np.random.default_rng([job.seed, 7])
-    ticks = sorted(rng.choice(job.n_ticks, min(_TICKS, job.n_ticks), replace=False).tolist())
+    ticks = sorted(int(t) for t in rng.choice(job.n_ticks, min(_TICKS, job.n_ticks), replace=False))
     held_out, n = held_out_view(job), len(cameras_of(job))
-    views = sorted({held_out, *rng.permutation([v for v in range(n) if v != held_out])[: _VIEWS - 1].tolist()})
+    others = rng.permutation([v for v in range(n) if v != held_out])[: _VIEWS - 1]
+    views = sorted([held_out, *(int(v) for v in others)])
     p = job.profile
     chosen = [cameras_of(job)[v] for v in views]
     some = MultiViewRenderer(world_of(job), chosen, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
@@ -69,7 +70,7 @@ def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArr
             continue
         a, b = image[where].astype(np.float64), truth[where].astype(np.float64)
         relative = 100 * np.abs(a - b) / np.maximum(b, _FLOOR)
-        square = np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2)
+        square = float(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2))
         found |= {
             f"psnr_db{suffix}": float(-10 * np.log10(max(square, 1e-12))),
             f"mean_percent{suffix}": float(relative.mean()),

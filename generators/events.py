@@ -48,7 +48,7 @@ def events(
         span_us = np.array([key_ticks[k - 1], key_ticks[k]]) * 1e6 / rate_hz
         room = int(np.ceil(np.abs(after - level) / threshold).sum()) + 1
         t, pixel, p = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.uint8)
-        n = crossings(before.ravel(), after.ravel(), level.ravel(), *span_us, threshold, t, pixel, p)
+        n = crossings(before.ravel(), after.ravel(), level.ravel(), span_us[0], span_us[1], threshold, t, pixel, p)
         order = np.lexsort((pixel[:n], t[:n]))
         found.append((t[:n][order], pixel[:n][order], p[:n][order]))
         before = after

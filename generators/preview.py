@@ -31,5 +31,6 @@ def preview(
         both = np.concatenate([np.asarray(keys[k]), counts.astype(np.float32)], axis=1)
         frames.append(Image.fromarray(encode_srgb(both)).convert("RGB"))
     with atomic_path(path) as part:
-        options = {"duration": _FRAME_MS, "loop": 0, "quality": _QUALITY, "method": 4}
-        frames[0].save(part, save_all=True, append_images=frames[1:], **options)
+        frames[0].save(
+            part, save_all=True, append_images=frames[1:], duration=_FRAME_MS, loop=0, quality=_QUALITY, method=4
+        )

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -195,7 +195,7 @@ class Maker:
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
                     if target in missing:
-                        write_truth(self._scene, target, truth, ground, lambda view=truth.view: light_range(view))
+                        write_truth(self._scene, target, truth, ground, partial(light_range, truth.view))
                         yield target
 
         for _ in self.watch("ground truth", truths(), len(missing)):

@@ -84,11 +84,13 @@ def simulate(argv: Sequence[str] = ()) -> int:
     plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
     noisy = Sensor(gain=maps.gain, dark=maps.dark, photons=PHOTONS_PER_SPIKE)
 
+    at = ticks.tolist()
+
     def clip(sensor: Sensor) -> Clip:
         return keys, ticks, a.ticks, sensor, charge
 
     def ours(sensor: Sensor, threads: int) -> Callable[[], UInt8]:
-        return lambda: np.concatenate(list(camera.simulate(*clip(sensor), threads=threads)))
+        return lambda: np.concatenate(list(camera.simulate(keys, at, a.ticks, sensor, charge, threads=threads)))
 
     exact = {id(s): exact_counts(*clip(s)) for s in (plain, maps, noisy)}
     timed = []

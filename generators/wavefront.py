@@ -164,4 +164,5 @@ class WavefrontTracer:
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         face, uv = (dr.select(hit.is_valid(), a, 0) for a in (hit.prim_index, hit.prim_uv))
         dr.eval(distance, thing, face, uv)
-        return Hits(*(np.array(a) for a in (distance, thing)), np.array(face, np.int64), np.array(uv, np.float64).T)
+        numbers = np.array(face, np.int64), np.array(uv, np.float64).T
+        return Hits(np.array(distance), np.array(thing), *numbers)

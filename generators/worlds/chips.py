@@ -84,7 +84,7 @@ def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body
     """Chips without overlap, such that in free fall they would be spread over a column `fall_s` later."""
     speed = throw.speed_m_s - 9.81 * fall_s
     placed: list[np.ndarray] = []
-    bodies = []
+    bodies: list[Body] = []
     while len(bodies) < throw.count:
         place = np.array([rng.normal(0, 0.10), rng.normal(0.02, 0.07), rng.uniform(0.01, 0.34)])
         if any(np.linalg.norm(place - other) < 2.1 * RADIUS_M for other in placed):

@@ -11,7 +11,7 @@ import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
 from spike4dgs.generators.worlds.materials import Colour, Material
-from spike4dgs.generators.worlds.meshes import Atlas, box, ellipsoid, loft, merge, quad, revolve, rotation, tube
+from spike4dgs.generators.worlds.meshes import Atlas, Mesh, box, ellipsoid, loft, merge, quad, revolve, rotation, tube
 from spike4dgs.generators.worlds.textures import Canvas, fractal, plain
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.9, 1.95, 2.30
@@ -80,7 +80,9 @@ def rim_parts(colour: Colour) -> tuple[Part, ...]:
         revolve(np.array([(RIM_M, s * 0.10), (RIM_M - 0.03, s * 0.085), (0.09, s * 0.10), (0.0, s * 0.115)]), 40, "y")
         for s in (-1, 1)
     ]
-    holes, nuts, mark = [], [], []
+    holes: list[Mesh] = []
+    nuts: list[Mesh] = []
+    mark: list[Mesh] = []
     for k in range(8):
         turn = rotation("y", 2 * np.pi * k / 8)
         for s in (-1, 1):
