@@ -28,7 +28,7 @@ _ALL = tuple(range(9))
 
 PROFILES: dict[str, Profile] = {
     "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 256, 64, 0.5, 40),
-    "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.25, 100),
+    "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.5, 100),
     "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 0.25, 400),
 }
 

@@ -89,15 +89,15 @@ class TileTracer:
     def cast_movers(self, rays: Rays) -> Hits:
         """Where rays meet the moving things, which stand alone: nothing else is in the way."""
         n = len(rays[0])
-        found = Hits(np.full(n, np.inf, np.float32), np.full(n, -1, np.int32), np.zeros(n, np.int64), np.zeros((n, 2)))
-        numbers = {name: k for k, name in enumerate(self._scene.thing_ids)}
+        distance, number = np.full(n, np.inf, np.float32), np.full(n, -1, np.int32)
+        face, uv = np.zeros(n, np.int64), np.zeros((n, 2))
+        numbers = {name: k for k, name in enumerate(self._scene.mover_ids)}
         for k, (o, d) in enumerate(zip(*(a.tolist() for a in rays), strict=True)):
             hit = self._scene.movers.ray_intersect_preliminary(mi.Ray3f(o, d))
             if hit.is_valid():
-                owner = hit.shape if hit.instance is None else hit.instance
-                found.distance[k], found.thing[k] = hit.t, numbers[owner.id()]
-                found.face[k], found.uv[k] = hit.prim_index, list(hit.prim_uv)
-        return found
+                distance[k], number[k] = hit.t, numbers[hit.shape.id()]
+                face[k], uv[k] = hit.prim_index, list(hit.prim_uv)
+        return self._scene.hits(distance, number, face, uv)
 
 
 def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:

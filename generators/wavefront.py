@@ -95,7 +95,7 @@ class WavefrontTracer:
             rows.append([*to_world.ravel(), *c.center])
         self._cameras = mi.Float(np.array(rows, np.float32).ravel())  # [C, 12]
         by_id = {shape.id(): shape for shape in scene.movers.shapes()}
-        self._things = [mi.ShapePtr(by_id[name]) for name in scene.thing_ids]
+        self._movers = [mi.ShapePtr(by_id[name]) for name in scene.mover_ids]
         self._keys = mi.UInt32(np.array([zlib.crc32(c.id.encode()) for c in cameras], np.uint32))
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
@@ -157,12 +157,11 @@ class WavefrontTracer:
     def cast_movers(self, rays: mi.Ray3f) -> Hits:
         """Where rays meet the moving things, which stand alone: nothing else is in the way."""
         hit = self._scene.movers.ray_intersect_preliminary(rays)
-        thing = mi.Int32(-1)
-        for number, shape in enumerate(self._things):
-            thing = dr.select((hit.instance == shape) | (hit.shape == shape), number, thing)
-        thing = dr.select(hit.is_valid(), thing, -1)
+        number = mi.Int32(-1)
+        for k, shape in enumerate(self._movers):
+            number = dr.select(hit.is_valid() & (hit.shape == shape), k, number)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         face, uv = (dr.select(hit.is_valid(), a, 0) for a in (hit.prim_index, hit.prim_uv))
-        dr.eval(distance, thing, face, uv)
-        numbers = np.array(face, np.int64), np.array(uv, np.float64).T
-        return Hits(np.array(distance), np.array(thing), *numbers)
+        dr.eval(distance, number, face, uv)
+        place = np.array(face, np.int64), np.array(uv, np.float64).T
+        return self._scene.hits(np.array(distance), np.array(number), *place)
