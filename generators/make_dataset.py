@@ -96,7 +96,8 @@ def make_dataset(
     todo = [job for job in jobs if not _is_done(job, out, replace)]
     for job in jobs:
         if job not in todo:
-            console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}", markup=False)
+            note = "; pass --replace to make and audit it again" if audit else ""
+            console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
