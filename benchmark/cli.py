@@ -83,6 +83,11 @@ COMMANDS: dict[str, Command] = {
         "write a scene as nerfstudio's D-NeRF data: pictures, poses, times",
         "export-nerfstudio data/car-0-small --out car-nerfstudio",
     ),
+    "tradeoff": Command(
+        "spike4dgs.generators.tradeoff:tradeoff",
+        "report render time against error for several settings",
+        "tradeoff car --profile paper",
+    ),
     "spacing": Command(
         "spike4dgs.generators.spacing:spacing",
         "report key-frame spacing against error and render time",

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators import spacing, speed
+from spike4dgs.generators import spacing, speed, tradeoff
+from spike4dgs.generators.motion import KeyPlan
+from spike4dgs.generators.profiles import PROFILES, Job
 
 
 def drifting(n, px_per_tick, height=12, width=40):
@@ -70,3 +72,15 @@ def test_speed_reports_both_sides_and_the_error(tmp_path, capsys):
     assert all(float(r["Mpx-ticks/s"]) > 0 and float(r["x numpy"]) > 0 for r in ours)
     assert all(int(r["largest count error"]) <= 1 and float(r["pixels off, %"]) < 1 for r in ours)
     assert "numpy" in capsys.readouterr().out
+
+
+def test_tradeoff_renders_the_keys_that_its_ticks_need_and_no_others():
+    plan = KeyPlan(400, 20_000, 0.5, (20, 4))
+    assert tradeoff.needed(plan, [0]) == list(range(0, 41, 4))
+    assert tradeoff.needed(plan, [110, 119]) == list(range(80, 141, 4))
+    assert tradeoff.needed(plan, [399]) == list(range(360, 401, 4))
+    job = Job("car", 0, 0, "paper", PROFILES["paper"], 0.1)
+    listed = list(tradeoff.settings(job).values())
+    assert listed[0] == job and len({repr(j) for j in listed}) >= 4
+    with pytest.raises(UserError, match="world and --profile"):
+        tradeoff.tradeoff("moon")
