@@ -11,7 +11,7 @@ from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, Wo
 from spike4dgs.generators.worlds.lamp import Lamp
 from spike4dgs.generators.worlds.materials import Colour, Material
 from spike4dgs.generators.worlds.meshes import Mesh, ellipsoid, merge, quad
-from spike4dgs.generators.worlds.rigid_bodies import Body, owners, simulate
+from spike4dgs.generators.worlds.rigid_bodies import GRAVITY_M_S2, Block, Body, owners, simulate
 from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, plain
 
 BRICK_M = (0.084, 0.044, 0.040)  # x, y, z
@@ -19,6 +19,8 @@ COLUMNS, ROWS = 6, 8
 BALL_M = 0.042
 _WALL_Y = 0.02
 _AFTER_IMPACT_S = 0.035  # the middle of the clip
+_FLIGHT_S = 0.002  # of the ball before it meets the wall; all that came before is known without simulation
+_DESCENT_M_S = 1.2  # of the ball at the wall; its arc stays above the table for longer than any clip
 _TEXELS = 900  # per metre of the painted front
 _CELL = 24  # texels of a brick's own colour
 
@@ -27,6 +29,8 @@ _PAINTS: tuple[tuple[Colour, ...], ...] = (
     ((0.10, 0.30, 0.52), (0.16, 0.46, 0.50), (0.30, 0.36, 0.62), (0.08, 0.20, 0.40)),
     ((0.20, 0.46, 0.16), (0.48, 0.54, 0.12), (0.12, 0.34, 0.20), (0.66, 0.60, 0.20)),
 )
+# Height of the letters in metres, such that the word fits on whole bricks.
+_WORDS = {"SPIKE": 0.100, "GAUSS": 0.087, "20KHZ": 0.088, "BRICK": 0.095}
 
 
 @dataclass(frozen=True)
@@ -49,23 +53,24 @@ def _draw(variant: int, rng: np.random.Generator) -> _Shot:
         rng.uniform(0.85, 1.0),
     )
     aim, heading = (rng.uniform(-0.10, 0.10), rng.uniform(0.11, 0.24)), rng.uniform(50, 125)
-    word = ("SPIKE", "GAUSS", "20KHZ", "BRICK")[int(rng.integers(4))]
+    word = list(_WORDS)[int(rng.integers(len(_WORDS)))]
     return _Shot(rng.uniform(11.0, 16.0), aim, heading, int(rng.integers(len(_PAINTS))), word, lamp)
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The ball meets the wall 35 ms before half of `duration_s`; the simulation begins a little earlier."""
+    """The ball meets the wall 35 ms before half of `duration_s`; the simulation begins 2 ms earlier."""
     rng = rng_for("bricks", seed, variant)
     shot = _draw(variant, rng)
-    impact_s = duration_s / 2 - _AFTER_IMPACT_S
-    start_s = min(0.0, impact_s - 0.002)
-    places = _places()
+    start_s = duration_s / 2 - _AFTER_IMPACT_S - _FLIGHT_S
+    places, ball, still = _places(), _ball(shot), _room(rng)
     bodies = [Body("box", tuple(v / 2 for v in BRICK_M), p, density=650.0) for p in places]
-    path = simulate([*bodies, _ball(shot, impact_s - start_s)], start_s, duration_s)
+    path = simulate([*bodies, ball], start_s, duration_s, blocks=_blocks(still))
     meshes, picture = _bricks(places, shot, rng)
     mesh, (owner, bodies_of_faces) = merge(meshes), owners(meshes)
 
     def ball_pose(t_s: float) -> dict[str, np.ndarray]:
+        if t_s < start_s:
+            return {"ball": ball.flight(t_s - start_s)}
         turn, shift = path.at(t_s)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn[-1], shift[-1]
@@ -77,12 +82,12 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         seed=seed,
         variant=variant,
         duration_s=duration_s,
-        static=_room(rng),
+        static=still,
         groups={"ball": (Part(ellipsoid((BALL_M,) * 3, (0, 0, 0), 40), Material(stripes, 0.12)),)},
         instances={"ball": "ball"},
         emitters=shot.lamp.emitters(),
         poses=ball_pose,
-        exposure=1.2,
+        exposure=1.55,
         rig=RigSpec(
             center=(-0.22, -0.98, 0.62), target=(0.0, 0.05, 0.13), spacing_m=(0.07, 0.06), toe_in=0.8, fov_x_deg=39.0
         ),
@@ -109,28 +114,31 @@ def _places() -> list[tuple[float, float, float]]:
     ]
 
 
-def _ball(shot: _Shot, flight_s: float) -> Body:
-    """The ball such that it touches the wall's front after `flight_s`; its fall meanwhile is made up for."""
+def _ball(shot: _Shot) -> Body:
+    """The ball such that it touches the wall's front after _FLIGHT_S; its fall meanwhile is made up for."""
     a = np.radians(shot.heading_deg)
-    velocity = shot.speed_m_s * np.array([np.cos(a), np.sin(a), 0.0])
+    velocity = np.array([*(shot.speed_m_s * np.array([np.cos(a), np.sin(a)])), -_DESCENT_M_S])
     touch = np.array([shot.aim[0], _WALL_Y - BRICK_M[1] / 2 - BALL_M, shot.aim[1]])
-    begin = touch - velocity * flight_s
-    velocity[2] = 4.905 * flight_s
-    begin[2] = shot.aim[1]
+    begin = touch - velocity * _FLIGHT_S + [0.0, 0.0, GRAVITY_M_S2 / 2 * _FLIGHT_S**2]
+    spin = (8.0, 0.0, 20.0)
     return Body(
-        "sphere",
-        (BALL_M,),
-        tuple(begin.tolist()),
-        velocity=tuple(velocity.tolist()),
-        spin=(8.0, 0, 20.0),
-        density=2600.0,
+        "sphere", (BALL_M,), tuple(begin.tolist()), velocity=tuple(velocity.tolist()), spin=spin, density=2600.0
     )
 
 
 def _room(rng: np.random.Generator) -> dict[str, Part]:
     """The desk without what lies where bricks fly."""
-    away = ("pot", "pencils", "mug", "die", "sheet", "ruler")
+    away = ("pot", "pencils", "mug", "die", "sheet", "ruler", "ball", "stack")
     return {name: part for name, part in desk.room(rng).items() if name not in away}
+
+
+def _blocks(room: dict[str, Part]) -> list[Block]:
+    """What stops bricks: the room's wall (as thick as need be), its skirting and the books, which stand firm."""
+    books = [Block.around(part.mesh) for name, part in room.items() if name.startswith("book")]
+    wall = Block.around(room["wall"].mesh)
+    front = min(Block.around(room[name].mesh).low[1] for name in ("poster0", "wall"))
+    behind = Block((wall.low[0], front, wall.low[2]), (wall.high[0], front + 0.2, wall.high[2]))
+    return [behind, Block.around(room["skirting"].mesh), *books]
 
 
 # ---------------------------------------------------------------- bricks
@@ -142,7 +150,7 @@ def _bricks(
     """One box for each brick, in its own coordinates, and their picture: the painted front, then a cell for each."""
     colours = [np.array(_PAINTS[shot.paint][int(k)]) * rng.uniform(0.8, 1.2) for k in rng.integers(0, 4, len(places))]
     width, height = (COLUMNS + 0.5) * BRICK_M[0], ROWS * BRICK_M[2]
-    front_h, front_w = round(height * _TEXELS), round(width * _TEXELS)
+    front_h, front_w = (int(np.ceil(v * _TEXELS - 1e-9)) for v in (height, width))
     per_row = front_w // _CELL
     cell_rows = -(-len(places) // per_row)
     picture = plain((front_h + cell_rows * _CELL, front_w), (0.3, 0.3, 0.3))
@@ -150,8 +158,8 @@ def _bricks(
     for (x, _, z), colour in zip(places, colours, strict=True):
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.rectangle(left, top, left + BRICK_M[0], top + BRICK_M[2], tuple(colour))
-    c.text(shot.word, width / 2, height / 2, 0.126, (0.84, 0.82, 0.76))
-    c.text(shot.word, width / 2, height / 2 - 0.002, 0.122, (0.04, 0.05, 0.09))
+    c.text(shot.word, width / 2 + 0.003, height / 2 + 0.003, _WORDS[shot.word], (0.84, 0.82, 0.76))
+    c.text(shot.word, width / 2, height / 2, _WORDS[shot.word], (0.04, 0.05, 0.09))
     for x, _, z in places:  # an edge around every brick
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.line([(left, top), (left + BRICK_M[0], top)], 0.003, (0.78, 0.74, 0.66), 0.7)

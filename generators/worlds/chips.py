@@ -11,12 +11,13 @@ from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, Wo
 from spike4dgs.generators.worlds.lamp import Lamp
 from spike4dgs.generators.worlds.materials import Colour, Material
 from spike4dgs.generators.worlds.meshes import Mesh, box, merge, quad, revolve
-from spike4dgs.generators.worlds.rigid_bodies import Body, owners, simulate
+from spike4dgs.generators.worlds.rigid_bodies import GRAVITY_M_S2, Block, Body, owners, simulate
 from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
 RADIUS_M, THICK_M = 0.024, 0.0045
 _SEGMENTS = 28
 _BEFORE_S = 0.05  # of simulated fall before the middle of the clip
+_FLOOR_M = -0.01
 _CELL = 112  # texels of a chip's face
 _COLOURS: tuple[Colour, ...] = (
     (0.70, 0.06, 0.05),
@@ -55,9 +56,10 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     rng = rng_for("chips", seed, variant)
     throw = _draw(variant, rng)
     start_s = min(0.0, duration_s / 2 - _BEFORE_S)
-    path = simulate(_bodies(throw, duration_s / 2 - start_s, rng), start_s, duration_s, friction=0.3)
-    kinds = rng.integers(0, len(_COLOURS), throw.count)
-    mesh, (owner, bodies) = merge([_chip(int(k)) for k in kinds]), owners([_chip(int(k)) for k in kinds])
+    blocks = [Block.around(mesh) for mesh in _edges()]
+    path = simulate(_bodies(throw, duration_s / 2 - start_s, rng), start_s, duration_s, friction=0.3, blocks=blocks)
+    chips = [_chip(int(kind)) for kind in rng.integers(0, len(_COLOURS), throw.count)]
+    mesh, (owner, bodies) = merge(chips), owners(chips)
     surface = Part(mesh, Material(_picture(rng), 0.3))
     return WorldScene(
         name="chips",
@@ -69,7 +71,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         instances={},
         emitters=throw.lamp.emitters(),
         poses=lambda t_s: {},
-        exposure=1.25,
+        exposure=1.5,
         rig=RigSpec(
             center=(0.0, -0.78, 0.60), target=(0.0, 0.04, 0.135), spacing_m=(0.055, 0.048), toe_in=0.8, fov_x_deg=39.0
         ),
@@ -81,19 +83,24 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body]:
-    """Chips without overlap, such that in free fall they would be spread over a column `fall_s` later."""
-    speed = throw.speed_m_s - 9.81 * fall_s
-    placed: list[np.ndarray] = []
+    """Chips that free flight would spread over a column `fall_s` later, apart from each other now and then.
+
+    Those that cross on the way collide, and the lowest meet the table.
+    """
+    speed = throw.speed_m_s - GRAVITY_M_S2 * fall_s
+    apart = 2.02 * np.hypot(RADIUS_M, THICK_M / 2)  # whatever way they are turned
+    placed: list[np.ndarray] = []  # [2, 3]: at the beginning and at the end
     bodies: list[Body] = []
     while len(bodies) < throw.count:
         place = np.array([rng.normal(0, 0.10), rng.normal(0.02, 0.07), rng.uniform(0.01, 0.34)])
-        if any(np.linalg.norm(place - other) < 2.1 * RADIUS_M for other in placed):
-            continue
         down = max(speed + rng.uniform(-0.3, 0.3), 0.3)
         velocity = np.array([throw.drift_m_s + rng.normal(0, 0.25), rng.normal(0, 0.25), -down])
-        begin = place - velocity * fall_s + [0, 0, 4.905 * fall_s**2]
+        begin = place - velocity * fall_s + [0, 0, GRAVITY_M_S2 / 2 * fall_s**2]
+        ends = np.stack([begin, place])
+        if any(np.linalg.norm(ends - other, axis=1).min() < apart for other in placed):
+            continue
+        placed.append(ends)
         q, spin = rng.normal(size=4), rng.normal(0, 22, 3)
-        placed.append(place)
         q /= np.linalg.norm(q)
         size = (RADIUS_M, THICK_M / 2)
         motion = {"velocity": tuple(velocity.tolist()), "spin": tuple(spin.tolist())}
@@ -160,14 +167,17 @@ def _table(felt: Colour, rng: np.random.Generator) -> dict[str, Part]:
         c.text(str(7 * k % 36), x + 0.055, 0.705, 0.035, _WHITE)
     picture = c.picture * (0.88 + 0.16 * fractal(size, rng, 8, 1))[..., None]
     room = desk.room(rng)
-    return {k: room[k] for k in ("wall", "skirting", "poster0", "poster1", "poster2")} | {
-        "floor": Part(quad((0, 0.0, -0.01), (3.4, 0, 0), (0, 2.4, 0)), room["desk"].material),
+    return {k: room[k] for k in ("wall", "poster0", "poster1", "poster2")} | {
+        "skirting": Part(room["skirting"].mesh.at(0, 0, _FLOOR_M), room["skirting"].material),
+        "floor": Part(quad((0, 0.0, _FLOOR_M), (3.4, 0, 0), (0, 2.4, 0)), room["desk"].material),
         "felt": Part(quad((0, 0.05, 0), (1.3, 0, 0), (0, 0.78, 0)), Material(picture)),
-        "edge": Part(
-            merge([box((1.36, 0.03, 0.03), (0, 0.455, 0.0)), box((1.36, 0.03, 0.03), (0, -0.355, 0.0))]),
-            Material((0.30, 0.14, 0.06), 0.2),
-        ),
+        "edge": Part(merge(_edges()), Material((0.30, 0.14, 0.06), 0.2)),
     }
+
+
+def _edges() -> list[Mesh]:
+    """The table's far and near edge."""
+    return [box((1.36, 0.03, 0.03), (0, y, 0.0)) for y in (0.455, -0.355)]
 
 
 WORLD = World("chips", "A handful of chips falls on a table", build)
