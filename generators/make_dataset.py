@@ -73,7 +73,7 @@ def make_dataset(
     from rich.console import Console
 
     from spike4dgs.generators.executors import executor
-    from spike4dgs.generators.mitsuba_variant import choose_device
+    from spike4dgs.generators.mitsuba_variant import choose_device, pick_variant
 
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:
@@ -98,6 +98,8 @@ def make_dataset(
         if job not in todo:
             note = "; pass --replace to make and audit it again" if audit else ""
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
+    if todo:
+        pick_variant()  # if it cannot render, say so before anything is written
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")

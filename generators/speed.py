@@ -117,8 +117,8 @@ def simulate(argv: Sequence[str] = ()) -> int:
             threads,
             f"{ms:.1f}",
             f"{a.height * a.width * a.ticks / ms / 1e3:.0f}",
-            f"{numpy_ms / ms:.1f}",
-            f"{zoo_ms / ms:.1f}" if zoo_ms else "-",
+            f"{numpy_ms / ms:.3g}",
+            f"{zoo_ms / ms:.3g}" if zoo_ms else "-",
             str(off.max()),
             f"{100 * (off > 0).mean():.3f}",
         ]

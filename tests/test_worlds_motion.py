@@ -45,7 +45,7 @@ def test_street_things_cross_from_left_to_right_at_their_speed(name, variant):
 def test_nothing_sinks_into_the_ground(name):
     world = WORLDS[name].build(0, 0, 0.1)
     for t in np.linspace(0, 0.1, 7):
-        assert world.moving_points(t)[:, 2].min() > -0.03 if name in STREET else -0.004
+        assert world.moving_points(t)[:, 2].min() > (-0.03 if name in STREET else -0.004)
 
 
 # ---------------------------------------------------------------- people and wheels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ def _draw(variant: int, rng: np.random.Generator) -> _Flight:
     if variant == 0:
         return _Flight()
     light = street.Light(rng.uniform(-150, -40), rng.uniform(42, 64), rng.uniform(2.6, 3.3), rng.uniform(0.7, 0.95))
-    beat = bird_body.Beat(rng.uniform(8, 12), rng.uniform(0.7, 0.9), phase=rng.uniform(0, 2 * np.pi))
+    beat = bird_body.Beat(rng.uniform(12, 20), rng.uniform(0.7, 0.9), phase=rng.uniform(0, 2 * np.pi))
     return _Flight(rng.uniform(2.4, 3.4), rng.uniform(0.40, 0.52), beat, int(rng.integers(len(_PLUMAGES))), light)
 
 
@@ -47,9 +48,12 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         bob = -0.008 * np.cos(2 * np.pi * flight.beat.hz * t + flight.beat.phase)
         return np.asarray(translation(flight.speed_m_s * t, 0.0, flight.height_m + bob) @ rotation("y", -0.10))
 
-    def wings(t_s: float) -> np.ndarray:
-        body, local = pose(t_s), bird_body.wing_points(flight.beat, t_s - duration_s / 2)
-        return np.asarray(local @ body[:3, :3].T + body[:3, 3])
+    def carried(points: Callable[[bird_body.Beat, float], np.ndarray]) -> Callable[[float], np.ndarray]:
+        def at(t_s: float) -> np.ndarray:
+            body, local = pose(t_s), points(flight.beat, t_s - duration_s / 2)
+            return np.asarray(local @ body[:3, :3].T + body[:3, 3])
+
+        return at
 
     return WorldScene(
         name="bird",
@@ -63,7 +67,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         poses=lambda t_s: {"bird": pose(t_s)},
         exposure=0.95,
         rig=RigSpec(
-            center=(0.05, -0.98, 0.98), target=(0.0, 0.06, 0.42), spacing_m=(0.085, 0.072), toe_in=0.8, fov_x_deg=42.0
+            center=(0.05, -0.98, 0.98), target=(0.0, 0.06, 0.42), spacing_m=(0.085, 0.072), toe_in=0.8, fov_x_deg=45.0
         ),
         shadow_sources=np.append(flight.light.to_sun, 0.0)[None],
         depth_range=(0.4, 60.0),
@@ -73,7 +77,12 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
             "wing_beats_per_s": flight.beat.hz,
             "wing_span_m": 2 * bird_body.SPAN_M,
         },
-        deforming={"wing": Deforming(bird_body.wings_part(plumage, rng), wings, bird_body.wing_bodies())},
+        deforming={
+            "wing": Deforming(
+                bird_body.wings_part(plumage, rng), carried(bird_body.wing_points), bird_body.wing_bodies()
+            ),
+            "tail": Deforming(bird_body.tail_part(plumage, rng), carried(bird_body.tail_points)),
+        },
     )
 
 

@@ -1,4 +1,4 @@
-"""A small bright bird: a rigid body, and wings that bend, twist and lag from root to tip without stretching.
+"""A small bright bird: a rigid body, wings that bend, twist and lag from root to tip without stretching, a tail fan.
 
 Own coordinates: x forward, y to the left, z up, origin in the middle of the body. Metres.
 """
@@ -17,6 +17,7 @@ from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 LENGTH_M = 0.30
 SPAN_M = 0.27  # of one wing, along its bent line
 _ALONG, _ACROSS = 33, 9  # points of a wing
+_FAN, _BACK = 21, 9  # points of the tail
 _ROOT = np.array([0.045, 0.028, 0.030])  # front of the left wing's root
 
 
@@ -34,7 +35,7 @@ class Plumage:
 class Beat:
     """How the wings move: beats per second, half the stroke and its middle (radians), lag of the tip, twist."""
 
-    hz: float = 9.0
+    hz: float = 12.0
     stroke: float = 0.80
     middle: float = 0.16
     lag: float = 1.0
@@ -47,9 +48,14 @@ class Beat:
         rise = self.middle + self.stroke * (0.55 + 0.45 * s) * np.cos(turn) - 0.10 * s
         return rise, self.twist * s * np.sin(turn)
 
+    def tail(self, t_s: float) -> tuple[float, float]:
+        """Half the angle that the tail spreads, and its pitch (radians): it opens and sinks as the wings go down."""
+        down = np.sin(2 * np.pi * self.hz * t_s + self.phase)
+        return 0.42 + 0.07 * float(down), -0.05 * float(down)
+
 
 def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Body with head, beak, eyes, tail and feet."""
+    """Body with head, beak, eyes and feet."""
     stations = np.array(  # x, height of the middle, half height, half width
         [(-0.105, 0.010, 0.010, 0.013), (-0.085, 0.008, 0.020, 0.023), (-0.045, 0.002, 0.036, 0.036)]
         + [(0.0, -0.002, 0.044, 0.041), (0.04, 0.004, 0.041, 0.037), (0.07, 0.018, 0.033, 0.030)]
@@ -81,7 +87,6 @@ def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
         Part(merge(eyes), Material((0.01, 0.01, 0.012), 0.06)),
         Part(merge(glints), Material((0.9, 0.9, 0.9))),
         Part(merge(feet), Material((0.50, 0.26, 0.06))),
-        Part(_tail(), Material(_feathers(plumage, 5, rng))),
     )
 
 
@@ -124,20 +129,25 @@ def _chord(s: np.ndarray) -> np.ndarray:
     return np.asarray(smooth * (1 + 0.07 * np.cos(2 * np.pi * 11 * s)))
 
 
-def _tail() -> Mesh:
-    """A fan of feathers behind the body."""
-    side = np.linspace(-1, 1, 21)
-    back = np.linspace(0, 1, 9)
-    reach = 0.115 * (1 + 0.06 * np.cos(np.pi * 5 * side))
-    points = np.stack(
-        [
-            -0.085 - back[None] * (reach * np.cos(0.42 * side))[:, None],
-            (0.010 + 0.120 * back[None]) * np.sin(0.42 * side)[:, None],
-            0.012 - 0.025 * back[None] - 0.010 * (side**2)[:, None] * back[None],
-        ],
-        -1,
-    )
-    return surface(points)
+def tail_part(plumage: Plumage, rng: np.random.Generator) -> Part:
+    """The tail as one mesh; its vertices are those of `tail_points` at t = 0."""
+    mesh = surface(np.zeros((_FAN, _BACK, 3)))
+    points = tail_points(Beat(), 0.0)
+    return Part(Mesh(points, mesh.faces, mesh.uv, smooth=True), Material(_feathers(plumage, 5, rng)))
+
+
+def tail_points(beat: Beat, t_s: float) -> np.ndarray:
+    """Vertices [N, 3] of the tail in the body's coordinates: a fan of feathers that keep their length."""
+    spread, pitch = beat.tail(t_s)
+    side = np.linspace(-1, 1, _FAN)[:, None]
+    back = np.linspace(0, 1, _BACK)
+    reach = 0.115 * (1 + 0.06 * np.cos(np.pi * 5 * side)) * back
+    turn = spread * side
+    away, sink = reach * np.cos(turn), 0.025 * back + 0.010 * side**2 * back
+    x = -0.085 - away * np.cos(pitch) + sink * np.sin(pitch)
+    y = 0.010 * np.sin(turn) + reach * np.sin(turn)
+    z = 0.012 - sink * np.cos(pitch) + away * np.sin(pitch)
+    return np.stack([x, y, z], -1).reshape(-1, 3)
 
 
 def _body_picture(plumage: Plumage, rng: np.random.Generator) -> np.ndarray:

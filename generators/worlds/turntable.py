@@ -42,8 +42,7 @@ def _draw(variant: int, rng: np.random.Generator) -> _Setup:
         return _Setup()
     side = rng.choice([-1.0, 1.0])
     place = (side * rng.uniform(0.5, 1.0), rng.uniform(-0.9, -0.5), rng.uniform(1.5, 1.9))
-    slow, fast = rng.uniform(4.0, 5.5), rng.uniform(20.0, 25.0)
-    turns = (fast if variant % 2 else slow) * rng.choice([-1.0, 1.0])
+    turns = (rng.uniform(20.0, 25.0) if variant % 2 else rng.uniform(4.0, 5.5)) * rng.choice([-1.0, 1.0])
     return _Setup(turns, int(rng.integers(8)), rng.uniform(0, 2 * np.pi), Lamp(place, rng.uniform(0.85, 1.1)))
 
 
