@@ -144,7 +144,7 @@ def tail_points(beat: Beat, t_s: float) -> np.ndarray:
     reach = 0.115 * (1 + 0.06 * np.cos(np.pi * 5 * side)) * back
     turn = spread * side
     away, sink = reach * np.cos(turn), 0.025 * back + 0.010 * side**2 * back
-    x = -0.085 - away * np.cos(pitch) + sink * np.sin(pitch)
+    x = -0.085 - away * np.cos(pitch) - sink * np.sin(pitch)
     y = 0.010 * np.sin(turn) + reach * np.sin(turn)
     z = 0.012 - sink * np.cos(pitch) + away * np.sin(pitch)
     return np.stack([x, y, z], -1).reshape(-1, 3)

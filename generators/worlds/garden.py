@@ -98,7 +98,7 @@ def _things(rng: np.random.Generator) -> dict[str, Part]:
     post = [box((0.07, 0.07, 0.52), (1.28, 0.30, 0.26)), box((0.16, 0.16, 0.03), (1.28, 0.30, 0.535))]
     return {
         "can": Part(merge([can, spout, handle]).at(-1.02, 0.22, 0), Material((0.16, 0.36, 0.34), 0.2)),
-        "bowl": Part(bowl.at(0.62, -0.02, 0), Material(stripes, 0.15)),
+        "bowl": Part(bowl.at(0.45, 0.30, 0), Material(stripes)),
         "post": Part(merge(post), Material(wood((96, 48), rng, 2))),
         "lantern": Part(ellipsoid((0.06, 0.06, 0.08), (1.28, 0.30, 0.63), 20), Material((0.80, 0.72, 0.50), 0.15)),
     }
