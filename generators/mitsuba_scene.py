@@ -49,6 +49,8 @@ class MitsubaScene:
         self.full = mi.load_dict({"type": "scene", **static, **moving})
         self.movers = mi.load_dict({"type": "scene", **plain})
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
+        # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
+        self._own_normals = str(mi.variant()).startswith("scalar")
         self._placed_at: float | None = None
         self.place(0.0)
 
@@ -71,13 +73,15 @@ class MitsubaScene:
             return
         poses = self._world.poses(t_s)
         turns = np.array([poses[name][:3] for name in self._world.instances]).reshape(-1, 3, 4)
-        for name, batch in self._batches.items():
-            positions, normals = batch.at(t_s, turns)
-            for parameters in self._parameters:
-                parameters[f"moving_{name}.vertex_positions"] = positions
-                if normals is not None:
-                    parameters[f"moving_{name}.vertex_normals"] = normals
+        placed = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
         for parameters in self._parameters:
+            for name, (positions, _) in placed.items():
+                parameters[f"{name}.vertex_positions"] = positions
+            if self._own_normals:
+                parameters.update()
+            for name, (_, normals) in placed.items():
+                if normals is not None:
+                    parameters[f"{name}.vertex_normals"] = normals
             parameters.update()
         self._placed_at = t_s
 

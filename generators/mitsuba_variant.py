@@ -94,6 +94,7 @@ def load_mitsuba() -> ModuleType:
 
     if mi.variant() is None:
         mi.set_variant(pick_variant())
+        mi.set_log_level(mi.LogLevel.Error)  # it warns of every sliver among the triangles
     return mi
 
 
