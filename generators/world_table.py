@@ -57,6 +57,8 @@ def worlds(
         raise problem("world", f"one of {', '.join(WORLDS)}", ", ".join(unknown), "correct the name")
     if profile not in PROFILES:
         raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(profile), "correct the name")
+    if reports is not None and not reports.is_dir():
+        raise problem("--reports", "a folder with reports of scenes", str(reports), "correct the path")
     p = PROFILES[profile]
     rows = [_row(Job(n, variant, seed, profile, p, p.seconds), reports) for n in names or WORLDS]
     write_text(out, _markdown(rows))
@@ -99,7 +101,11 @@ def _made_in(job: Job, reports: Path | None) -> str:
     if path is None or not path.is_file():
         return "-"
     report: dict[str, Any] = read_json(path, "the report of a scene")
-    return f"{report['total_s'] - report['stages_s'].get('audit', 0):.0f}"
+    try:
+        return f"{report['total_s'] - report['stages_s'].get('audit', 0):.0f}"
+    except (KeyError, TypeError, AttributeError):
+        found = f"keys {', '.join(report) or 'none'}"
+        raise problem(path, "numbers total_s and stages_s", found, "make the scene again") from None
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:

@@ -33,7 +33,7 @@ def _draw(variant: int, rng: np.random.Generator) -> _Flight:
     if variant == 0:
         return _Flight()
     light = street.Light(rng.uniform(-150, -40), rng.uniform(48, 64), rng.uniform(2.9, 3.3), rng.uniform(0.7, 0.95))
-    beat = bird_body.Beat(rng.uniform(12, 20), rng.uniform(0.7, 0.9), phase=rng.uniform(0, 2 * np.pi))
+    beat = bird_body.Beat(rng.uniform(12, 20), rng.uniform(0.6, 0.8), phase=rng.uniform(0, 2 * np.pi))
     return _Flight(rng.uniform(2.4, 3.4), rng.uniform(0.40, 0.46), beat, int(rng.integers(len(_PLUMAGES))), light)
 
 

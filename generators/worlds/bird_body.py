@@ -36,7 +36,7 @@ class Beat:
     """How the wings move: beats per second, half the stroke and its middle (radians), lag of the tip, twist."""
 
     hz: float = 12.0
-    stroke: float = 0.80
+    stroke: float = 0.68
     middle: float = 0.16
     lag: float = 1.0
     twist: float = 0.45

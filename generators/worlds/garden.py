@@ -25,7 +25,7 @@ def garden(rng: np.random.Generator) -> dict[str, Part]:
     sign.text("GARDEN", 0.30, 0.10, 0.075, (0.08, 0.22, 0.12))
     sign.text("20 kHz", 0.30, 0.20, 0.05, (0.55, 0.10, 0.05))
     return {
-        "deck": Part(deck, Material(wood((620, 1050), rng, 17), 0.4)),
+        "deck": Part(deck, Material(1.3 * wood((620, 1050), rng, 17), 0.4)),
         "wall": Part(wall, Material(bricks)),
         "ledge": Part(ledge, Material(paving((64, 64), rng, (32, 64), (0.50, 0.48, 0.44), (0.66, 0.64, 0.60)))),
         "lawn": Part(lawn, Material((0.10, 0.16, 0.05))),
