@@ -12,7 +12,8 @@ Photons arrive at random. With N photons to a threshold, the charge that is expe
 sum of k independent Gamma(N) / N variables, exactly, whatever the light does; so shot noise costs one random number for
 each spike, not for each tick: a spike takes the charge 1 + g / sqrt(N) instead of 1, with g from a sum of four bytes
 (mean 0, variance 1, excess kurtosis -0.3, |g| < 3.46) where Gamma's is Gaussian up to a skewness of 2 / sqrt(N). g is a
-hash of (seed, pixel, tick), so it does not depend on batches or threads.
+hash of (seed, pixel, tick), so it does not depend on batches or threads. The limit to a tick's charge is then not 1 but
+the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick.
 
 Radiance between keys is a cubic Hermite (Catmull-Rom) curve: the tangent at a key is the slope between its neighbours,
 in the first and last interval the slope of that interval itself. With p0..p3 the keys around the interval from p1 to p2
@@ -54,7 +55,7 @@ Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in or
 RADIANCE_GAIN = 0.6  # spikes per tick of a pixel that sees white
 PHOTONS_PER_SPIKE = 5e4  # of a real camera; see `sensor_maps` for the rest of its statistics
 DEVIATE_SD = 21845**0.5  # of `sensor_kernels.deviate`
-_MOST_DEVIATION = 510 / DEVIATE_SD
+MOST_DEVIATION = 510 / DEVIATE_SD
 _BATCH_BYTES = 16 << 20  # of key frames in memory at a time
 
 
@@ -141,9 +142,9 @@ def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
     if sensor.photons is None:
         return 0.0, float(THRESHOLD), np.int32(0)
     sd = sensor.photons**-0.5
-    head = sd * _MOST_DEVIATION
+    head = sd * MOST_DEVIATION
     unit = float(np.floor(THRESHOLD / (1 + head)))
-    return head, unit, np.int32(round(sd * unit / DEVIATE_SD))
+    return head, unit, np.int32(sd * unit / DEVIATE_SD)  # rounded down: a spike never takes more than there is
 
 
 def _check(keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32, means: bool) -> None:

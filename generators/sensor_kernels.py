@@ -70,16 +70,18 @@ def integrate(
             stop = min(start + n, len(words))
             for block in range(strip, min(strip + STRIP, last_block)):
                 p = block * BLOCK
-                k = window[s : s + 4, p : p + BLOCK]
+                k0, k1 = window[s][p : p + BLOCK], window[s + 1][p : p + BLOCK]
+                k2, k3 = window[s + 2][p : p + BLOCK], window[s + 3][p : p + BLOCK]
                 g = gain[p : p + BLOCK] if len(gain) > BLOCK else gain
                 d = dark[p : p + BLOCK] if len(dark) > BLOCK else dark
                 c[:] = charge[p : p + BLOCK]
                 out = words[start:stop, block]
-                constant = means or _still(k)
+                constant = means or _still(k0, k1, k2, k3)
                 if constant:
-                    _steady(k[1], g, d, radiance_gain, unit, increment)
+                    _steady(k1, g, d, radiance_gain, unit, increment)
                 else:
-                    _prepare(k, tangents[s, 0], tangents[s, 1], g, d, np.float32(radiance_gain), unit, n, w)
+                    weights = tangents[s, 0], tangents[s, 1]
+                    _prepare(k0, k1, k2, k3, weights, g, d, np.float32(radiance_gain), np.float32(unit), n, w)
                 if noise != 0:
                     for i in range(BLOCK):
                         pixel[i] = np.uint32((p + i) * 0x9E3779B1)
@@ -92,21 +94,22 @@ def integrate(
 
 
 @kernel
-def _still(k: Any) -> bool:
-    """Whether the four keys [4, 64] are equal."""
-    same = True
+def _still(k0: Any, k1: Any, k2: Any, k3: Any) -> bool:
+    """Whether the four keys [64] are equal."""
+    different = np.uint32(0)
     for i in range(BLOCK):
-        same &= (k[0, i] == k[1, i]) & (k[1, i] == k[2, i]) & (k[2, i] == k[3, i])
-    return same
+        different += np.uint32((k0[i] != k1[i]) | (k1[i] != k2[i]) | (k2[i] != k3[i]))
+    return different == 0
 
 
 @kernel
 def _steady(k: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, increment: Any) -> None:
     """Increments [64] of pixels whose radiance does not change."""
+    top = np.float64(THRESHOLD - 1)
     for i in range(BLOCK):
         x = (np.float64(g[i]) * radiance_gain * np.float64(k[i]) + np.float64(d[i])) * unit
         x = 0.0 if x < 0.0 else x
-        increment[i] = np.int32(unit - 1.0 if x > unit - 1.0 else x)
+        increment[i] = np.int32(top if x > top else x)
 
 
 @kernel
@@ -121,20 +124,21 @@ def _constant(increment: Any, c: Any, words: Any) -> None:
 
 
 @kernel
-def _prepare(k: Any, weight1: Any, weight2: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, n: Any, w: Any) -> None:
+def _prepare(
+    k0: Any, k1: Any, k2: Any, k3: Any, weights: Any, g: Any, d: Any, radiance_gain: Any, one: Any, n: Any, w: Any
+) -> None:
     """Polynomial in u (rows 0..3 of `w` [6 * 64]) and limits (rows 4, 5) of the increment, in charge units."""
-    one, zero = np.float32(unit), np.float32(0.0)
-    top = np.float32(unit * (1 - 2.0**-24))  # the largest float32 below one threshold
+    zero, top = np.float32(0.0), np.float32(THRESHOLD - 128)  # the largest float32 below
     width2, width3 = np.float32(1.0 / (12.0 * n * n)), np.float32(1.0 / (4.0 * n * n))
     for i in range(BLOCK):
         scale = g[i] * radiance_gain * one
-        d2 = k[2, i] - k[1, i]
-        m1 = weight1 * (k[2, i] - k[0, i])
-        m2 = weight2 * (k[3, i] - k[1, i])
+        d2 = k2[i] - k1[i]
+        m1 = weights[0] * (k2[i] - k0[i])
+        m2 = weights[1] * (k3[i] - k1[i])
         a2 = scale * (np.float32(3.0) * d2 - np.float32(2.0) * m1 - m2)
         a3 = scale * (m1 + m2 - np.float32(2.0) * d2)
-        level = scale * k[1, i] + d[i] * one
-        level2 = scale * k[2, i] + d[i] * one
+        level = scale * k1[i] + d[i] * one
+        level2 = scale * k2[i] + d[i] * one
         w[i] = level + a2 * width2
         w[BLOCK + i] = scale * m1 + a3 * width3
         w[2 * BLOCK + i] = a2

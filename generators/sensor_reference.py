@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.sensor import DEVIATE_SD, Float32, Int32, Keys, Sensor
+from spike4dgs.generators.sensor import DEVIATE_SD, MOST_DEVIATION, Float32, Int32, Keys, Sensor
 from spike4dgs.generators.sensor_kernels import THRESHOLD
 
 Float64 = NDArray[np.float64]
@@ -54,7 +54,7 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
     for tick, mean in enumerate(means):
-        level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1.0)
+        level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1 + sd * MOST_DEVIATION)
         fired = level >= 1.0
         yield fired, level
         level = level - fired * (1 + sd * deviates(pixels, tick, sensor.noise_key))

@@ -2,6 +2,8 @@
 
 - Adjacent intervals: a pixel that keeps the charge above the threshold and sees steady light has intervals of two
   neighbouring lengths between its spikes; one that drops the charge has one, one with much temporal noise has many.
+  The share of pixels with other intervals grows as the noise of one spike, which makes it the figure that tells how
+  many photons a spike takes; it depends on the rates too, so compare recordings of equal rates and length.
 - Excess count variance: over windows of a recording, a pixel's count varies by f (1 - f) around its mean even without
   noise, f being the fraction of the mean; the unbiased variance of the counts minus that is temporal noise, plus
   f (1 - f) / (windows - 1) from the estimate itself, which a noise-free pixel shows too.
@@ -32,6 +34,11 @@ class StreamStatistics:
     one_interval: float
     two_intervals: float
     excess_variance: tuple[float, ...]
+
+    @property
+    def other_intervals(self) -> float:
+        """Share of pixels with three lengths of intervals or more, or two that are no neighbours."""
+        return 1 - self.one_interval - self.two_intervals
 
 
 def stream_statistics(spikes: NDArray[np.bool_], pixels: NDArray[np.bool_] | None = None) -> StreamStatistics:

@@ -196,7 +196,7 @@ def test_maps_have_the_spread_of_the_real_camera(tmp_path):
     local = gain / np.repeat(np.repeat(smooth, 10, 0), 10, 1)
     assert gain.mean() == pytest.approx(1, abs=1e-5)
     assert gain.std() == pytest.approx(0.058, abs=0.002)
-    assert local.std() == pytest.approx(0.032, abs=0.002)
+    assert local.std() == pytest.approx(0.032, rel=0.15)
     assert np.median(dark) == pytest.approx(0.0045, rel=0.02)
     assert np.percentile(dark, [1, 99]) == pytest.approx([0.0015, 0.0128], rel=0.1)
     assert 40 < (dark > 5 * np.median(dark)).sum() < 160
@@ -224,7 +224,7 @@ def test_bad_input_is_named():
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 40), st.sampled_from([100.0, 5e3, 5e4]), st.booleans(), st.integers(0, 2**31))
-def test_shot_noise_is_the_twins_bit_for_bit(height, width, photons, on, seed):
+def test_shot_noise_is_the_twins(height, width, photons, on, seed):
     rng = np.random.default_rng(seed)
     ticks = np.cumsum([0, *rng.integers(1, 9, 12)])
     keys = rng.uniform(0, 2.2, (13, height, width)).astype(np.float32)  # up to saturation
@@ -236,7 +236,11 @@ def test_shot_noise_is_the_twins_bit_for_bit(height, width, photons, on, seed):
     assert np.array_equal(s.packed, stream(keys, ticks, n, sensor, charge, threads=3).packed)
     spikes = s.window(0, n)
     assert np.abs(spikes.sum(0).astype(int) - exact.sum(0)).max() <= 1
-    assert (spikes != exact).mean() < 0.02  # float32 rounding moves a few spikes by a tick
+    # a pixel leaves the twin only where rounding may decide; from there on its random numbers are other ones
+    differ = spikes != exact
+    first = differ & (np.cumsum(differ, axis=0) == 1)
+    assert not (first & ~near_threshold(keys, ticks, n, sensor, charge)).any()
+    assert differ.mean() < 0.02
 
 
 def test_intervals_vary_as_photons_do():
@@ -269,11 +273,12 @@ def test_intervals_vary_as_photons_do():
 
 def test_a_full_well_stays_full_with_noise():
     light = np.full((4, 16), 5.0, np.float32)
-    sensor = Sensor(photons=100, noise_seed=(1,))
-    s = stream([light, light], [0, 3000], 3000, sensor, random_charge(4, 16, [0]))
-    assert (s.counts(0, 3000) >= 2700).all()  # a spike may ask for more than one tick's charge, never for much more
-    off = stream([light, light], [0, 3000], 3000, Sensor(), random_charge(4, 16, [0]))
-    assert (off.counts(1, 3000) == 2999).all()
+    moving = np.stack([light, light + 1, light])  # the other kernel
+    for keys, ticks in (([light, light], [0, 3000]), (moving, [0, 1500, 3000])):
+        for photons in (None, 100, 5e4):
+            sensor = Sensor(photons=photons, noise_seed=(1,))
+            s = stream(keys, ticks, 3000, sensor, random_charge(4, 16, [0]))
+            assert (s.counts(1, 3000) == 2999).all()
 
 
 def test_noise_differs_between_seeds_and_not_between_runs():
