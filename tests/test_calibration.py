@@ -34,8 +34,8 @@ def test_maps_are_recovered_from_what_a_scene_ships(tmp_path):
     flat, dark = recordings(tmp_path, sensor)
     assert (flat.n_ticks, dark.n_ticks) == (calibration.FLAT_TICKS, calibration.DARK_TICKS)
     found = calibration.estimate(flat, dark, calibration.FLAT_RADIANCE)
-    assert rms(found.gain, sensor.gain) < 0.002  # asked for: 0.01
-    assert rms(found.dark, sensor.dark) < 0.02  # asked for: 0.20
+    assert rms(found.gain, sensor.gain) < 0.003  # asked for: 0.01
+    assert rms(found.dark, sensor.dark) < 0.05  # asked for: 0.20
     assert found.radiance_gain == pytest.approx(0.6, rel=1e-3)
     counted = flat.counts(0, flat.n_ticks) / flat.n_ticks - dark.counts(0, dark.n_ticks) / dark.n_ticks
     assert rms(found.gain, sensor.gain) < 0.5 * rms(counted / counted.mean(), sensor.gain)  # better than counting

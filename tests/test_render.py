@@ -64,7 +64,7 @@ def test_keys_are_close_to_mitsubas_own_rendering(r, truth):
     assert np.abs(error).mean() < NOISE[r.world.name]
     assert abs(error.mean()) < 0.002
     smooth, plain = (gaussian_filter(e, (0, 2, 2))[~traced] for e in (error, r.background - truth))
-    assert np.abs(smooth).mean() < 0.7 * np.abs(plain).mean()  # relighting removes most of the soft change
+    assert np.abs(smooth).mean() < 0.8 * np.abs(plain).mean()  # relighting removes what is above the noise
     assert np.abs(smooth).max() < 0.03
 
 
