@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
@@ -86,7 +86,14 @@ def near_threshold(keys, ticks, n, sensor, charge, tolerance=1e-4):
     return np.stack([np.abs((level + 0.5) % 1 - 0.5) < tolerance for level in levels])
 
 
+def strays(spikes, expected):
+    """[n, H, W]: where a pixel's number of spikes so far leaves the twin's; coming back is no fault of its own."""
+    ahead = np.cumsum(spikes.astype(int) - expected, axis=0)
+    return (ahead != 0) & (np.concatenate([0 * ahead[:1], ahead[:-1]]) == 0)
+
+
 @settings(max_examples=30, deadline=None)
+@example(height=6, width=7, gaps=[1, 10, 24], cut=0, contrast=1.0, on=False, seed=654)  # a spike one tick early
 @given(
     height=st.integers(1, 17),
     width=st.integers(1, 23),
@@ -108,7 +115,7 @@ def test_equals_the_twin(height, width, gaps, cut, contrast, on, seed):
     expected = simulate_reference(keys, ticks, n, sensor, charge)
     differ = got.window(0, n) != expected
     assert differ.mean() <= 0.01
-    assert not (differ & ~near_threshold(keys, ticks, n, sensor, charge)).any()
+    assert not (strays(got.window(0, n), expected) & ~near_threshold(keys, ticks, n, sensor, charge)).any()
     assert np.abs(got.counts(0, n).astype(int) - expected.sum(0)).max() <= 1
     if not differ.any():
         assert np.array_equal(got.packed, pack(expected))
@@ -120,9 +127,10 @@ def scene(seed=0, height=31, width=45, n_keys=60):
     return keys, np.arange(n_keys) * 5, (n_keys - 1) * 5
 
 
-def test_bytes_depend_on_the_seed_and_not_on_threads_or_batches(monkeypatch):
+@pytest.mark.parametrize("photons", [None, 5e4])
+def test_bytes_depend_on_the_seed_and_not_on_threads_or_batches(monkeypatch, photons):
     keys, ticks, n = scene()
-    sensor, charge = maps(31, 45, True), random_charge(31, 45, [0, 7])
+    sensor, charge = replace(maps(31, 45, True), photons=photons), random_charge(31, 45, [0, 7])
     once = stream(keys, ticks, n, sensor, charge, threads=1).packed
     assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=2).packed)
     monkeypatch.setattr("spike4dgs.generators.sensor._BATCH_BYTES", 4 * 31 * 45 * 7)
