@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,6 @@ def simulate_numpy(
             yield pack(fired[None])
 
 
-Clip = tuple[Keys, NDArray[np.int64], int, Sensor, Int32]
-
-
 def exact_counts(
     keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32
 ) -> NDArray[np.int64]:
@@ -64,6 +62,16 @@ def pattern(height: int, width: int, n_keys: int, moving: float) -> Float32:
     return np.asarray(light, dtype=np.float32)
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One simulator to time: a call that gives packed spikes, and the counts that it should find."""
+
+    name: str
+    threads: str
+    exact: NDArray[np.int64]
+    call: Callable[[], UInt8]
+
+
 def simulate(argv: Sequence[str] = ()) -> int:
     """Time the simulator on one and two threads, plain numpy, and spikezoo; print speeds, ratios and errors.
 
@@ -80,55 +88,72 @@ def simulate(argv: Sequence[str] = ()) -> int:
     a = p.parse_args(list(argv))
     n_keys = -(-a.ticks // a.spacing) + 1
     keys, ticks = pattern(a.height, a.width, n_keys, a.moving), np.arange(n_keys, dtype=np.int64) * a.spacing
-    pixels, charge = (a.height, a.width, 0, "cam_00"), random_charge(a.height, a.width, [0])
-    plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
-    noisy = Sensor(gain=maps.gain, dark=maps.dark, photons=PHOTONS_PER_SPIKE)
-
-    at = ticks.tolist()
-
-    def clip(sensor: Sensor) -> Clip:
-        return keys, ticks, a.ticks, sensor, charge
-
-    def ours(sensor: Sensor, threads: int) -> Callable[[], UInt8]:
-        return lambda: np.concatenate(list(camera.simulate(keys, at, a.ticks, sensor, charge, threads=threads)))
-
-    exact = {id(s): exact_counts(*clip(s)) for s in (plain, maps, noisy)}
     timed = []
-    runs: list[tuple[str, str, Sensor, Callable[[], UInt8]]] = [
-        ("numpy, tick by tick, maps", "1", maps, lambda: np.concatenate(list(simulate_numpy(*clip(maps))))),
-        ("spike4dgs, maps and shot noise", "1", noisy, ours(noisy, 1)),
-        ("spike4dgs, maps and shot noise", "2", noisy, ours(noisy, 2)),
-        ("spike4dgs, maps", "2", maps, ours(maps, 2)),
-        ("spike4dgs, neither", "2", plain, ours(plain, 2)),
-    ]
-    if (other := _spikezoo()) is not None:
-        frames = np.stack([m.astype(np.float32) for m in tick_means(keys, ticks.tolist(), a.ticks)])
-        runs.append((_SPIKEZOO, "1", plain, lambda: pack(other(frames, 1 / plain.radiance_gain))))
-    for name, threads, sensor, run in runs:
-        last: list[UInt8] = []
-        _, ms = time_ms(lambda run=run, last=last: last.append(run()), a.repeats if "spike4dgs" in name else 1)  # type: ignore[misc]
-        off = np.abs(count_bits(last[-1], a.height * a.width).astype(np.int64) - exact[id(sensor)])
-        timed.append((name, threads, ms, off))
-    numpy_ms = timed[0][2]
-    zoo_ms = timed[-1][2] if timed[-1][0] == _SPIKEZOO else None
+    for run in (runs := _our_runs(keys, ticks, a.ticks) + (zoo := _spikezoo_runs(keys, ticks, a.ticks))):
+        found = count_bits(run.call(), a.height * a.width).astype(np.int64)
+        timed.append((time_ms(run.call, a.repeats)[1], np.abs(found - run.exact)))
+    numpy_ms, zoo_ms = timed[0][0], timed[-1][0]
     rows = [
         [
-            name,
-            threads,
+            run.name,
+            run.threads,
             f"{ms:.1f}",
             f"{a.height * a.width * a.ticks / ms / 1e3:.0f}",
             f"{numpy_ms / ms:.3g}",
-            f"{zoo_ms / ms:.3g}" if zoo_ms else "-",
+            f"{zoo_ms / ms:.3g}" if zoo else "-",
             str(off.max()),
             f"{100 * (off > 0).mean():.3f}",
         ]
-        for name, threads, ms, off in timed
+        for run, (ms, off) in zip(runs, timed, strict=True)
     ]
-    if zoo_ms is None:
+    if not zoo:
         rows.append([f"{_SPIKEZOO}: not installed", *["-"] * (len(COLUMNS) - 1)])
     title = f"{a.ticks} ticks of {a.width}x{a.height}, a key every {a.spacing} ticks; errors against float64"
     show_table(title, COLUMNS, rows, a.csv)
     return 0
+
+
+def _our_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run]:
+    """Plain numpy first, then the simulator with more and with fewer of its terms."""
+    height, width = keys.shape[1:]
+    pixels, charge = (height, width, 0, "cam_00"), random_charge(height, width, [0])
+    plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
+    noisy = replace(maps, photons=PHOTONS_PER_SPIKE)
+
+    def ours(sensor: Sensor, threads: int) -> Callable[[], UInt8]:
+        at = ticks.tolist()
+        return lambda: np.concatenate(list(camera.simulate(keys, at, n_ticks, sensor, charge, threads=threads)))
+
+    def by_numpy() -> UInt8:
+        return np.concatenate(list(simulate_numpy(keys, ticks, n_ticks, maps, charge)))
+
+    exact = {s: exact_counts(keys, ticks, n_ticks, s, charge) for s in (plain, maps, noisy)}
+    return [
+        Run("numpy, tick by tick, maps", "1", exact[maps], by_numpy),
+        Run("spike4dgs, maps and shot noise", "1", exact[noisy], ours(noisy, 1)),
+        Run("spike4dgs, maps and shot noise", "2", exact[noisy], ours(noisy, 2)),
+        Run("spike4dgs, maps", "2", exact[maps], ours(maps, 2)),
+        Run("spike4dgs, neither", "2", exact[plain], ours(plain, 2)),
+    ]
+
+
+def _spikezoo_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run]:
+    """spikezoo's simulator, where it is installed, on ready-made frames.
+
+    It draws its initial charges from numpy's global generator, which is seeded so that the exact counts are known.
+    """
+    if (other := _spikezoo()) is None:
+        return []
+    sensor = Sensor()
+    frames = np.stack([m.astype(np.float32) for m in tick_means(keys, ticks.tolist(), n_ticks)])
+
+    def run() -> UInt8:
+        np.random.seed(0)  # noqa: NPY002
+        return pack(other(frames, 1 / sensor.radiance_gain))
+
+    np.random.seed(0)  # noqa: NPY002
+    charge = (np.random.random(keys.shape[1:]) * THRESHOLD).astype(np.int32)  # noqa: NPY002
+    return [Run(_SPIKEZOO, "1", exact_counts(keys, ticks, n_ticks, sensor, charge), run)]
 
 
 def _spikezoo() -> Callable[..., Any] | None:
@@ -143,6 +168,7 @@ def _spikezoo() -> Callable[..., Any] | None:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except ImportError:
+    except (ImportError, FileNotFoundError) as e:
+        print(f"{path} cannot be imported: {e}")
         return None
     return getattr(module, "video2spike_simulation", None)
