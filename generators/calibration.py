@@ -116,9 +116,10 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
     from rich.table import Table
 
     opened = open_scene(scene)
-    facts = opened.meta.get("calibration")
-    if facts is None:
-        raise problem(scene, "a scene with calibration recordings", "none", "make or record one with them")
+    facts = opened.meta.get("calibration", {})
+    if missing := {"flat_radiance", "flat_ticks", "dark_ticks"} - set(facts):
+        lacks = f"calibration without {', '.join(sorted(missing))}"
+        raise problem(scene / "scene.json", "facts of calibration recordings", lacks, "make a scene with recordings")
     table = Table(
         "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
     )

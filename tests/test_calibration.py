@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import array_cameras, write_small_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,7 +13,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes import SpikeStream, open_stream, pack
 from spike4dgs.generators import calibration
 from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Sensor
-from spike4dgs.generators.sensor_maps import dark_map, gain_map
+from spike4dgs.generators.sensor_maps import dark_map, gain_map, write_maps
 
 WIDTH, HEIGHT = 200, 125
 
@@ -67,3 +68,47 @@ def test_recordings_that_do_not_fit_are_refused():
         calibration.estimate(other, dark, 0.7)
     with pytest.raises(UserError, match="no more spikes than in the dark"):
         calibration.estimate(dark, dark, 0.7)
+
+
+def scene_with_recordings(root, facts):
+    for camera in array_cameras():
+        pixels = camera.height, camera.width, 0, camera.id
+        sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+        calibration.write_calibration(root / "calibration", camera, sensor, [1, 2])
+        if camera.id != "cam_03":  # nobody knows the truth of this one
+            write_maps(root / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
+    return write_small_scene(root, extras={"calibration": facts})
+
+
+FACTS = {
+    "flat_radiance": calibration.FLAT_RADIANCE,
+    "flat_ticks": calibration.FLAT_TICKS,
+    "dark_ticks": calibration.DARK_TICKS,
+}
+
+
+def test_the_command_writes_maps_and_pictures_and_scores_them(tmp_path, capsys):
+    scene = scene_with_recordings(tmp_path / "scene", FACTS)
+    assert calibration.calibrate(scene, out=tmp_path / "out") == 0
+    lines = {line.split()[1]: line.split() for line in capsys.readouterr().out.splitlines() if "cam_" in line}
+    assert set(lines) == {"cam_00", "cam_01", "cam_02", "cam_03"}
+    for camera, cells in lines.items():
+        gain_error, dark_error = cells[9], cells[11]
+        with np.load(tmp_path / f"out/{camera}.npz") as maps:
+            gain, dark = maps["gain"], maps["dark"]
+        assert (tmp_path / f"out/{camera}.png").stat().st_size > 10_000
+        if camera == "cam_03":
+            assert (gain_error, dark_error) == ("-", "-")
+            continue
+        with np.load(scene / f"truth/{camera}.npz") as truth:
+            assert float(gain_error) == pytest.approx(100 * rms(gain, truth["gain"]), abs=0.001)
+            assert float(dark_error) == pytest.approx(100 * rms(dark, truth["dark"]), abs=0.001)
+        assert 0 < float(gain_error) < 1 and 0 < float(dark_error) < 20
+
+
+def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
+    with pytest.raises(UserError, match="calibration without dark_ticks, flat_radiance, flat_ticks"):
+        calibration.calibrate(small_scene, out=tmp_path / "out")
+    scene = scene_with_recordings(tmp_path / "other", FACTS | {"dark_ticks": 77})
+    with pytest.raises(UserError, match="77 ticks"):
+        calibration.calibrate(scene, out=tmp_path / "out")
