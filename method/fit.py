@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.recipes import Budget, Progress, Recipe
+from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.method.gaussians import Gaussians, from_points
@@ -44,14 +44,62 @@ MotionMaker = Callable[[Extent, TrainSettings, torch.Generator], Motion]
 SupervisionMaker = Callable[[TrainSettings, TrainingScene], Supervision]
 
 
+class FitSettings(Protocol):
+    """What every algorithm's settings have: when pictures are made, and how a budget changes the step counts."""
+
+    @property
+    def time_spacing_ticks(self) -> int:
+        """Ticks between two training pictures."""
+        ...
+
+    @property
+    def edge_ticks(self) -> int:
+        """Ticks at the clip's ends without a picture."""
+        ...
+
+    @property
+    def max_times(self) -> int:
+        """The most training pictures a view."""
+        ...
+
+    def scaled(self, scale: float) -> FitSettings:
+        """The same settings with the step counts multiplied by a budget's scale."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FitJob:
+    """Everything that an algorithm fits from and reports to. `key` identifies the fit that a checkpoint belongs to."""
+
+    scene: TrainingScene
+    start: Start
+    footage: Footage
+    extent: Extent
+    settings: Any  # the algorithm's own, scaled by the budget
+    device: str
+    seed: int
+    progress: Progress
+    checkpoint: Path | None
+    key: str
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """A fitting loop and the defaults of its settings."""
+
+    settings: FitSettings
+    fit: Callable[[FitJob], Model]
+
+
 @dataclass(frozen=True)
 class Parts:
-    """The tables that a recipe's four names are looked up in."""
+    """The tables that a recipe's four names are looked up in. `algorithms` are motions with a loop of their own."""
 
     images: Mapping[str, ImageMaker]
     initialization: Mapping[str, Initialization]
     motion: Mapping[str, MotionMaker]
     supervision: Mapping[str, SupervisionMaker]
+    algorithms: Mapping[str, Algorithm] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +128,9 @@ class RecipeMethod:
 
     def __init__(self, recipe: Recipe, parts: Parts) -> None:
         self.name, self.recipe, self.parts = recipe.name, recipe, parts
-        self.settings = make_settings(recipe.settings, f"recipe {recipe.name}")
-        self.params: dict[str, Any] = {**recipe.as_dict(), "settings": asdict(self.settings)}
+        self.algorithm = parts.algorithms.get(recipe.motion) or self._trainer()
+        self.settings = make_settings(recipe.settings, f"recipe {recipe.name}", self.algorithm.settings)
+        self.params: dict[str, Any] = {**recipe.as_dict(), "settings": asdict(self.settings)}  # type: ignore[call-overload]
 
     def fit(
         self,
@@ -91,7 +140,7 @@ class RecipeMethod:
         seed: int,
         progress: Progress,
         checkpoint: Path | None = None,
-    ) -> FittedModel:
+    ) -> Model:
         """Fit the training views; see `benchmark.recipes.Method`.
 
         Raises UserError for an unknown part or setting, a foreign checkpoint, or a device that is not there.
@@ -101,21 +150,39 @@ class RecipeMethod:
         settings = self.settings.scaled(budget.scale)
         images = _part(parts.images, recipe.images, recipe, "images")
         initialize = _part(parts.initialization, recipe.initialization, recipe, "initialization")
-        make_motion = _part(parts.motion, recipe.motion, recipe, "motion")
-        supervise = _part(parts.supervision, recipe.supervision, recipe, "supervision")
+        _part({**parts.motion, **parts.algorithms}, recipe.motion, recipe, "motion")
+        _part(parts.supervision, recipe.supervision, recipe, "supervision")
         progress(0, 1, "initialisation")
         start = initialize(scene, seed)
-        extent = measure(start, scene)
-        motion = make_motion(extent, settings, seeded(seed, -1))
-        if isinstance(motion, torch.nn.Module):
-            motion.to(device)
         progress(0, 1, "pictures")
         footage = film(scene, start.cameras, images, settings, device)
-        first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=device)
-        trainer = Trainer(footage, first, motion, supervise(settings, scene), settings, scale=extent.scale, seed=seed)
-        trainer.run(progress, checkpoint, sha256_json([scene.revision, self.params, budget.scale, seed]))
-        gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=device))
-        return FittedModel(gaussians, motion, scene.duration_us, device)
+        key = sha256_json([scene.revision, self.params, budget.scale, seed])
+        extent = measure(start, scene)
+        job = FitJob(scene, start, footage, extent, settings, device, seed, progress, checkpoint, key)
+        return self.algorithm.fit(job)
+
+    def _trainer(self) -> Algorithm:
+        """The one trainer, with the recipe's motion and supervision."""
+        recipe, parts = self.recipe, self.parts
+
+        def fit(job: FitJob) -> FittedModel:
+            return fit_gaussians(job, parts.motion[recipe.motion], parts.supervision[recipe.supervision])
+
+        return Algorithm(TrainSettings(), fit)
+
+
+def fit_gaussians(job: FitJob, make_motion: MotionMaker, supervise: SupervisionMaker) -> FittedModel:
+    """Run the trainer on Gaussians that start at the job's points."""
+    settings, start = job.settings, job.start
+    motion = make_motion(job.extent, settings, seeded(job.seed, -1))
+    if isinstance(motion, torch.nn.Module):
+        motion.to(job.device)
+    first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=job.device)
+    supervision = supervise(settings, job.scene)
+    trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
+    trainer.run(job.progress, job.checkpoint, job.key)
+    gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
+    return FittedModel(gaussians, motion, job.scene.duration_us, job.device)
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:
@@ -133,7 +200,7 @@ def check_device(device: str) -> None:
         raise problem("device", "cpu, or a CUDA device of this machine", found, "use --device cpu") from None
 
 
-def choose_ticks(n_ticks: int, settings: TrainSettings) -> tuple[int, ...]:
+def choose_ticks(n_ticks: int, settings: FitSettings) -> tuple[int, ...]:
     """Ticks of the training pictures: evenly spaced, an edge away from the clip's ends, where windows are cut."""
     edge = min(settings.edge_ticks, (n_ticks - 1) // 2)
     span = n_ticks - 2 * edge
@@ -142,7 +209,7 @@ def choose_ticks(n_ticks: int, settings: TrainSettings) -> tuple[int, ...]:
 
 
 def film(
-    scene: TrainingScene, cameras: Sequence[Camera], images: ImageMaker, settings: TrainSettings, device: str
+    scene: TrainingScene, cameras: Sequence[Camera], images: ImageMaker, settings: FitSettings, device: str
 ) -> Footage:
     """Pictures of all training views at the chosen times."""
     ticks = choose_ticks(scene.n_ticks, settings)

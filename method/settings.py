@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from spike4dgs.benchmark.errors import problem
 
@@ -70,14 +70,16 @@ class TrainSettings:
         )
 
 
-def make_settings(overrides: Mapping[str, Any], where: str) -> TrainSettings:
-    """The defaults with `overrides` by name. Raises UserError for an unknown name or a value of another type."""
-    defaults = TrainSettings()
-    known = {f.name for f in fields(TrainSettings)}
+S = TypeVar("S")
+
+
+def make_settings(overrides: Mapping[str, Any], where: str, defaults: S) -> S:
+    """Settings with `overrides` by name. Raises UserError for an unknown name or a value of another type."""
+    known = {f.name for f in fields(defaults)}  # type: ignore[arg-type]
     for name, value in overrides.items():
         if name not in known:
             raise problem(where, f"settings among {', '.join(sorted(known))}", repr(name), "correct the name")
         kind = type(getattr(defaults, name))
-        if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        if isinstance(value, bool) != (kind is bool) or not isinstance(value, (int, float) if kind is float else kind):
             raise problem(where, f"{name} as {kind.__name__}", repr(value), "correct the value")
-    return replace(defaults, **overrides)
+    return replace(defaults, **overrides)  # type: ignore[type-var]

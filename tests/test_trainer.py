@@ -184,7 +184,7 @@ def test_unknown_part_is_named(change, message):
 @pytest.mark.parametrize(("name", "value"), [("steps", 3), ("coarse_steps", 2.5), ("ramp", "slow"), ("levels", True)])
 def test_unknown_setting_or_wrong_type_is_refused(name, value):
     with pytest.raises(UserError, match=name):
-        make_settings({name: value}, "recipe x")
+        make_settings({name: value}, "recipe x", TrainSettings())
 
 
 def test_device_that_is_not_there_is_refused():
