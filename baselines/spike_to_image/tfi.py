@@ -30,8 +30,8 @@ def tfi_image(stream: SpikeStream, tick: int) -> Float32:
 
 
 @kernel
-def _find(packed: UInt8, pixel: int, tick: int, step: int) -> int:
-    """The first tick with a spike, going from `tick` in direction `step`; -1 where there is none."""
+def find_spike(packed: UInt8, pixel: int, tick: int, step: int) -> int:
+    """The first tick with a spike of a stored pixel, from `tick` in direction `step`; -1 where there is none."""
     byte, bit = pixel >> 3, pixel & 7
     while 0 <= tick < len(packed):
         if packed[tick, byte] >> bit & 1:
@@ -44,14 +44,14 @@ def _find(packed: UInt8, pixel: int, tick: int, step: int) -> int:
 def _image(packed: UInt8, tick: int, image: Float32, start: int, stop: int) -> None:
     n = len(packed)
     for p in range(start, stop):
-        before, after = _find(packed, p, tick - 1, -1), _find(packed, p, tick, 1)
+        before, after = find_spike(packed, p, tick - 1, -1), find_spike(packed, p, tick, 1)
         if before >= 0 and after >= 0:
             length = after - before
         elif after >= 0:
-            following = _find(packed, p, after + 1, 1)
+            following = find_spike(packed, p, after + 1, 1)
             length = n if following < 0 else max(following - after, after + 1)
         elif before >= 0:
-            earlier = _find(packed, p, before - 1, -1)
+            earlier = find_spike(packed, p, before - 1, -1)
             length = n if earlier < 0 else max(before - earlier, n - before)
         image[p] = np.float32(1) / np.float32(length) if before >= 0 or after >= 0 else np.float32(0)
 
