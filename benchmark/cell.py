@@ -60,7 +60,7 @@ class Job:
                 "revision": self.scene.revision,
                 "split": self.scene.split,
                 "protocol": PROTOCOL,
-                "budget": self.budget.scale,
+                "budget": self.budget.label,
                 "device": device_type(self.device),
             }
         )
@@ -105,11 +105,12 @@ def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callab
                 scene=job.scene.id,
                 scene_revision=job.scene.revision,
                 split=job.scene.split,
-                budget=job.budget.scale,
+                budget=job.budget.label,
                 device=job.device,
                 fit_seconds=fit_seconds,
                 render_fps=len(job.scene.targets) / render_seconds,
                 peak_memory_mb=peak_memory_mb(job.device),
+                model_mb=_megabytes(model),
                 environment=environment(job.device),
                 harness=harness(),
                 key=job.key,
@@ -117,6 +118,11 @@ def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callab
             )
         )
     shutil.rmtree(work)
+
+
+def _megabytes(model: Model) -> float | None:
+    size = getattr(model, "size_bytes", None)
+    return None if size is None else int(size) / 1e6
 
 
 def _render(model: Model, camera: Camera, t_us: float, where: str) -> NDArray[np.float32]:

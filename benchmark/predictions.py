@@ -56,11 +56,12 @@ class PredictionInfo:
     scene: str
     scene_revision: str | None = None
     split: str | None = None  # None: the scene's default one
-    budget: float | None = None  # multiple of the published number of steps
+    budget: float | str | None = None  # multiple of the quick budget, or "paper"
     device: str | None = None
     fit_seconds: float | None = None
     render_fps: float | None = None
     peak_memory_mb: float | None = None
+    model_mb: float | None = None  # what the fitted model takes on disk, without code
     environment: dict[str, Any] | None = None
     harness: dict[str, Any] | None = None  # version, commit and dirty flag of the code that fitted
     key: str | None = None  # the runner's content key

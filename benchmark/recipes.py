@@ -38,11 +38,38 @@ class Recipe:
         return {**asdict(self), "settings": dict(self.settings)}
 
 
+SCALES = {"quick": 1.0, "standard": 4.0}  # quick: at most 90 s a fit on two cores, 200x125 pixels, 20 ms
+PAPER = "paper"
+
+
 @dataclass(frozen=True)
 class Budget:
-    """What a fit may spend. `scale` multiplies every recipe's step counts; 1.0 is the published setting."""
+    """What a fit may spend. `scale` multiplies a recipe's step counts; with `published` they are its publication's."""
 
     scale: float = 1.0
+    published: bool = False
+
+    @property
+    def label(self) -> float | str:
+        """How records name it: the scale, or "paper"."""
+        return PAPER if self.published else self.scale
+
+
+def make_budget(text: str) -> Budget:
+    """The budget that a command line names: quick, standard, paper, or a multiple of quick.
+
+    Raises UserError for anything else.
+    """
+    if text == PAPER:
+        return Budget(published=True)
+    try:
+        scale = SCALES[text] if text in SCALES else float(text)
+    except ValueError:
+        scale = 0.0
+    if not 0 < scale < float("inf"):
+        expected = f"{', '.join(SCALES)}, {PAPER}, or a positive number"
+        raise problem("--budget", expected, repr(text), "use quick for a first look")
+    return Budget(scale)
 
 
 class Progress(Protocol):
@@ -54,7 +81,7 @@ class Progress(Protocol):
 
 
 class Model(Protocol):
-    """A fitted scene."""
+    """A fitted scene. An attribute `size_bytes` may be added: what it takes on disk, without code."""
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Gray linear radiance [H, W] float32 (1.0 = white) seen by `camera` at the time `t_us`."""

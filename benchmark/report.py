@@ -27,6 +27,7 @@ _COSTS = {
     "fit_seconds": ("fit\ns", "{:.1f}"),
     "render_fps": ("render\nfps", "{:.1f}"),
     "peak_memory_mb": ("peak\nMB", "{:.0f}"),
+    "model_mb": ("model\nMB", "{:.1f}"),
 }
 
 

@@ -29,7 +29,16 @@ _AGAIN = "score the predictions again"
 
 def missing_cell(status: str, error: str) -> Cell:
     """A cell without values: `status` is failed or skipped, `error` is the reason in one line."""
-    nothing = ("gain_aligned", "predictions_sha256", "fit_seconds", "render_fps", "peak_memory_mb", "budget", "device")
+    nothing = (
+        "gain_aligned",
+        "predictions_sha256",
+        "fit_seconds",
+        "render_fps",
+        "peak_memory_mb",
+        "model_mb",
+        "budget",
+        "device",
+    )
     return {
         "status": status,
         "metrics": dict.fromkeys(METRICS),

@@ -28,11 +28,13 @@ from spike4dgs.benchmark.cell import Job, is_done, run_job
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_text, writing
-from spike4dgs.benchmark.recipes import Budget, Method, find_methods
+from spike4dgs.benchmark.recipes import Budget, Method, find_methods, make_budget
 from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
 from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
+from spike4dgs.benchmark.table_files import write_table
+from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes
 
 
 @dataclass(frozen=True)
@@ -167,13 +169,16 @@ class _ShownCell:
 
 
 def run_benchmark(
-    scenes: Positional[tuple[Path, ...]],
+    scenes: Positional[tuple[Path, ...]] = (),
     *,
+    table: int | None = None,
+    data: Path = Path("data"),
+    profile: str = "small",
     methods: tuple[str, ...] = (),
     out: Path = Path("runs/benchmark"),
     seed: int = 0,
     device: str = "auto",
-    budget: float = 1.0,
+    budget: str = "quick",
     split: str | None = None,
     leaderboard: Path | None = None,
     replace: bool = False,
@@ -183,38 +188,59 @@ def run_benchmark(
 
     Args:
         scenes: Scene folders.
-        methods: Methods by name; all that are installed if left out.
+        table: Instead of scenes, a table of the paper: 1 (outdoor worlds), 2 (objects), 6 (pictures from spikes).
+        data: Folder of the table's scenes.
+        profile: Profile of the table's scenes.
+        methods: Methods by name; all that are installed, or all rows of the table, if left out.
         out: Folder for predictions, results, pictures and logs; for another split than the default, OUT/SPLIT is.
         seed: Seed that every fit gets.
         device: auto, cpu or cuda.
-        budget: Multiple of each method's published number of steps.
+        budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
         split: Training views and held-out views, such as corner or views-3; each scene's default if left out.
         leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
         replace: Replace entries of the same name in that leaderboard.
         allow_gaps: Accept recordings with gaps.
     """
+    if table == IMAGE_TABLE:
+        return _image_table(scenes, data, profile, out)
+    paper = None if table is None else published(table)
+    if paper and scenes:
+        raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
+    scenes = table_scenes(paper, data, profile) if paper else scenes
     known = find_methods()
+    methods = methods or (tuple(m for m in paper.rows if m in known) if paper else ())
     if unknown := [m for m in methods if m not in known]:
         raise problem("--methods", f"names among {', '.join(sorted(known))}", ", ".join(unknown), "correct the names")
     if not known:
         raise problem("--methods", "an installed method", "none", "install a package that registers one")
-    if not budget > 0 or budget == float("inf"):
-        raise problem("--budget", "a positive number", str(budget), "use 1 for the published setting")
     chosen = [known[name] for name in dict.fromkeys(methods or known)]
     opened = open_scenes(scenes, allow_gaps, split)
     if split and not all(s.is_default_split for s in opened):
         out = out / split
-    settings = Settings(out, seed, choose_device(device), Budget(budget))
+    settings = Settings(out, seed, choose_device(device), make_budget(budget))
     console = make_console()
     records = run_matrix(opened, chosen, settings, console)
     console.print(results_table(records))
     write_pictures(opened, records, out)
+    if paper:
+        worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
+        write_table(out, build_table(paper, records, worlds))
+        console.print(f"table {paper.number}: {out}/table.md, .csv, .tex, .json", highlight=False, markup=False)
     console.print(f"pictures: {out}/sheet_*.png and {out}/scatter.png", highlight=False, markup=False)
     refused = _submit(records, scenes, settings, leaderboard, replace)
     failed = [f"{r['method']['name']} on {s}" for r in records for s, c in r["scenes"].items() if c["status"] != "ok"]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed or refused else 0
+
+
+def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path) -> int:
+    """Table 6 compares pictures, not methods: the command `speed images` measures it."""
+    from spike4dgs.benchmark.cli import load
+
+    worlds = [world for number in (1, 2) for world in published(number).worlds]
+    chosen = scenes or tuple(p for world in worlds if (p := data / f"{world}-0-{profile}").is_dir())
+    return int(load("table-6")(chosen, out))
 
 
 def write_pictures(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:

@@ -38,6 +38,7 @@ def score_scene(predictions: Predictions, scene: Scene) -> Cell:
         "fit_seconds": info.fit_seconds,
         "render_fps": info.render_fps,
         "peak_memory_mb": info.peak_memory_mb,
+        "model_mb": info.model_mb,
         "budget": info.budget,
         "device": info.device,
         "fitted_with": {"harness": info.harness, "environment": info.environment},

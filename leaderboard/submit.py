@@ -120,7 +120,7 @@ def _check_same(claimed: Cell, computed: Cell, where: str) -> None:
             if not same_value(claimed["per_image"][name][metric], value, TOLERANCE):
                 found = str(claimed["per_image"][name][metric])
                 raise problem(f"{where}, {name}", f"{metric} = {value} as computed from the files", found, fix)
-    for key in ("fit_seconds", "render_fps", "peak_memory_mb", "budget", "device", "fitted_with"):
+    for key in ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb", "budget", "device", "fitted_with"):
         if claimed[key] != computed[key]:
             raise problem(where, f"{key} {computed[key]} as in prediction.json", str(claimed[key]), fix)
 

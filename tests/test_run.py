@@ -230,7 +230,7 @@ def test_run_benchmark_leaves_results_pictures_and_entries(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget=0.5)
+    code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5")
     assert code == 0
     text = capsys.readouterr().out
     assert "quick+counts" in text and "Results" in text and "verified, rank 1 of" in text
@@ -284,8 +284,9 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
     ("arguments", "message"),
     [
         ({"methods": ("nonsense",)}, "--methods: expected names among bad, counts, quick+counts, found nonsense"),
-        ({"budget": 0.0}, "--budget: expected a positive number, found 0.0"),
-        ({"budget": float("nan")}, "--budget: expected a positive number"),
+        ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, found '0'"),
+        ({"budget": "nan"}, "or a positive number, found 'nan'"),
+        ({"budget": "fast"}, "or a positive number, found 'fast'"),
         ({"device": "tpu"}, "--device: expected auto, cpu or cuda, found 'tpu'"),
         ({"device": "cuda:99"}, "--device: expected a CUDA device of this machine, found 'cuda:99'"),
         ({"scenes": ()}, "scenes: expected at least one scene folder"),
