@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import shared_file
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from iqa_twin import asymmetric, half, leaves, luma, noisy, poster, symmetric
 from iqa_twin import brisque_features as twin_features
@@ -27,7 +27,7 @@ from spike4dgs.benchmark.iqa.natural_scene_statistics import (
 )
 from spike4dgs.benchmark.iqa.parameters import load_parameters
 
-# The authors' MATLAB code on five photographs, and how far ours may be. I08 has six flat squares (2 % of its pixels) and
+# The authors' MATLAB code on five photographs, and how far ours may be. I08 has six flat squares (2 % of its pixels),
 # I19 is flat in 30 % of its pixels: there, MATLAB counts rounding noise by its sign (see the test below).
 MATLAB = {"I03": (94.642, 0.01), "I04": (-0.108, 0.01), "I06": (0.993, 0.01), "I08": (5.358, 0.6), "I19": (72.26, 2.7)}
 IMAGES = {
@@ -124,9 +124,10 @@ def test_sums_are_those_of_the_shifted_products() -> None:
             np.testing.assert_allclose(row, expected, rtol=1e-12)
 
 
-@given(st.floats(0.25, 9), st.floats(0.01, 10), st.floats(0.1, 10))
-def test_fits_recover_a_distribution_from_its_exact_moments(shape: float, left: float, skew: float) -> None:
-    right = left * skew
+@settings(deadline=None)
+@given(st.integers(200, 10000), st.floats(0.01, 10), st.floats(0.1, 10))
+def test_fits_recover_a_distribution_from_its_exact_moments(thousandths: int, left: float, skew: float) -> None:
+    shape, right = thousandths / 1000, left * skew
     share = left / (left + right)  # of the values that are negative
     square, mean_abs = gamma(3 / shape) / gamma(1 / shape), gamma(2 / shape) / gamma(1 / shape)
     count = 1000
@@ -140,13 +141,21 @@ def test_fits_recover_a_distribution_from_its_exact_moments(shape: float, left: 
         ]
     )
     fit = fit_asymmetric(sums, count)
-    assert float(fit.shape) == pytest.approx(shape, abs=0.00051)
+    assert float(fit.shape) == shape
     assert float(fit.left) == pytest.approx(left * math.sqrt(square), rel=1e-9)
     assert float(fit.right) == pytest.approx(right * math.sqrt(square), rel=1e-9)
-    assert float(fit.mean) == pytest.approx((right - left) * mean_abs, rel=0.01, abs=1e-12)
-    np.testing.assert_allclose(fit.scales, (left, right), rtol=0.01)
-    if skew == 1:
-        assert fit_symmetric(sums, count)[0] == pytest.approx(shape, abs=0.00051)
+    assert float(fit.mean) == pytest.approx((right - left) * mean_abs, rel=1e-9, abs=1e-12)
+    np.testing.assert_allclose(fit.scales, (left, right), rtol=1e-9)
+
+
+@settings(deadline=None)
+@given(st.integers(200, 10000), st.floats(0.01, 10))
+def test_symmetric_fits_recover_a_distribution_from_its_exact_moments(thousandths: int, scale: float) -> None:
+    shape = thousandths / 1000
+    variance = scale**2 * gamma(3 / shape) / gamma(1 / shape)
+    sums = np.array([scale * gamma(2 / shape) / gamma(1 / shape), variance / 2, variance / 2, 0.5, 0.5])
+    found = fit_symmetric(1000 * sums, 1000)
+    assert found == (shape, pytest.approx(variance, rel=1e-12))
 
 
 @pytest.mark.parametrize("shape", [0.3, 0.8, 1.0, 2.0, 5.0])
