@@ -154,7 +154,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         raise problem(path, "a mask image", f"damaged data ({e})", "restore it or make the scene again") from None
 
 
-def encode_srgb(image: Float32) -> UInt8:
+def encode_srgb(image: NDArray[np.floating[Any]]) -> UInt8:
     """Linear radiance -> sRGB-encoded 8 bit, clipped to [0, 1]: how linear images are shown to people."""
     x = np.clip(np.nan_to_num(image), 0.0, 1.0)
     encoded = np.where(

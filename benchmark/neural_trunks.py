@@ -1,4 +1,4 @@
-"""Networks of the learned metrics in plain torch: the convolutions of AlexNet, VGG-16 and SqueezeNet 1.1, and ResNet-18.
+"""Networks of the learned metrics in plain torch: convolutions of AlexNet, VGG-16, SqueezeNet 1.1, and ResNet-18.
 
 Layers and parameter names are those of torchvision's models, so that their published state dicts load; torchvision
 itself is not needed (it has no build that works beside every CPU build of torch). Inference only: frozen parameters,
@@ -44,7 +44,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
 
 def load_into(network: nn.Module, state: State, where: str | Path) -> nn.Module:
-    """Load exactly the network's parameters, freeze it, and return it. Raises UserError where names or shapes differ."""
+    """Load the network's parameters, freeze it, and return it. Raises UserError where names or shapes differ."""
     own = network.state_dict()
     # Counters of batch normalisation are not used for inference, and old files lack them.
     wanted = {k: v for k, v in own.items() if not k.endswith("num_batches_tracked")}

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.images import encode_srgb, read_exr
-from spike4dgs.benchmark.metrics import METRICS
+from spike4dgs.benchmark.metrics import METRICS, Metric
 from spike4dgs.benchmark.result import Cell, Record
 from spike4dgs.benchmark.scene import Scene, Target
 
@@ -34,41 +34,51 @@ _COSTS = {
 def make_console() -> Console:
     """A console; where the output is no terminal, one that is wide enough for the table."""
     console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=140)
+    return console if console.is_terminal else Console(highlight=False, width=180)
 
 
 def results_table(records: Sequence[Record]) -> Table:
-    """All records as a table: one block per scene and one for the mean; the best value of a block is bold."""
+    """All records as a table: one block per scene and one for the mean; the best value of a block is bold.
+
+    Metrics that no scene of any record has are left out.
+    """
     splits = ", ".join(sorted({r["dataset"]["split"] for r in records}))
-    table = Table(
-        title=f"Results, split {splits}", caption="higher is better; a dash is a value that does not exist", box=None
-    )
+    cells = [cell for r in records for cell in r["scenes"].values()]
+    metrics = [m for m in METRICS.values() if any(c["metrics"][m.id] is not None for c in cells)]
+    lower = ", ".join(m.id for m in metrics if not m.higher_is_better)
+    caption = f"higher is better{f', except {lower}' if lower else ''}; a dash is a value that does not exist"
+    table = Table(title=f"Results, split {splits}", caption=caption, box=None)
     table.add_column("scene")
     table.add_column("method")
-    for m in METRICS.values():
+    for m in metrics:
         table.add_column(m.id.replace("_", "\n"), justify="right")
     for title, _ in _COSTS.values():
         table.add_column(title, justify="right")
     scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
     for scene in scenes:
-        cells = [(r["method"]["name"], r["scenes"][scene]) for r in records if scene in r["scenes"]]
-        _add_block(table, scene, [(name, cell["metrics"], cell) for name, cell in cells])
+        named = [(r["method"]["name"], r["scenes"][scene]) for r in records if scene in r["scenes"]]
+        _add_block(table, scene, metrics, [(name, cell["metrics"], cell) for name, cell in named])
     if len(scenes) > 1:
-        _add_block(table, "mean", [(r["method"]["name"], r["mean"], {}) for r in records])
+        _add_block(table, "mean", metrics, [(r["method"]["name"], r["mean"], {}) for r in records])
     return table
 
 
-def _add_block(table: Table, title: str, rows: list[tuple[str, dict[str, float | None], Mapping[str, Any]]]) -> None:
+def _add_block(
+    table: Table,
+    title: str,
+    metrics: Sequence[Metric],
+    rows: list[tuple[str, dict[str, float | None], Mapping[str, Any]]],
+) -> None:
     best: dict[str, float] = {}
-    for m in METRICS.values():
-        values = [v for _, metrics, _ in rows if (v := metrics[m.id]) is not None]
-        if values:
-            best[m.id] = max(values) if m.higher_is_better else min(values)
-    for i, (name, metrics, cell) in enumerate(rows):
+    for m in metrics:
+        known = [v for _, values, _ in rows if (v := values[m.id]) is not None]
+        if known:
+            best[m.id] = max(known) if m.higher_is_better else min(known)
+    for i, (name, values, cell) in enumerate(rows):
         texts = []
-        for m in METRICS.values():
-            text = m.format(metrics[m.id])
-            texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and metrics[m.id] == best.get(m.id, "") else text)
+        for m in metrics:
+            text = m.format(values[m.id])
+            texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and values[m.id] == best.get(m.id, "") else text)
         costs = ["" if cell.get(k) is None else form.format(cell[k]) for k, (_, form) in _COSTS.items()]
         status = cell.get("status", "ok")
         shown = escape(name) + (f" [red]({status})[/red]" if status != "ok" else "")
@@ -79,7 +89,8 @@ def cell_summary(cell: Cell) -> str:
     """One line about a cell."""
     if cell["status"] != "ok":
         return f"{cell['status']}: {cell['error']}"
-    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic")]
+    ids = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
+    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ids]
     costs = [("fit", "fit_seconds", "s"), ("render", "render_fps", "images/s"), ("peak", "peak_memory_mb", "MB")]
     shown += [f"{name} {cell[k]:.1f} {unit}" for name, k, unit in costs if cell[k] is not None]
     return ", ".join(shown)

@@ -15,7 +15,8 @@ from typing import Any
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.metrics import METRICS, Values, scene_means
+from spike4dgs.benchmark.measure import Values, scene_means
+from spike4dgs.benchmark.metrics import METRICS
 from spike4dgs.benchmark.predictions import MethodInfo
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -42,6 +43,7 @@ def missing_cell(status: str, error: str) -> Cell:
     return {
         "status": status,
         "metrics": dict.fromkeys(METRICS),
+        "computed": {},
         "notes": {},
         "per_image": {},
         **dict.fromkeys(nothing),
@@ -103,7 +105,8 @@ def check_record(record: Record, where: str | Path) -> None:
         for name, values in (("metrics", cell["metrics"]), *cell["per_image"].items()):
             _check_metric_names(values, f"{where}, scene {scene}, {name}")
         if cell["status"] == "ok":
-            _check_means(cell["metrics"], scene_means(cell["per_image"])[0], f"{where}, scene {scene}")
+            _check_computed(cell, f"{where}, scene {scene}")
+            _check_means(cell["metrics"], scene_means(cell["per_image"]), f"{where}, scene {scene}")
     _check_metric_names(record["mean"], f"{where}, mean")
     _check_means(record["mean"], dataset_means(record["scenes"]), f"{where}, mean")
 
@@ -119,6 +122,24 @@ def _check_metric_names(values: Values, where: str) -> None:
     if set(values) != set(METRICS):
         found = ", ".join(sorted(set(values) ^ set(METRICS)))
         raise problem(where, "exactly the metrics of the table", f"unknown or missing: {found}", _AGAIN)
+
+
+def _check_computed(cell: Cell, where: str) -> None:
+    """Values only of metrics that were computed, and a note for every metric without one."""
+    if unknown := sorted(cell["computed"].keys() - METRICS.keys()):
+        raise problem(where, "computed metrics of the table", ", ".join(unknown), _AGAIN)
+    for metric, sha256 in cell["computed"].items():
+        weights = METRICS[metric].weights
+        if (weights is None) != (sha256 is None) or (weights and weights.sha256 not in (None, sha256)):
+            expected = f"{metric} by {weights.description if weights else 'no weights'}"
+            raise problem(where, expected, f"weights with sha256 {sha256}", _AGAIN)
+    for name, values in cell["per_image"].items():
+        for metric, value in values.items():
+            if value is not None and metric not in cell["computed"]:
+                raise problem(f"{where}, {name}", f"no {metric}, which was not computed", str(value), _AGAIN)
+    for metric, value in cell["metrics"].items():
+        if value is None and metric not in cell["notes"]:
+            raise problem(where, f"a note that says why {metric} is null", "none", _AGAIN)
 
 
 def _check_means(found: Values, expected: Values, where: str) -> None:

@@ -33,6 +33,7 @@ from spike4dgs.benchmark.report import cell_summary, make_console, results_table
 from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
+from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.table_files import write_table
 from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes
 
@@ -45,6 +46,7 @@ class Settings:
     seed: int = 0
     device: str = "cpu"
     budget: Budget = Budget()
+    metrics: tuple[str, ...] = (AUTO,)
 
 
 def predictions_folder(out: Path, method: str, scene: str) -> Path:
@@ -66,20 +68,21 @@ def run_matrix(
         check_method_name(method.name)
     for scene in scenes:
         _check_inputs(scene)
+    selection = select_metrics(settings.metrics)
     records = []
     with _lock(settings.out), _Display(console, len(scenes) * len(methods)) as display:
         for method in methods:
             cells: dict[str, Cell] = {}
             for scene in scenes:
                 job = Job(method, scene, settings.seed, settings.device, settings.budget)
-                cells[scene.id] = _run_cell(job, settings.out, display)
+                cells[scene.id] = _run_cell(job, selection, settings.out, display)
             record = build_record(job.info, scenes, cells, settings.device)
             write_record(settings.out / "results" / f"{method.name}.json", record)
             records.append(record)
     return records
 
 
-def _run_cell(job: Job, out: Path, display: _Display) -> Cell:
+def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> Cell:
     folder = predictions_folder(out, job.method.name, job.scene.id)
     log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
     with display.cell(f"{job.method.name} on {job.scene.id}") as shown:
@@ -88,7 +91,7 @@ def _run_cell(job: Job, out: Path, display: _Display) -> Cell:
                 shown.note("predictions are there: scored from the files")
             else:
                 run_job(job, folder, out / "work" / job.key[:16], shown.progress, shown.note)
-            cell = score_scene(open_for(folder, job.scene), job.scene)
+            cell = score_scene(open_for(folder, job.scene), job.scene, selection)
             log.unlink(missing_ok=True)
         except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
             write_text(log, traceback.format_exc())
@@ -179,6 +182,7 @@ def run_benchmark(
     seed: int = 0,
     device: str = "auto",
     budget: str = "quick",
+    metrics: tuple[str, ...] = (AUTO,),
     split: str | None = None,
     leaderboard: Path | None = None,
     replace: bool = False,
@@ -196,6 +200,8 @@ def run_benchmark(
         seed: Seed that every fit gets.
         device: auto, cpu or cuda.
         budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
+        metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
+            are always computed.
         split: Training views and held-out views, such as corner or views-3; each scene's default if left out.
         leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
         replace: Replace entries of the same name in that leaderboard.
@@ -217,7 +223,7 @@ def run_benchmark(
     opened = open_scenes(scenes, allow_gaps, split)
     if split and not all(s.is_default_split for s in opened):
         out = out / split
-    settings = Settings(out, seed, choose_device(device), make_budget(budget))
+    settings = Settings(out, seed, choose_device(device), make_budget(budget), metrics)
     console = make_console()
     records = run_matrix(opened, chosen, settings, console)
     console.print(results_table(records))

@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.images import Float32
-from spike4dgs.benchmark.metrics import Mask, check_images, fit_gain, measure, scene_means
+from spike4dgs.benchmark.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.measure import fit_gain, measure, scene_means, scene_notes
 from spike4dgs.benchmark.predictions import SUMS, MethodInfo, Predictions, open_predictions
 from spike4dgs.benchmark.report import make_console, results_table
 from spike4dgs.benchmark.result import Cell, Record, build_record, missing_cell, write_record
 from spike4dgs.benchmark.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
 
 
-def score_scene(predictions: Predictions, scene: Scene) -> Cell:
-    """Score predictions against the ground truth of `scene`: one cell of a result record.
+def score_scene(predictions: Predictions, scene: Scene, selection: Selection) -> Cell:
+    """Score predictions against the ground truth of `scene` by the selected metrics: one cell of a result record.
 
     Raises UserError for damaged images on either side.
     """
     info = predictions.info
-    gain = fit_gain((truth, image) for _, truth, image, _ in _images(predictions, scene))
-    per_image = {
-        target.name: measure(truth, image, moving, gain, f"{predictions.root / target.name}.exr")
-        for target, truth, image, moving in _images(predictions, scene)
-    }
-    metrics, notes = scene_means(per_image)
+    gain = fit_gain((pair.truth_radiance, pair.predicted_radiance) for _, pair in _pairs(predictions, scene))
+    measured = {t.name: measure(pair, gain, selection.metrics) for t, pair in _pairs(predictions, scene)}
+    per_image = {name: m.values for name, m in measured.items()}
     return {
         "status": "ok",
-        "metrics": metrics,
-        "notes": notes,
+        "metrics": scene_means(per_image),
+        "computed": dict(selection.weights),
+        "notes": scene_notes(per_image, {name: m.refused for name, m in measured.items()}, selection),
         "per_image": per_image,
         "gain_aligned": gain,
         "predictions_sha256": predictions.sha256,
@@ -63,12 +63,23 @@ def open_for(root: Path, scene: Scene) -> Predictions:
     return predictions
 
 
-def _images(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, Float32, Float32, Mask]]:
-    """(target, truth, prediction, moving), checked; read anew each time, so that no clip is held in memory."""
-    for target in scene.targets:
+def _pairs(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, ImagePair]]:
+    """Targets with their images, checked, each camera's in the order of time.
+
+    Read anew each time, so that no clip is held in memory: a pair knows the one before it, and no more.
+    """
+    earlier: tuple[Target, ImagePair] | None = None
+    for target in sorted(scene.targets, key=lambda t: (t.camera, t.tick)):
         truth, image, moving = scene.ground_truth(target), predictions.read(target), scene.moving(target)
-        check_images(truth, image, moving, f"{predictions.root / target.name}.exr")
-        yield target, truth, image, moving
+        where = f"{predictions.root / target.name}.exr"
+        check_images(truth, image, moving, where)
+        pair = ImagePair(truth, image, moving, where)
+        if earlier and earlier[0].camera == target.camera:
+            since_ms = (scene.t_us(target.tick) - scene.t_us(earlier[0].tick)) / 1000
+            yield target, replace(pair, earlier=earlier[1], since_ms=since_ms)
+        else:
+            yield target, pair
+        earlier = target, pair
 
 
 def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
@@ -81,8 +92,8 @@ def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
     return {s.id: root / s.id for s in scenes}
 
 
-def score_all(root: Path, scenes: Sequence[Scene]) -> Record:
-    """Score one method on several scenes. A scene without a folder counts as skipped.
+def score_all(root: Path, scenes: Sequence[Scene], selection: Selection) -> Record:
+    """Score one method on several scenes by the selected metrics. A scene without a folder counts as skipped.
 
     Raises UserError for bad predictions, and where the folders are of different methods.
     """
@@ -96,7 +107,7 @@ def score_all(root: Path, scenes: Sequence[Scene]) -> Record:
         scene = next(s for s in scenes if s.id == scene_id)
         if folder.is_dir():
             predictions = open_for(folder, scene)
-            cells[scene_id] = score_scene(predictions, scene)
+            cells[scene_id] = score_scene(predictions, scene, selection)
             methods[scene_id] = predictions.info.method
         else:
             cells[scene_id] = missing_cell("skipped", f"no predictions folder {folder.name}")
@@ -127,6 +138,7 @@ def score(
     scenes: Positional[tuple[Path, ...]],
     *,
     out: Path | None = None,
+    metrics: tuple[str, ...] = (AUTO,),
     split: str | None = None,
     allow_gaps: bool = False,
 ) -> int:
@@ -137,10 +149,12 @@ def score(
             holds one predictions folder per scene id.
         scenes: Scene folders.
         out: Write the result record to this file.
+        metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
+            are always computed.
         split: Split of the scenes that the predictions are for; each scene's default one if left out.
         allow_gaps: Accept recordings with gaps.
     """
-    record = score_all(predictions, open_scenes(scenes, allow_gaps, split))
+    record = score_all(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
     make_console().print(results_table([record]))
     if out:
         write_record(out, record)

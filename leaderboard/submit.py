@@ -4,14 +4,15 @@
     LEADERBOARD/entries/METHOD@SPLIT.json   the same on another split than the default one
     LEADERBOARD/leaderboard.json            ranked rows, made from the entries alone
 
-Fit time, speed and memory are taken from prediction.json: they cannot be computed again.
+Fit time, speed and memory are taken from prediction.json: they cannot be computed again. Metrics whose weights this
+machine lacks are kept as claimed, and the entry lists them as unverified.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,11 @@ from spike4dgs.benchmark.result import Cell, Record, check_record, is_complete, 
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.score import open_for, open_scenes, prediction_folders, score_scene
+from spike4dgs.benchmark.selection import select_metrics
 from spike4dgs.benchmark.splits import DEFAULT_SPLIT
 
 ENTRY, BOARD = "spike4dgs-entry/1", "spike4dgs-leaderboard/1"
-TOLERANCE = 1e-6  # dB or SSIM: between machines the last bits of a mean differ
+GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ
 Entry = dict[str, Any]
 
 
@@ -43,8 +45,9 @@ def submit(
 ) -> int:
     """Check a result record and enter it into the leaderboard.
 
-    With predictions and scenes, every hash and every score is computed again and the entry is labelled verified.
-    Without them it is labelled self-reported. Submitting a record twice changes nothing.
+    With predictions and scenes, every hash and every score is computed again and the entry is labelled verified;
+    scores whose weights are not on this machine are listed as unverified. Without predictions and scenes the entry is
+    labelled self-reported. Submitting a record twice changes nothing.
 
     Args:
         result: Result record, as written by score or run-benchmark.
@@ -57,13 +60,16 @@ def submit(
     record = read_record(result)
     opened = open_scenes(scenes, allow_gaps, record["dataset"]["split"]) if scenes else []
     missing = _missing(record, predictions, opened)
+    unverified = {metric for cell in record["scenes"].values() for metric in cell["computed"]}
     if predictions is not None and not missing:
-        verify_record(record, result, predictions, opened)
+        unverified = verify_record(record, result, predictions, opened)
     label = "self-reported" if missing else "verified"
-    entry = _write_entry(leaderboard, record, label, replace)
+    entry = _write_entry(leaderboard, record, label, [m for m in METRICS if m in unverified], replace)
     board = write_leaderboard(leaderboard)
     name = record["method"]["name"]
     why = f" ({missing})" if missing and entry["label"] == label else ""
+    if entry["label"] == "verified" and entry["unverified"]:
+        why = f" (as claimed, for lack of weights: {', '.join(entry['unverified'])})"
     print(f"{name}: {entry['label']}{why}, {_standing(board, record)}")
     return 0
 
@@ -81,8 +87,8 @@ def _missing(record: Record, predictions: Path | None, scenes: Sequence[Scene]) 
     return ""
 
 
-def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequence[Scene]) -> None:
-    """Hash and score the predictions of every scored scene again.
+def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequence[Scene]) -> set[str]:
+    """Hash and score the predictions of every scored scene again. Returns the metrics that could not be computed.
 
     Raises UserError where a scene, a hash, the method or a score differs from the record.
     """
@@ -93,6 +99,7 @@ def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequen
             fix = "give the scene that was scored, or score again"
             raise problem(scene.root, f"scene revision {revision[:16]}...", f"{scene.revision[:16]}...", fix)
     folders = prediction_folders(predictions, used)
+    available, unverified = select_metrics(), set[str]()
     for scene in used:
         cell = record["scenes"][scene.id]
         if cell["status"] != "ok":
@@ -104,20 +111,26 @@ def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequen
         if found.info.method.as_dict() != record["method"]:
             expected = f"predictions of {record['method']['name']} as in the record"
             raise problem(found.root, expected, f"{found.info.method}"[:200], "score the predictions again")
-        _check_same(cell, score_scene(found, scene), f"{where}, scene {scene.id}")
+        computed = score_scene(found, scene, available.among(cell["computed"]))
+        # The same weights, or none: another MetaIQA says nothing about a claim.
+        shared = {m for m, sha256 in computed["computed"].items() if cell["computed"][m] == sha256}
+        _check_same(cell, computed, shared, f"{where}, scene {scene.id}")
+        unverified |= cell["computed"].keys() - shared
+    return unverified
 
 
-def _check_same(claimed: Cell, computed: Cell, where: str) -> None:
+def _check_same(claimed: Cell, computed: Cell, metrics: Collection[str], where: str) -> None:
     fix = "score the predictions again with this version"
     gain = (claimed["gain_aligned"], computed["gain_aligned"])
-    if not same_value(*gain, TOLERANCE * (gain[1] or 1)):
+    if not same_value(*gain, GAIN_TOLERANCE * (gain[1] or 1)):
         raise problem(where, f"gain_aligned {gain[1]}", str(gain[0]), fix)
     if set(claimed["per_image"]) != set(computed["per_image"]):
         found = f"{len(claimed['per_image'])} images"
         raise problem(where, f"scores of the {len(computed['per_image'])} targets", found, fix)
     for name, values in computed["per_image"].items():
-        for metric, value in values.items():
-            if not same_value(claimed["per_image"][name][metric], value, TOLERANCE):
+        for metric in metrics:
+            value = values[metric]
+            if not same_value(claimed["per_image"][name][metric], value, METRICS[metric].tolerance):
                 found = str(claimed["per_image"][name][metric])
                 raise problem(f"{where}, {name}", f"{metric} = {value} as computed from the files", found, fix)
     for key in ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb", "budget", "device", "fitted_with"):
@@ -125,21 +138,26 @@ def _check_same(claimed: Cell, computed: Cell, where: str) -> None:
             raise problem(where, f"{key} {computed[key]} as in prediction.json", str(claimed[key]), fix)
 
 
-def _write_entry(leaderboard: Path, record: Record, label: str, replace: bool) -> Entry:
-    """Write the entry, or keep the one that says the same; a better label is taken over."""
+def _write_entry(leaderboard: Path, record: Record, label: str, unverified: list[str], replace: bool) -> Entry:
+    """Write the entry, or keep the one that says the same; a better label or fewer unverified scores are taken over."""
     path = leaderboard / "entries" / f"{entry_name(record)}.json"
-    entry: Entry = {"schema": ENTRY, "label": label, "submitted": utc_now(), "record": record}
+    checked = {"label": label, "unverified": unverified}
+    entry: Entry = {"schema": ENTRY, **checked, "submitted": utc_now(), "record": record}
     if path.is_file():
         old = read_entry(path)
         if _claim(old["record"]) == _claim(record):
-            if label == old["label"] or label == "self-reported":
+            if _confidence(entry) <= _confidence(old):
                 return old
-            entry = {**old, "label": label}
+            entry = {**old, **checked}
         elif not replace:
             fix = "pass --replace to put the new record in its place"
             raise problem(path, "no entry of this method, or the same record", "another record", fix)
     write_json(path, entry)
     return entry
+
+
+def _confidence(entry: Entry) -> tuple[bool, int]:
+    return entry["label"] == "verified", -len(entry["unverified"])
 
 
 def entry_name(record: Mapping[str, Any]) -> str:
@@ -171,7 +189,7 @@ def write_leaderboard(folder: Path) -> dict[str, Any]:
     for entry in entries:
         contest = {"dataset": entry["record"]["dataset"], "protocol": entry["record"]["protocol"]}
         boards.setdefault(json.dumps(contest, sort_keys=True), []).append(entry)
-    keys = ("id", "title", "definition", "higher_is_better", "implementation", "unit", "digits")
+    keys = ("id", "title", "definition", "higher_is_better", "implementation", "takes", "unit", "digits")
     board = {
         "schema": BOARD,
         "primary": PRIMARY,
@@ -205,6 +223,7 @@ def rank(entries: Sequence[Entry]) -> list[dict[str, Any]]:
                 "rank": None if order(entry)[0] == math.inf else position,
                 "method": record["method"]["name"],
                 "label": entry["label"],
+                "unverified": entry["unverified"],
                 "submitted": entry["submitted"],
                 "entry": f"entries/{entry_name(record)}.json",
                 "mean": record["mean"],

@@ -222,7 +222,8 @@ def entry_of(record: Record, name: str, psnr: float | None, submitted: str) -> R
     record = copy.deepcopy(record)
     record["method"]["name"] = name
     record["mean"][PRIMARY] = psnr
-    return {"schema": "spike4dgs-entry/1", "label": "verified", "submitted": submitted, "record": record}
+    checked = {"label": "verified", "unverified": []}
+    return {"schema": "spike4dgs-entry/1", **checked, "submitted": submitted, "record": record}
 
 
 def test_of_equal_values_the_earlier_submission_is_first(finished: Path) -> None:

@@ -11,9 +11,24 @@ from numpy.typing import NDArray
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics import MAX_PSNR_DB, METRICS, PRIMARY, fit_gain, measure, scene_means
+from spike4dgs.benchmark.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.measure import Values, fit_gain, scene_means, scene_notes
+from spike4dgs.benchmark.measure import measure as measure_pair
+from spike4dgs.benchmark.metrics import MAX_PSNR_DB, METRICS, PRIMARY, Images
+from spike4dgs.benchmark.selection import select_metrics
 
 EVERYWHERE = np.ones((24, 40), bool)
+CHOSEN = select_metrics(("psnr",))  # the metrics of linear images, which need nothing
+
+
+def measure(truth: NDArray, prediction: NDArray, moving: NDArray, gain: float | None, where: str = "x") -> Values:
+    """The values of the linear metrics of one image, after the checks that scoring does."""
+    check_images(truth, prediction, moving, where)
+    return measure_pair(ImagePair(truth, prediction, moving, where), gain, CHOSEN.metrics).values
+
+
+def summary(per_image: dict[str, Values]) -> tuple[Values, dict[str, str]]:
+    return scene_means(per_image), scene_notes(per_image, {}, CHOSEN)
 
 
 def images(seed: int = 0, noise: float = 0.1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -113,9 +128,9 @@ def test_predictions_without_a_positive_gain_have_no_aligned_values(value: float
     prediction = np.full_like(truth, value)
     gain = fit_gain([(truth, prediction)])
     assert gain is None
-    metrics, notes = scene_means({"cam/000001": measure(truth, prediction, EVERYWHERE, gain, "x")})
-    for m in METRICS.values():
-        assert (metrics[m.id] is None) == m.aligned
+    metrics, notes = summary({"cam/000001": measure(truth, prediction, EVERYWHERE, gain, "x")})
+    for m in CHOSEN.metrics:
+        assert (metrics[m.id] is None) == (m.aligned or m.images is Images.LATER)
         assert (notes.get(m.id) == "no positive gain fits the predictions") == m.aligned
 
 
@@ -123,7 +138,7 @@ def test_scene_values_are_means_of_images_and_never_pooled() -> None:
     truth = np.full((24, 40), 0.5)
     per_image = {f"c/{i}": measure(truth, truth + e, EVERYWHERE, 1.0, "x") for i, e in enumerate((0.001, 0.1, 0.3))}
     expected = np.mean([60.0, 20.0, -20 * math.log10(0.3)])
-    assert scene_means(per_image)[0]["psnr"] == pytest.approx(expected, abs=1e-6)
+    assert scene_means(per_image)["psnr"] == pytest.approx(expected, abs=1e-6)
     pooled = -10 * math.log10(np.mean([1e-6, 1e-2, 9e-2]))
     assert abs(pooled - expected) > 10
 
@@ -136,7 +151,7 @@ def test_identical_images_are_capped_and_noted() -> None:
     }
     assert per_image["cam/000001"]["psnr"] == MAX_PSNR_DB == per_image["cam/000001"]["psnr_dynamic"]
     assert per_image["cam/000001"]["ssim"] == pytest.approx(1)
-    metrics, notes = scene_means(per_image)
+    metrics, notes = summary(per_image)
     assert metrics["psnr"] == pytest.approx((MAX_PSNR_DB + per_image["cam/000002"]["psnr"]) / 2)
     assert notes["psnr"] == "1 without any error count as 100 dB, the first cam/000001"
     assert "ssim" not in notes
@@ -147,10 +162,10 @@ def test_an_image_without_motion_has_no_dynamic_value_and_is_noted() -> None:
     still = measure(truth, prediction, ~EVERYWHERE, 1.0, "x")
     assert still["psnr_dynamic"] is None and still["ssim_dynamic_aligned"] is None and still["psnr"] is not None
     moving = measure(truth, prediction, region(), 1.0, "x")
-    metrics, notes = scene_means({"a": still, "b": moving})
+    metrics, notes = summary({"a": still, "b": moving})
     assert metrics["psnr_dynamic"] == moving["psnr_dynamic"]
     assert notes["psnr_dynamic"] == "mean over the 1 of 2 images that have a moving region"
-    metrics, notes = scene_means({"a": still})
+    metrics, notes = summary({"a": still})
     assert metrics["psnr_dynamic"] is None and notes["psnr_dynamic"] == "no image has a moving region"
 
 
@@ -179,13 +194,17 @@ def test_images_below_the_window_are_refused() -> None:
 
 
 def test_the_table_describes_every_metric_once() -> None:
-    assert list(METRICS) == [
+    linear = [
         f"{metric}{region}{aligned}"
         for aligned in ("", "_aligned")
         for region in ("", "_dynamic")
         for metric in ("psnr", "ssim")
     ]
+    shown = ["lpips_alex", "lpips_vgg", "lpips_squeeze", "flip", "brisque", "niqe", "metaiqa"]
+    assert list(METRICS) == [*linear, *shown, "temporal_error"]
+    assert [m.id for m in METRICS.values() if m.takes == "srgb8"] == shown
+    assert {m.id for m in METRICS.values() if m.higher_is_better} == {*linear, "metaiqa"}
     assert PRIMARY in METRICS
     for m in METRICS.values():
-        assert m.title and m.definition and m.implementation and m.higher_is_better
+        assert m.title and m.definition and m.implementation and m.digits > 0 < m.tolerance
     assert METRICS["psnr"].format(21.987) == "21.99" and METRICS["ssim"].format(None) == "-"

@@ -61,6 +61,12 @@ def test_a_record_says_what_ran_on_what(record: Record) -> None:
     for cell in record["scenes"].values():
         assert cell["status"] == "ok" and cell["error"] is None
         assert set(cell["metrics"]) == set(METRICS) and len(cell["per_image"]) == 3
+        assert {"psnr", "flip", "temporal_error"} <= set(cell["computed"]) <= set(METRICS)
+        assert {m for m, v in cell["metrics"].items() if v is None} <= set(cell["notes"])
+        assert (
+            cell["metrics"]["niqe"] is None
+            and "3 of 3 images refused, the first cam_03/000020" in cell["notes"]["niqe"]
+        )
         assert cell["fit_seconds"] > 0 and cell["render_fps"] > 0 and cell["gain_aligned"] > 0
         assert cell["peak_memory_mb"] is None or cell["peak_memory_mb"] > 10
 
@@ -117,7 +123,13 @@ def change(path: str, value: Any) -> Callable[[Record], None]:
         (change("mean/psnr", None), "mean: expected psnr = "),
         (change("mean/lpips", 0.1), "unknown or missing: lpips"),
         (change("scenes/pattern-0/metrics/psnr", 99.0), "scene pattern-0: expected psnr = "),
-        (change("scenes/pattern-0/metrics", {}), "unknown or missing: psnr"),
+        (change("scenes/pattern-0/metrics", {}), "unknown or missing: brisque, flip"),
+        (change("scenes/pattern-0/computed/vmaf", None), "expected computed metrics of the table, found vmaf"),
+        (change("scenes/pattern-0/computed", {}), "which was not computed"),
+        (change("scenes/pattern-0/computed/lpips_alex", "0" * 64), "expected lpips_alex by alexnet-owt-7be5be79.pth"),
+        (change("scenes/pattern-0/computed/flip", "0" * 64), "expected flip by no weights, found weights with sha256"),
+        (change("scenes/pattern-0/computed/metaiqa", None), "expected metaiqa by metaiqa_resnet18.pth"),
+        (change("scenes/pattern-0/notes", {}), "expected a note that says why"),
         (change("scenes/pattern-0/status", "failed"), "at scenes/pattern-0"),
         (change("scenes/pattern-0/status", "perfect"), "at scenes/pattern-0"),
         (change("scenes/pattern-0/per_image", {}), "at scenes/pattern-0/per_image"),
