@@ -109,6 +109,11 @@ SPEED: dict[str, Command] = {
     ),
     "tfi": Command("spike4dgs.baselines.speed:tfi", "pictures from spike intervals, whole stack", "speed tfi"),
     "tfp": Command("spike4dgs.baselines.speed:tfp", "pictures from spike counts, whole stack", "speed tfp"),
+    "images": Command(
+        "spike4dgs.baselines.speed_images:images",
+        "time and quality of each way from spikes to a picture, beside the paper's Table 6",
+        "speed images data/car-0-small data/turntable-0-small",
+    ),
 }
 
 

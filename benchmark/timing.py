@@ -1,12 +1,14 @@
-"""What all speed measurements share: repeated timing, and a table on the console and in a CSV file."""
+"""What all speed measurements share: repeated timing, other packages' files, a table on the console and as CSV."""
 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 
 from spike4dgs.benchmark.files import atomic_path
 
@@ -22,8 +24,33 @@ def time_ms(run: Callable[[], object], repeats: int) -> tuple[float, float]:
     return min(times), statistics.median(times)
 
 
-def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], csv_path: Path | None) -> None:
-    """Print the rows, and write them to `csv_path` if given."""
+def module_of(package: str, file: str) -> ModuleType | None:
+    """The module in one file of a package, whose own `__init__` does not run; None where the package is not installed.
+
+    Raises ImportError where the file is not there, or needs what is not there.
+    """
+    found = importlib.util.find_spec(package)
+    if found is None or not found.submodule_search_locations:
+        return None
+    path = Path(next(iter(found.submodule_search_locations))) / file
+    spec = importlib.util.spec_from_file_location(f"_{package}_{path.stem}", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise ImportError(f"{package} has no {file}")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (ImportError, FileNotFoundError) as e:
+        raise ImportError(f"{package}/{file} cannot be imported: {e}") from e
+    return module
+
+
+def show_table(
+    title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], csv_path: Path | None, notes: Sequence[str] = ()
+) -> None:
+    """Print the rows, and write them to `csv_path` if given.
+
+    `notes`, one a row or none at all, stand below the table, and in the CSV file's last column `note`.
+    """
     from rich.console import Console
     from rich.table import Table
 
@@ -31,6 +58,10 @@ def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*row)
     Console(width=max(Console().width, 120)).print(table)
+    if notes:
+        print("".join(f"{row[0]}: {note}\n" for row, note in zip(rows, notes, strict=True) if note), end="")
+        columns = [*columns, "note"]
+        rows = [[*row, note] for row, note in zip(rows, notes, strict=True)]
     if csv_path is not None:
         with atomic_path(csv_path) as part, open(part, "w", newline="") as f:
             csv.writer(f).writerows([columns, *rows])

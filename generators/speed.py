@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.spikes import UInt8, count_bits, pack
-from spike4dgs.benchmark.timing import show_table, time_ms
+from spike4dgs.benchmark.timing import module_of, show_table, time_ms
 from spike4dgs.generators import sensor as camera
 from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Float32, Int32, Keys, Sensor, random_charge
 from spike4dgs.generators.sensor_kernels import THRESHOLD
@@ -158,17 +157,8 @@ def _spikezoo_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> lis
 
 def _spikezoo() -> Callable[..., Any] | None:
     """spikezoo's simulator, from its one file: importing the package would load its networks."""
-    found = importlib.util.find_spec("spikezoo")
-    if found is None or not found.submodule_search_locations:
-        return None
-    path = Path(next(iter(found.submodule_search_locations))) / "utils/spike_utils.py"
-    spec = importlib.util.spec_from_file_location("_spikezoo_spike_utils", path)
-    if spec is None or spec.loader is None:
-        return None
-    module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
-    except (ImportError, FileNotFoundError) as e:
-        print(f"{path} cannot be imported: {e}")
+        return getattr(module_of("spikezoo", "utils/spike_utils.py"), "video2spike_simulation", None)
+    except ImportError as e:
+        print(e)
         return None
-    return getattr(module, "video2spike_simulation", None)
