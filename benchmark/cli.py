@@ -43,6 +43,11 @@ COMMANDS: dict[str, Command] = {
         "estimate gain and dark maps from flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
+    "train-spk2img": Command(
+        "spike4dgs.baselines.spike_to_image.spk2img.train:train_spk2img",
+        "train the network of the spk2img pictures on training variants of the worlds",
+        "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
+    ),
     "run-benchmark": Command(
         "spike4dgs.benchmark.run:run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
