@@ -60,4 +60,5 @@ def refine(
     first = densify(gaussians, want & ~large, want & large, rng)
     dead_then = first.gaussians.logits.sigmoid() < settings.min_opacity
     second = prune(first.gaussians, ~dead_then)
-    return [Edit(second.gaussians, first.source[second.source])]
+    source = first.source[second.source]
+    return [Edit(second.gaussians, source, int((source < 0).sum()))]

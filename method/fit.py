@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -18,12 +18,13 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Gaussians, from_points
-from spike4dgs.method.motion import Extent, Motion
+from spike4dgs.method.motion import PUBLISHED, Extent, Motion
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Views, render
-from spike4dgs.method.supervision import Supervision
-from spike4dgs.method.trainer import Footage, Trainer, seeded
+from spike4dgs.method.supervision_model import Supervision
+from spike4dgs.method.trainer import Trainer, seeded
 
 Float32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -85,10 +86,11 @@ class FitJob:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A fitting loop and the defaults of its settings."""
+    """A fitting loop, the defaults of its settings, and the step counts of its publication."""
 
     settings: FitSettings
     fit: Callable[[FitJob], Model]
+    published: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,18 @@ class FittedModel:
     duration_us: float
     device: str
 
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the Gaussians and of the motion model."""
+        return count_bytes([*self.gaussians.tensors().values(), *self.motion.state_dict().values()])
+
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
         """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
         t = min(max(t_us / self.duration_us, 0.0), 1.0)
-        splats = self.motion.deform(self.gaussians, t).splats()
-        image = render(splats, Views.from_cameras([camera], device=self.device)).image[0, :, :, 0]
-        return image.clamp(min=0).cpu().numpy()
+        views = Views.from_cameras([camera], device=self.device)
+        image = render(self.motion.splats(self.gaussians, t), views).image
+        return self.motion.picture(image, views)[0].clamp(min=0).cpu().numpy()
 
 
 class RecipeMethod:
@@ -147,7 +154,7 @@ class RecipeMethod:
         """
         check_device(device)
         recipe, parts = self.recipe, self.parts
-        settings = self.settings.scaled(budget.scale)
+        settings = self._for(budget)
         images = _part(parts.images, recipe.images, recipe, "images")
         initialize = _part(parts.initialization, recipe.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe.motion, recipe, "motion")
@@ -156,7 +163,7 @@ class RecipeMethod:
         start = initialize(scene, seed)
         progress(0, 1, "pictures")
         footage = film(scene, start.cameras, images, settings, device)
-        key = sha256_json([scene.revision, self.params, budget.scale, seed])
+        key = sha256_json([scene.revision, self.params, budget.label, seed])
         extent = measure(start, scene)
         job = FitJob(scene, start, footage, extent, settings, device, seed, progress, checkpoint, key)
         return self.algorithm.fit(job)
@@ -168,21 +175,34 @@ class RecipeMethod:
         def fit(job: FitJob) -> FittedModel:
             return fit_gaussians(job, parts.motion[recipe.motion], parts.supervision[recipe.supervision])
 
-        return Algorithm(TrainSettings(), fit)
+        return Algorithm(TrainSettings(), fit, PUBLISHED.get(recipe.motion, {}))
+
+    def _for(self, budget: Budget) -> Any:
+        if not budget.published:
+            return self.settings.scaled(budget.scale)
+        where = f"recipe {self.name}"
+        if not (steps := self.algorithm.published):
+            fix = "choose another budget"
+            raise problem(where, "a publication's step counts for --budget paper", "none", fix)
+        return make_settings(steps, where, self.settings)
 
 
 def fit_gaussians(job: FitJob, make_motion: MotionMaker, supervise: SupervisionMaker) -> FittedModel:
     """Run the trainer on Gaussians that start at the job's points."""
     settings, start = job.settings, job.start
-    motion = make_motion(job.extent, settings, seeded(job.seed, -1))
-    if isinstance(motion, torch.nn.Module):
-        motion.to(job.device)
+    motion = make_motion(job.extent, settings, seeded(job.seed, -1)).to(job.device)
     first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=job.device)
-    supervision = supervise(settings, job.scene)
+    first = motion.attach(first, job.footage)
+    supervision = supervise(settings, job.scene).to(job.device)
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
     gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
     return FittedModel(gaussians, motion, job.scene.duration_us, job.device)
+
+
+def count_bytes(tensors: Iterable[Tensor]) -> int:
+    """What tensors take in a file."""
+    return sum(t.numel() * t.element_size() for t in tensors)
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:

@@ -7,7 +7,8 @@ way of adding and removing Gaussians keeps Adam's moments consistent by one rule
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,32 +21,44 @@ from spike4dgs.method.splat.reference import rotation_matrices
 
 SPLIT_SHRINK = 1.6  # a split Gaussian's two halves are this much smaller (3DGS)
 MAX_COPIES = 51  # the relocation formula's alternating sum is evaluated up to this many copies (MCMC)
+_COMMON = ("means", "log_scales", "quats", "logits", "colors")
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians as raw parameters, which an optimiser may push anywhere: activations make them valid."""
+    """N Gaussians as raw parameters, which an optimiser may push anywhere: activations make them valid.
+
+    `extra` holds what a motion model keeps of every Gaussian, under names of its own; edits treat it as the rest.
+    """
 
     means: Tensor  # [N, 3] m
     log_scales: Tensor  # [N, 3] natural logarithm of the standard deviations in m
     quats: Tensor  # [N, 4] wxyz, any length but 0
     logits: Tensor  # [N] opacity before the sigmoid
     colors: Tensor  # [N, 1] gray linear radiance, 1.0 = white, no activation
+    extra: dict[str, Tensor] = field(default_factory=dict)  # name -> [N, ...]
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """What `tensors` gave."""
+        extra = {k: v for k, v in tensors.items() if k not in _COMMON}
+        return cls(**{k: tensors[k] for k in _COMMON}, extra=extra)
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: getattr(self, name) for name in _COMMON} | self.extra
 
     def rows(self, index: Tensor) -> Gaussians:
         """The Gaussians of `index` (integers or a mask), detached."""
-        return Gaussians(**{k: v.detach()[index] for k, v in self.tensors().items()})
+        return Gaussians.from_tensors({k: v.detach()[index] for k, v in self.tensors().items()})
 
     def trainable(self) -> Gaussians:
         """Detached copies that require gradients."""
-        return Gaussians(**{k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()})
+        leaves = {k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()}
+        return Gaussians.from_tensors(leaves)
 
     def splats(self) -> Splats:
         """Activated values for the renderer."""
@@ -58,11 +71,13 @@ class Edit:
 
     gaussians: Gaussians
     source: Tensor
+    added: int = 0  # how many of the last rows are new
 
 
 def concatenate(parts: list[Gaussians]) -> Gaussians:
-    """Gaussians one after another."""
-    return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
+    """Gaussians one after another; all have the same extra parameters."""
+    tensors = [p.tensors() for p in parts]
+    return Gaussians.from_tensors({name: torch.cat([t[name] for t in tensors]) for name in tensors[0]})
 
 
 def from_points(
@@ -110,11 +125,10 @@ def densify(gaussians: Gaussians, clone: Tensor, split: Tensor, generator: torch
     scales = twice.log_scales.exp()
     noise = torch.randn(scales.shape, generator=generator).to(scales)
     offset = torch.einsum("nij,nj->ni", rotation_matrices(twice.quats), noise * scales)
-    halves = Gaussians(
-        twice.means + offset, twice.log_scales - math.log(SPLIT_SHRINK), twice.quats, twice.logits, twice.colors
-    )
-    source = torch.cat([keep, keep.new_full((len(cloned) + len(halves),), -1)])
-    return Edit(concatenate([gaussians.rows(keep), gaussians.rows(cloned), halves]), source)
+    halves = replace(twice, means=twice.means + offset, log_scales=twice.log_scales - math.log(SPLIT_SHRINK))
+    added = len(cloned) + len(halves)
+    source = torch.cat([keep, keep.new_full((added,), -1)])
+    return Edit(concatenate([gaussians.rows(keep), gaussians.rows(cloned), halves]), source, added)
 
 
 def relocate(gaussians: Gaussians, dead: Tensor, generator: torch.Generator) -> Edit:
@@ -136,8 +150,9 @@ def relocate(gaussians: Gaussians, dead: Tensor, generator: torch.Generator) -> 
     logits, log_scales = torch.logit(opacity), moved.log_scales + shrink.log()[:, None]
     for index in (gone, drawn):
         values.logits[index], values.log_scales[index] = logits, log_scales
-    for name in ("means", "quats", "colors"):
-        getattr(values, name)[gone] = getattr(moved, name)
+    for name, value in values.tensors().items():
+        if name not in ("logits", "log_scales"):
+            value[gone] = moved.tensors()[name]
     source[gone], source[drawn] = -1, -1
     return Edit(values, source)
 

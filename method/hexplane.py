@@ -126,7 +126,7 @@ class HexPlaneMotion(nn.Module):
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """The Gaussians at the time t in [0, 1]."""
         added = self.changes(gaussians.means, t)
-        return Gaussians(**{name: value + added[name] for name, value in gaussians.tensors().items()})
+        return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
 
     def mlp(self) -> list[nn.Parameter]:
         """Parameters of the linear layers."""

@@ -61,6 +61,23 @@ class TrainSettings:
     smooth_weight: float = 1e-3
     sparse_weight: float = 1e-4
 
+    # Spike rendering.
+    spike_ticks: int = 40  # ticks for which a picture is fired, as many as TFP's window has
+    noise_rate: float = 1e-3
+    noise_weight: float = 0.1  # of the noise embedding's mean square
+
+    # Spacetime Gaussians. Published rates in brackets, for 30,000 steps.
+    static_life: float = 4.0  # of the clip: a Gaussian that fades by 1 % towards the clip's ends [1]
+    moving_life: float = 0.3
+    moving_change: float = 0.03  # standard deviation over time, in white, above which pixels count as moving
+    moving_copies: int = 3  # times at which a moving point is laid down
+    guided_rounds: int = 2  # of guided sampling, after the second and the following refinements
+    times_rate: float = 1e-3  # [1e-4]
+    lives_rate: float = 0.03  # [0.03]
+    spins_rate: float = 1e-3  # [1e-4]
+    features_rate: float = 5e-3  # [2.5e-3 and 1e-3]
+    decoder_rate: float = 1e-3  # [1e-4]
+
     def scaled(self, scale: float) -> TrainSettings:
         """The same settings with the step counts multiplied by a budget's scale."""
         return replace(

@@ -18,24 +18,15 @@ from torch import Tensor
 from spike4dgs.benchmark.recipes import Progress
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.density import Pressure, refine
-from spike4dgs.method.gaussians import Gaussians
-from spike4dgs.method.motion import Motion
+from spike4dgs.method.footage import Footage
+from spike4dgs.method.gaussians import Edit, Gaussians
+from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Views, render
-from spike4dgs.method.supervision import Sample, Supervision
+from spike4dgs.method.supervision_model import Sample, Supervision
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
-
-
-@dataclass(frozen=True, eq=False)
-class Footage:
-    """What a fit looks at: pictures of all training views at some times."""
-
-    views: Views
-    ticks: tuple[int, ...]  # ascending
-    pictures: Tensor  # [T, C, H, W] linear radiance
-    n_ticks: int  # length of the clip
 
 
 @dataclass(frozen=True)
@@ -51,8 +42,10 @@ class Stage:
         return (step - self.first) / self.steps
 
 
-def stages(settings: TrainSettings, moves: bool) -> list[Stage]:
-    """The static stage, followed by the deforming one where the motion model moves."""
+def stages(settings: TrainSettings, moves: bool, rests_first: bool = True) -> list[Stage]:
+    """The static stage, followed by the deforming one where the motion model moves; or one that deforms throughout."""
+    if moves and not rests_first:
+        return [Stage(0, settings.coarse_steps + settings.fine_steps, deforms=True)]
     coarse = Stage(0, settings.coarse_steps, deforms=False)
     return [coarse, Stage(coarse.steps, settings.fine_steps, deforms=True)] if moves else [coarse]
 
@@ -108,7 +101,7 @@ class Trainer:
     ) -> None:
         self.footage, self.motion, self.supervision = footage, motion, supervision
         self.settings, self.scale, self.seed = settings, scale, seed
-        self.plan = stages(settings, motion.moves)
+        self.plan = stages(settings, motion.moves, motion.rests_first)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
         self.gaussians = gaussians.trainable()
@@ -122,13 +115,14 @@ class Trainer:
     def _begin(self, stage: Stage) -> None:
         """Start a stage as 4DGS does: a fresh optimiser, and nothing gathered for densification."""
         s = self.settings
-        own = self.motion.groups() if stage.deforms else {}
+        own = {**self.supervision.groups(), **(self.motion.groups() if stage.deforms else {})}
         self.rates = {
             "means": Decay(s.means_rate * self.scale, s.means_rate_last * self.scale),
             "log_scales": Decay(s.scales_rate, s.scales_rate),
             "quats": Decay(s.quats_rate, s.quats_rate),
             "logits": Decay(s.logits_rate, s.logits_rate),
             "colors": Decay(s.colors_rate, s.colors_rate),
+            **self.motion.rates(),
             **{name: rate for name, (_, rate) in own.items()},
         }
         groups = {name: [leaf] for name, leaf in self.gaussians.tensors().items()}
@@ -145,7 +139,7 @@ class Trainer:
             views = order[: self.settings.views_per_step].sort().values
         tick = footage.ticks[index]
         pictures = footage.pictures[index][views]
-        return Sample(tick / footage.n_ticks, tick, tuple(views.tolist()), pictures)
+        return Sample(tick / footage.n_ticks, tick, tuple(views.tolist()), pictures, self.step)
 
     def train_step(self) -> Tensor:
         """One step; returns the loss."""
@@ -157,9 +151,10 @@ class Trainer:
         outputs: list[RenderOutput] = []
 
         def draw(t: float) -> Tensor:
-            moved = self.motion.deform(self.gaussians, t) if stage.deforms else self.gaussians
-            outputs.append(render(moved.splats(), views))
-            return outputs[-1].image[..., 0]
+            splats = self.motion.splats(self.gaussians, t) if stage.deforms else self.gaussians.splats()
+            outputs.append(render(splats, views))
+            image = outputs[-1].image
+            return self.motion.picture(image, views) if stage.deforms else image[..., 0]
 
         set_rates(self.adam, self.rates, stage.fraction(self.step))
         self.adam.zero_grad(set_to_none=True)
@@ -183,7 +178,13 @@ class Trainer:
         limit = round(s.max_per_pixel * width * height)
         rng = seeded(self.seed, self.step)
         for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
-            self.gaussians = apply_edit(self.adam, edit)
+            self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
+        if stage.deforms and 2 <= done // s.refine_every < 2 + s.guided_rounds:
+            before = len(self.gaussians)
+            more = self.motion.guide(self.gaussians, self.footage, rng)
+            index = torch.arange(len(more), device=more.means.device)
+            if len(more) > before:
+                self.gaussians = apply_edit(self.adam, Edit(more, torch.where(index < before, index, -1)))
         self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
 
     def run(
@@ -211,6 +212,7 @@ class Trainer:
         parts = {
             "gaussians": self.gaussians.tensors(),
             "motion": self.motion.state_dict(),
+            "supervision": self.supervision.state_dict(),
             "adam": export_state(self.adam),
             "pressure": {"gradient": self.pressure.gradient, "seen": self.pressure.seen},
         }
@@ -221,8 +223,9 @@ class Trainer:
         device = self.gaussians.means.device
         on = {part: {k: v.to(device) for k, v in saved.part(part).items()} for part in ("gaussians", "pressure")}
         self.step = saved.step
-        self.gaussians = Gaussians(**on["gaussians"]).trainable()
+        self.gaussians = Gaussians.from_tensors(on["gaussians"]).trainable()
         self.motion.load_state_dict(saved.part("motion"))
+        self.supervision.load_state_dict(saved.part("supervision"))
         # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.
         stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
         self._begin(stage)

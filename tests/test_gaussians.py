@@ -108,7 +108,7 @@ def test_pruned_optimiser_goes_on_as_if_the_pruned_had_never_been():
 def test_optimiser_state_survives_export_and_import():
     g, adam = trained(some(5))
     copy, fresh = trained(some(5), steps=0)
-    copy = Gaussians(**{k: v.detach().clone() for k, v in g.tensors().items()}).trainable()
+    copy = g.trainable()
     fresh = make_adam({k: [v] for k, v in copy.tensors().items()}, (0.9, 0.99))
     import_state(fresh, {k: v.clone() for k, v in export_state(adam).items()})
     for leaves, optimiser in ((g, adam), (copy, fresh)):

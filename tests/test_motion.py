@@ -6,13 +6,14 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.method.fit import FittedModel
+from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Gaussians
 from spike4dgs.method.hexplane import plane_tv, time_smoothness, time_sparsity
 from spike4dgs.method.motion import MOTIONS, Extent, HexPlane4DGS
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision import SUPERVISIONS
-from spike4dgs.method.trainer import Footage, Trainer, seeded
+from spike4dgs.method.trainer import Trainer, seeded
 
 WORLD = ToyWorld(width=32, height=20, side=2)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 3.0, 100, 32)

@@ -75,11 +75,16 @@ def test_a_moving_board_is_seen_from_a_new_place():
 
 
 @pytest.mark.slow
+def test_spacetime_gaussians_beat_a_static_scene_where_things_move():
+    assert psnr(fitted("spacetime"), moving=True) > psnr(fitted("static"), moving=True) + 2
+
+
+@pytest.mark.slow
 def test_deformation_beats_a_static_scene_where_things_move():
     assert psnr(fitted("hexplane"), moving=True) > psnr(fitted("static"), moving=True) + 2
 
 
-def trainer(steps: int = 12, **settings: float) -> Trainer:
+def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", **settings: float) -> Trainer:
     scene = WORLD.training
     s = replace(
         TrainSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, mlp_width=16, views_per_step=3),
@@ -90,9 +95,10 @@ def trainer(steps: int = 12, **settings: float) -> Trainer:
     start = surfaces(scene, 0)
     extent = measure(start, scene)
     first = from_points(start.points[::3], start.values[::3], opacity=0.5)
-    motion = MOTIONS["hexplane"](extent, s, seeded(0, -1))
+    model = MOTIONS[motion](extent, s, seeded(0, -1))
     footage = film(scene, start.cameras, pictures, s, "cpu")
-    return Trainer(footage, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
+    loss = SUPERVISIONS[supervision](s, scene)
+    return Trainer(footage, model.attach(first, footage), model, loss, s, scale=extent.scale, seed=3)
 
 
 class Killed(Exception):
@@ -103,17 +109,27 @@ def tensors(t: Trainer) -> dict[str, torch.Tensor]:
     return {k: v.detach().clone() for k, v in t.state().tensors.items()}
 
 
+PARTS_WITH_STATE = {
+    "hexplane": {},
+    "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
+    "spike-render": {"supervision": "spike-render"},  # a loss with parameters
+}
+
+
 @cache
-def uninterrupted() -> dict[str, torch.Tensor]:
-    whole = trainer()
+def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
+    whole = trainer(**PARTS_WITH_STATE[parts])
     whole.run(silent)
     return tensors(whole)
 
 
-@pytest.mark.parametrize("step", range(1, 12))
-def test_killed_at_any_step_and_resumed_gives_the_same_bits(step, tmp_path):
+@pytest.mark.parametrize(
+    ("parts", "step"),
+    [("hexplane", s) for s in range(1, 12)] + [(p, s) for p in ("spacetime", "spike-render") for s in (3, 6, 9)],
+)
+def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path):
     path = tmp_path / "fit.safetensors"
-    first = trainer()
+    first = trainer(**PARTS_WITH_STATE[parts])
     original = first.train_step
 
     def dies() -> torch.Tensor:
@@ -124,11 +140,11 @@ def test_killed_at_any_step_and_resumed_gives_the_same_bits(step, tmp_path):
     first.train_step = dies
     with pytest.raises(Killed):
         first.run(silent, path, "this", checkpoint_s=0)
-    second = trainer()
+    second = trainer(**PARTS_WITH_STATE[parts])
     second.run(silent, path, "this")
     result = tensors(second)
-    assert result.keys() == uninterrupted().keys()
-    for name, value in uninterrupted().items():
+    assert result.keys() == uninterrupted(parts).keys()
+    for name, value in uninterrupted(parts).items():
         assert torch.equal(result[name], value), name
 
 
@@ -171,8 +187,8 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
     [
         ({"images": "none"}, "expected images among short, found 'none'"),
         ({"initialization": "colmap"}, "initialization among true"),
-        ({"motion": "wobble"}, "motion among hexplane, static"),
-        ({"supervision": "spike"}, "supervision among pixel"),
+        ({"motion": "wobble"}, "motion among hexplane, spacetime, spacetime-lite, static"),
+        ({"supervision": "spike"}, "supervision among pixel, spike-render"),
     ],
 )
 def test_unknown_part_is_named(change, message):
@@ -209,6 +225,8 @@ def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
     assert reach[0] < 40 and reach[0] + 15 < reach[1] and reach[1] + 15 < reach[2]
     whole = {choose_time(s, fine, step, 100, True) for step in range(400, 600)}
     assert min(whole) <= 1 and max(whole) >= 98 and len(whole) > 80
+    (throughout,) = stages(s, moves=True, rests_first=False)
+    assert throughout.deforms and throughout.steps == 600
     (only,) = stages(s, moves=False)
     assert len({choose_time(s, only, step, 100, False) for step in range(200)}) > 95
 

@@ -1,0 +1,63 @@
+"""What every motion model gives to the trainer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from spike4dgs.method.footage import Footage
+from spike4dgs.method.gaussians import Edit, Gaussians
+from spike4dgs.method.optimizer import Decay
+from spike4dgs.method.splat import Splats, Views
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """What a motion model may know of a scene before it is fitted."""
+
+    low: Tensor  # [3] m, corners of the box that holds the points, outliers left out
+    high: Tensor  # [3]
+    scale: float  # m, the scene's size as the trainer's learning rates see it
+    n_ticks: int
+    width: int  # px of a view
+
+
+class Motion(nn.Module):
+    """How Gaussians move. A model says where they are at a time; the rest has defaults that cost nothing."""
+
+    moves = True  # False: all times look the same, and only the static stage is trained
+    rests_first = True  # a static stage comes before the moving one
+
+    def splats(self, gaussians: Gaussians, t: float) -> Splats:
+        """What is drawn at t in [0, 1], differentiable in the Gaussians and in the model's own parameters."""
+        raise NotImplementedError
+
+    def picture(self, image: Tensor, views: Views) -> Tensor:
+        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        return image[..., 0]
+
+    def attach(self, gaussians: Gaussians, footage: Footage) -> Gaussians:
+        """The first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
+        return gaussians
+
+    def born(self, edit: Edit, generator: torch.Generator) -> Edit:
+        """The same edit after a change of the Gaussians that densification added."""
+        return edit
+
+    def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
+        """The Gaussians followed by new ones where pictures are bad; asked for `guided_rounds` times in a fit."""
+        return gaussians
+
+    def rates(self) -> dict[str, Decay]:
+        """Learning rates of the parameters in `Gaussians.extra`, by name."""
+        return {}
+
+    def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
+        """The model's own parameters and their learning rates, by group."""
+        return {}
+
+    def regularizer(self) -> Tensor:
+        """What is added to the loss."""
+        return torch.zeros(())

@@ -1,0 +1,58 @@
+"""STG's "Sandwich": three splatted channels and the pixel's ray become gray radiance.
+
+    radiance = albedo + W2 relu(W1 [view feature, time feature, ray origin, ray direction])
+
+without biases. The published decoder works on nine channels, three of each kind for RGB, with W1 [6, 12] and
+W2 [3, 6]; pictures here are gray, so that one channel of each kind is left, W1 is [6, 8] and W2 [1, 6]. No activation
+follows, as in the preset for linear pictures: radiance may exceed 1.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from spike4dgs.method.splat import Views
+
+HIDDEN = 6
+CHANNELS = 3  # albedo, view feature, time feature
+
+
+class Decoder(nn.Module):
+    """The two layers. Ray origins count from `center` [3] in units of `scale` metres."""
+
+    def __init__(self, center: Tensor, scale: float, generator: torch.Generator) -> None:
+        super().__init__()
+        self.scale = scale
+        self.center: Tensor
+        self.register_buffer("center", center.float().clone())
+        first = torch.empty(HIDDEN, CHANNELS - 1 + 6)
+        nn.init.kaiming_uniform_(first, a=5**0.5, generator=generator)  # what torch's convolutions start from
+        self.first = nn.Parameter(first)
+        # Zero: the first pictures are the albedo. The published layer starts at random.
+        self.second = nn.Parameter(torch.zeros(1, HIDDEN))
+
+    def forward(self, channels: Tensor, views: Views) -> Tensor:
+        """Splatted channels [V, H, W, 3] -> gray radiance [V, H, W]."""
+        planes = channels.permute(0, 3, 1, 2).flatten(2)  # [V, 3, H * W], which is how the CPU rasteriser keeps them
+        rays = self._from_rays(views).to(planes.dtype)  # [V, 6, H * W]
+        hidden = torch.baddbmm(rays, self.first[:, :2].expand(len(planes), -1, -1), planes[:, 1:]).relu()
+        gray = planes[:, 0] + (self.second @ hidden)[:, 0]
+        return gray.view(channels.shape[:3])
+
+    def _from_rays(self, views: Views) -> Tensor:
+        """The first layer's sums over ray origin and direction: [V, 6, H * W]."""
+        origin, direction = rays(views)
+        o = (origin.float() - self.center) / self.scale  # [V, 3]
+        by_origin = o @ self.first[:, 2:5].T  # [V, 6]
+        return self.first[:, 5:].expand(len(o), -1, -1) @ direction.float() + by_origin[..., None]
+
+
+def rays(views: Views) -> tuple[Tensor, Tensor]:
+    """Camera centres [V, 3] and unit directions [V, 3, H * W] of the pixels' rays, in world coordinates."""
+    R, t = views.w2c[:, :3, :3], views.w2c[:, :3, 3]
+    down, across = (torch.arange(n, device=R.device) + 0.5 for n in (views.height, views.width))
+    v, u = torch.meshgrid(down, across, indexing="ij")
+    pixels = torch.stack([u, v, torch.ones_like(u)]).flatten(1).to(R)  # [3, H * W]
+    direction = R.mT @ torch.linalg.inv(views.K.to(R)) @ pixels
+    return -(R.mT @ t[..., None])[..., 0], direction / direction.norm(dim=1, keepdim=True)
