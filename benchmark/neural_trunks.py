@@ -33,7 +33,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
         else:
             state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError) as e:
-        raise problem(path, "a file of tensors", f"{type(e).__name__} ({str(e).splitlines()[0][:120]})", fix) from None
+        raise problem(path, "a file of tensors", f"{type(e).__name__} ({str(e)[:120]})", fix) from None
     except Exception as e:  # safetensors has an error class of its own
         if type(e).__module__.startswith("safetensors"):
             raise problem(path, "a file of tensors", str(e)[:120], fix) from None

@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from conftest import write_small_scene
 from dummy_methods import CountMethod, FailingMethod, run
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.metaiqa import metaiqa_network
 from spike4dgs.benchmark.metrics import METRICS, PRIMARY
 from spike4dgs.benchmark.predictions import INFO, SUMS
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.weights import METAIQA, VARIABLE
 from spike4dgs.leaderboard import submit as module
 from spike4dgs.leaderboard.submit import rank, read_entry, submit, write_leaderboard
 
@@ -224,6 +227,59 @@ def entry_of(record: Record, name: str, psnr: float | None, submitted: str) -> R
     record["mean"][PRIMARY] = psnr
     checked = {"label": "verified", "unverified": []}
     return {"schema": "spike4dgs-entry/1", **checked, "submitted": submitted, "record": record}
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine that has weights for MetaIQA (random ones) and nothing else."""
+    torch.manual_seed(0)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    torch.save(metaiqa_network().state_dict(), folder / METAIQA.name)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv(VARIABLE, str(folder))
+    return folder
+
+
+def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
+    done: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
+    monkeypatch.delenv(VARIABLE)
+    entry = read_entry(enter(done, "with", verified=False))
+    assert set(entry["unverified"]) == {*METRICS} - {"lpips_alex", "lpips_vgg", "lpips_squeeze"}
+    entry = read_entry(enter(done, "with"))
+    assert (entry["label"], entry["unverified"]) == ("verified", ["metaiqa"])
+    assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
+    assert "with: verified (as claimed, for lack of weights: metaiqa), rank 1" in capsys.readouterr().out
+    monkeypatch.setenv(VARIABLE, str(weights))
+    path = enter(done, "with")
+    assert read_entry(path)["unverified"] == []
+    before = path.read_bytes()
+    monkeypatch.delenv(VARIABLE)
+    assert enter(done, "with").read_bytes() == before, "what was verified stays so"
+
+
+def better_metaiqa(record: Record) -> None:
+    for cell in record["scenes"].values():
+        for values in cell["per_image"].values():
+            values["metaiqa"] += 0.25
+        cell["metrics"]["metaiqa"] += 0.25
+    record["mean"]["metaiqa"] += 0.25
+
+
+def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done: Path, weights: Path) -> None:
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
+    edit(done / "out/results/with.json", better_metaiqa)
+    with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
+        enter(done, "with")
+    torch.manual_seed(1)
+    torch.save(metaiqa_network().state_dict(), weights / METAIQA.name)
+    assert read_entry(enter(done, "with"))["unverified"] == ["metaiqa"]
+
+
+def test_more_weights_than_the_claimants_do_no_harm(done: Path, weights: Path) -> None:
+    assert read_entry(enter(done))["unverified"] == []
 
 
 def test_of_equal_values_the_earlier_submission_is_first(finished: Path) -> None:
