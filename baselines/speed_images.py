@@ -104,8 +104,9 @@ def images(argv: Sequence[str] = ()) -> int:
     title = f"Pictures from spikes, median ms of {a.repeats}, quality at the held-out cameras of {len(scenes)} scene(s)"
     show_table(title, _columns(scenes), [_texts(r) for r in rows], a.out / "images.csv", [r.note for r in rows])
     if len(scenes) > 1:
-        by_scene = [(r.title, *(_show("psnr", r.quality[s.id]["psnr"]) for s in scenes)) for r in rows if r.quality]
-        columns = ("pictures", *(s.id for s in scenes))
+        scored = [row for row in rows if row.quality]
+        by_scene = [(s.id, *(_show("psnr", row.quality[s.id]["psnr"]) for row in scored)) for s in scenes]
+        columns = ("scene", *(row.title for row in scored))
         show_table("PSNR by scene", columns, by_scene, a.out / "images_by_scene.csv")
     for scene in scenes:
         write_strip(a.out / f"strip_{scene.id}.png", scene, rows)
