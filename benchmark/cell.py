@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.recipes import Budget, Method, Model, Progress
+from spike4dgs.benchmark.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.result import PROTOCOL
 from spike4dgs.benchmark.scene import Scene
 
@@ -48,6 +49,12 @@ class Job:
         m = self.method
         version = getattr(m, "version", None) or harness()["version"]
         return MethodInfo(m.name, version, dict(m.params), self.seed, tuple(getattr(m, "trained_on", ())))
+
+    @property
+    def variants(self) -> tuple[MethodInfo, ...]:
+        """The method as it is, and with refined held-out cameras where it asks for that: one record each."""
+        refined = replace(self.info, name=self.method.name + SUFFIX)
+        return (self.info, refined) if getattr(self.method, "refines_views", False) else (self.info,)
 
     @property
     def key(self) -> str:
@@ -78,10 +85,11 @@ def is_done(job: Job, folder: Path) -> bool:
     return predictions.info.key == job.key
 
 
-def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callable[[str], None]) -> None:
-    """Fit, render and write the predictions to `folder`. `work` holds the checkpoint until the folder is whole.
+def run_job(job: Job, folders: Sequence[Path], work: Path, progress: Progress, note: Callable[[str], None]) -> None:
+    """Fit, render and write the predictions of the job's variants to `folders`.
 
-    Only the fit sees `scene.training`; held-out cameras appear only in the calls to render.
+    `work` holds the checkpoint until the folders are whole. Only the fit sees `scene.training`; held-out cameras
+    appear only in the calls to render, and refined ones are found after the fit.
     """
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
@@ -91,17 +99,29 @@ def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callab
         note(f"resuming after {clock.before:.0f} s of fitting")
     model = job.method.fit(job.scene.training, job.budget, job.device, job.seed, progress, checkpoint)
     fit_seconds = clock.seconds()
+    cameras = job.scene.cameras
+    for method, folder in zip(job.variants, folders, strict=True):
+        if method != job.info:
+            cameras = {**cameras, **refined_cameras(cast(Refinable, model), job.scene)}
+        _predict(job, method, model, cameras, fit_seconds, folder)
+    shutil.rmtree(work)
+
+
+def _predict(
+    job: Job, method: MethodInfo, model: Model, cameras: Mapping[str, Camera], fit_seconds: float, folder: Path
+) -> None:
+    """Render the targets as `cameras` see them into a predictions folder."""
     render_seconds = 0.0
     with PredictionWriter(folder) as writer:
         for target in job.scene.targets:
-            camera, t_us = job.scene.cameras[target.camera], job.scene.t_us(target.tick)
+            camera, t_us = cameras[target.camera], job.scene.t_us(target.tick)
             start = time.perf_counter()
-            image = _render(model, camera, t_us, f"{job.method.name} on {job.scene.id}, {target.name}")
+            image = _render(model, camera, t_us, f"{method.name} on {job.scene.id}, {target.name}")
             render_seconds += time.perf_counter() - start
             writer.add(target, image, t_us)
         writer.finish(
             PredictionInfo(
-                method=job.info,
+                method=method,
                 scene=job.scene.id,
                 scene_revision=job.scene.revision,
                 split=job.scene.split,
@@ -117,7 +137,6 @@ def run_job(job: Job, folder: Path, work: Path, progress: Progress, note: Callab
                 created=utc_now(),
             )
         )
-    shutil.rmtree(work)
 
 
 def _megabytes(model: Model) -> float | None:

@@ -91,8 +91,8 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Two attributes may be added: `version` (the package's if absent; also part of the key), and `trained_on`, the names
-    of the data sets that learned parts have seen.
+    Three attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names
+    of the data sets that learned parts have seen, and `refines_views`: its models have `refine` (see `refinement`).
     """
 
     name: str

@@ -29,6 +29,7 @@ from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_text, writing
 from spike4dgs.benchmark.recipes import Budget, Method, find_methods, make_budget
+from spike4dgs.benchmark.refinement import SUFFIX
 from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
 from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
 from spike4dgs.benchmark.scene import Scene
@@ -36,6 +37,7 @@ from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
 from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.table_files import write_table
 from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes
+from spike4dgs.benchmark.weights import WeightsError
 
 
 @dataclass(frozen=True)
@@ -72,33 +74,36 @@ def run_matrix(
     records = []
     with _lock(settings.out), _Display(console, len(scenes) * len(methods)) as display:
         for method in methods:
-            cells: dict[str, Cell] = {}
-            for scene in scenes:
-                job = Job(method, scene, settings.seed, settings.device, settings.budget)
-                cells[scene.id] = _run_cell(job, selection, settings.out, display)
-            record = build_record(job.info, scenes, cells, settings.device)
-            write_record(settings.out / "results" / f"{method.name}.json", record)
-            records.append(record)
+            jobs = [Job(method, scene, settings.seed, settings.device, settings.budget) for scene in scenes]
+            rows = [_run_cell(job, selection, settings.out, display) for job in jobs]
+            for info, cells in zip(jobs[0].variants, zip(*rows, strict=True), strict=True):
+                by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
+                record = build_record(info, scenes, by_scene, settings.device)
+                write_record(settings.out / "results" / f"{info.name}.json", record)
+                records.append(record)
     return records
 
 
-def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> Cell:
-    folder = predictions_folder(out, job.method.name, job.scene.id)
+def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> list[Cell]:
+    """The cells of the job's variants."""
+    folders = [predictions_folder(out, variant.name, job.scene.id) for variant in job.variants]
     log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
     with display.cell(f"{job.method.name} on {job.scene.id}") as shown:
         try:
-            if is_done(job, folder):
+            if all(is_done(job, folder) for folder in folders):
                 shown.note("predictions are there: scored from the files")
             else:
-                run_job(job, folder, out / "work" / job.key[:16], shown.progress, shown.note)
-            cell = score_scene(open_for(folder, job.scene), job.scene, selection)
+                run_job(job, folders, out / "work" / job.key[:16], shown.progress, shown.note)
+            cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in folders]
             log.unlink(missing_ok=True)
         except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
             write_text(log, traceback.format_exc())
             reason = str(e) if isinstance(e, UserError) else f"{type(e).__name__}: {e}"
-            cell = missing_cell("failed", f"{reason} (see logs/{log.name})"[:2000])
-        shown.note(cell_summary(cell))
-    return cell
+            status = "skipped" if isinstance(e, WeightsError) else "failed"
+            cells = [missing_cell(status, f"{reason} (see logs/{log.name})"[:2000])] * len(folders)
+        for variant, cell in zip(job.variants, cells, strict=True):
+            shown.note(f"{'' if variant == job.info else SUFFIX[1:] + ': '}{cell_summary(cell)}")
+    return cells
 
 
 def _check_inputs(scene: Scene) -> None:
@@ -234,7 +239,8 @@ def run_benchmark(
         console.print(f"table {paper.number}: {out}/table.md, .csv, .tex, .json", highlight=False, markup=False)
     console.print(f"pictures: {out}/sheet_*.png and {out}/scatter.png", highlight=False, markup=False)
     refused = _submit(records, scenes, settings, leaderboard, replace)
-    failed = [f"{r['method']['name']} on {s}" for r in records for s, c in r["scenes"].items() if c["status"] != "ok"]
+    cells = [(f"{r['method']['name']} on {s}", c["status"]) for r in records for s, c in r["scenes"].items()]
+    failed = [name for name, status in cells if status == "failed"]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed or refused else 0
