@@ -60,17 +60,17 @@ def dust3r(scene: TrainingScene, seed: int) -> Start:
 
     Raises WeightsError where the weights are absent, UserError where they are others or a view is not placed.
     """
-    return _start(scene, seed, calibrated=True)
+    return estimate(scene, clip_means(scene), seed, calibrated=True)
 
 
 def dust3r_uncalibrated(scene: TrainingScene, seed: int) -> Start:
     """The same, with intrinsics unknown."""
-    return _start(scene, seed, calibrated=False)
+    return estimate(scene, clip_means(scene), seed, calibrated=False)
 
 
-def _start(scene: TrainingScene, seed: int, *, calibrated: bool) -> Start:
+def estimate(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Start:
+    """Poses and points from one picture of each training view [C, H, W], linear radiance; raises as `dust3r`."""
     network = load_dust3r(find_checkpoint())
-    pictures = clip_means(scene)
     views = [resized(camera, network.shape.patch) for camera in scene.cameras]
     shown = np.stack([_resize(p, v) for p, v in zip(pictures, views, strict=True)])
     return place(predictor(network, shown), views, shown, scene, seed, calibrated=calibrated)

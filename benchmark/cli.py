@@ -83,6 +83,11 @@ COMMANDS: dict[str, Command] = {
         "write a scene's streams as a SpikeCV folder",
         "export-spikecv data/car-0-small --out car-spikecv",
     ),
+    "poses": Command(
+        "spike4dgs.baselines.pose_report:poses",
+        "estimate the training cameras' poses and measure their errors",
+        "poses data/car-0-small data/bricks-0-small --initialization colmap",
+    ),
     "export-nerfstudio": Command(
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
         "write a scene as nerfstudio's D-NeRF data: pictures, poses, times",
@@ -112,6 +117,7 @@ SPEED: dict[str, Command] = {
     "decode": Command(
         "spike4dgs.benchmark.speed_decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
     ),
+    "metrics": Command("spike4dgs.benchmark.speed_metrics:metrics", "every metric for one image", "speed metrics"),
     "tfi": Command("spike4dgs.baselines.speed:tfi", "pictures from spike intervals, whole stack", "speed tfi"),
     "tfp": Command("spike4dgs.baselines.speed:tfp", "pictures from spike counts, whole stack", "speed tfp"),
     "images": Command(

@@ -1,0 +1,155 @@
+"""`poses`: estimate the training cameras' poses of scenes, and measure them against the calibrated ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+from tyro.conf import Positional
+
+from spike4dgs.baselines.colmap import clip_means, map_views
+from spike4dgs.baselines.dust3r import estimate as estimate_dust3r
+from spike4dgs.baselines.rig import rig
+from spike4dgs.baselines.spike_to_image import IMAGES
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.images import Float32
+from spike4dgs.benchmark.poses import pose_errors
+from spike4dgs.benchmark.report import make_console
+from spike4dgs.benchmark.scene import TrainingScene, open_scene
+
+CLIP = "clip"  # the pictures that the initialisations take: means of the whole clip
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Cameras that were placed, and how many points came with them."""
+
+    cameras: Sequence[Camera]
+    points: int
+
+
+def _rig(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = rig(scene, seed)
+    return Estimate(start.cameras, len(start.points))
+
+
+def _colmap(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+    found = map_views(scene, pictures, seed, calibrated=calibrated)
+    return Estimate(found.cameras, len(found.points))
+
+
+def _dust3r(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = estimate_dust3r(scene, pictures, seed, calibrated=calibrated)
+    return Estimate(start.cameras, len(start.points))
+
+
+ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Estimate]] = {
+    "rig": _rig,
+    "colmap": _colmap,
+    "dust3r": _dust3r,
+}
+COLUMNS = {  # key of the row -> heading, format
+    "registered": ("views", "{}"),
+    "points": ("points", "{}"),
+    "rotation_deg": ("rotation deg", "{:.3f}"),
+    "rotation_max_deg": ("max", "{:.3f}"),
+    "translation_m": ("translation m", "{:.4f}"),
+    "translation_of_array": ("of array", "{:.1%}"),
+    "rra_5": ("RRA@5", "{:.2f}"),
+    "rta_5": ("RTA@5", "{:.2f}"),
+    "rta_15": ("RTA@15", "{:.2f}"),
+    "maa_30": ("mAA30", "{:.3f}"),
+    "focal_ratio": ("focal / true", "{:.3f}"),
+    "seconds": ("s", "{:.1f}"),
+}
+
+
+def poses(
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    initialization: tuple[str, ...] = ("colmap",),
+    images: str = CLIP,
+    unknown_intrinsics: bool = False,
+    seed: int = 0,
+    split: str | None = None,
+    out: Path | None = None,
+) -> int:
+    """Estimate the training cameras of scenes and print a table of pose errors.
+
+    Errors are those after the similarity that fits the estimated cameras to the calibrated ones; RRA and RTA are
+    shares of camera pairs. `rig` takes the calibrated poses: its errors are zero, and its points are counted.
+
+    Args:
+        scenes: Scene folders.
+        initialization: What estimates: rig, colmap, dust3r.
+        images: clip (means of the whole clip, what recipes take), or pictures of the clip's middle, such as tfp.
+        unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
+        seed: Seed of everything random.
+        split: Split whose training cameras are taken; each scene's default one if left out.
+        out: Write the rows to this JSON file.
+    """
+    if unknown := [name for name in initialization if name not in ESTIMATORS]:
+        expected = f"names among {', '.join(ESTIMATORS)}"
+        raise problem("--initialization", expected, ", ".join(unknown), "correct the names")
+    if images not in (CLIP, *IMAGES):
+        raise problem("--images", f"one of {', '.join((CLIP, *IMAGES))}", repr(images), "correct the name")
+    rows = []
+    for path in scenes:
+        scene = open_scene(path, split=split).training
+        pictures = _pictures(scene, images)
+        for name in initialization:
+            rows.append(measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics))
+    _print(rows)
+    if out:
+        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "seed": seed}
+        write_json(out, {"settings": settings, "rows": rows})
+    return 0
+
+
+def _pictures(scene: TrainingScene, images: str) -> Float32:
+    """One picture of each training view [C, H, W], linear radiance."""
+    if images == CLIP:
+        return clip_means(scene)
+    return np.concatenate([IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams])
+
+
+def measure_poses(
+    scene: TrainingScene, pictures: Float32, name: str, seed: int, *, calibrated: bool
+) -> dict[str, float | int | str | None]:
+    """One row of the table: what was found, its errors (None where fewer than two views are placed), seconds.
+
+    What an estimator refuses stands in the row's `error`.
+    """
+    row: dict[str, float | int | str | None] = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
+    start = time.perf_counter()
+    try:
+        found = ESTIMATORS[name](scene, pictures, seed, calibrated)
+    except UserError as e:
+        return {**row, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}
+    row["seconds"] = time.perf_counter() - start
+    row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": found.points}
+    if len(found.cameras) < 2:
+        return {**row, "error": "fewer than two views are placed"}
+    true = {camera.id: camera for camera in scene.cameras}
+    partners = [true[camera.id] for camera in found.cameras]
+    ratios = [a.fx / b.fx for a, b in zip(found.cameras, partners, strict=True)]
+    return {**row, **pose_errors(found.cameras, partners).summary(), "focal_ratio": float(np.mean(ratios))}
+
+
+def _print(rows: Sequence[dict[str, float | int | str | None]]) -> None:
+    table = Table("scene", "poses", *(heading for heading, _ in COLUMNS.values()))
+    for row in rows:
+        values = ((row[key], text) for key, (_, text) in COLUMNS.items())
+        shown = ["-" if value is None else text.format(value) for value, text in values]
+        table.add_row(str(row["scene"]), str(row["initialization"]), *shown)
+    console = make_console()
+    console.print(table)
+    for row in rows:
+        if row.get("error"):
+            console.print(f"{row['scene']}, {row['initialization']}: {row['error']}", highlight=False, markup=False)
