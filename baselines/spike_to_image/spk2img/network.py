@@ -44,7 +44,8 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
 
 
 def _leaky(x: Tensor) -> Tensor:
-    return F.leaky_relu(x, 0.1)
+    """LeakyReLU in place: only for what was just computed and is not used otherwise."""
+    return F.leaky_relu_(x, 0.1)
 
 
 class _Residual(nn.Module):
@@ -52,10 +53,12 @@ class _Residual(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.body = nn.Sequential(_conv(width, width), nn.ReLU(), _conv(width, width), nn.ReLU(), _conv(width, width))
+        self.body = nn.Sequential(
+            _conv(width, width), nn.ReLU(inplace=True), _conv(width, width), nn.ReLU(inplace=True), _conv(width, width)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(x + self.body(x))
+        return F.relu_(x + self.body(x))
 
 
 class Extractor(nn.Module):
@@ -64,9 +67,11 @@ class Extractor(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         hidden = max(8, width // 4)  # 16 in the paper
-        self.branches = nn.ModuleList(nn.Sequential(_conv(n, hidden), nn.ReLU(), _conv(hidden, 1)) for n in BRANCHES)
-        self.weigh = nn.Sequential(_conv(4, 8), nn.ReLU(), _conv(8, 4), nn.Sigmoid())
-        self.first = nn.Sequential(_conv(4, width), nn.ReLU())
+        self.branches = nn.ModuleList(
+            nn.Sequential(_conv(n, hidden), nn.ReLU(inplace=True), _conv(hidden, 1)) for n in BRANCHES
+        )
+        self.weigh = nn.Sequential(_conv(4, 8), nn.ReLU(inplace=True), _conv(8, 4), nn.Sigmoid())
+        self.first = nn.Sequential(_conv(4, width), nn.ReLU(inplace=True))
         self.body = nn.Sequential(*(_Residual(width) for _ in range(_RESIDUAL_BLOCKS)))
 
     def forward(self, block: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +120,12 @@ class Alignment(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.down = nn.ModuleList(
-            nn.Sequential(_conv(width, width, stride=2), nn.LeakyReLU(0.1), _conv(width, width), nn.LeakyReLU(0.1))
+            nn.Sequential(
+                _conv(width, width, stride=2),
+                nn.LeakyReLU(0.1, inplace=True),
+                _conv(width, width),
+                nn.LeakyReLU(0.1, inplace=True),
+            )
             for _ in range(_LEVELS - 1)
         )
         self.levels = nn.ModuleList(_Level(width, has_coarser=i < _LEVELS - 1) for i in range(_LEVELS))
@@ -156,7 +166,11 @@ class Spk2ImgNet(nn.Module):
         self.align = Alignment(width)
         self.masks = nn.ModuleList(_mask(width) for _ in range(blocks - 1))
         self.reconstruct = nn.Sequential(
-            _conv(blocks * width, 3 * width), nn.ReLU(), _conv(3 * width, width), nn.ReLU(), _conv(width, 1)
+            _conv(blocks * width, 3 * width),
+            nn.ReLU(inplace=True),
+            _conv(3 * width, width),
+            nn.ReLU(inplace=True),
+            _conv(width, 1),
         )
 
     def forward(self, spikes: Tensor) -> Reconstruction:
