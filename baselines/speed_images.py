@@ -237,7 +237,7 @@ def _columns(scenes: Sequence[Scene]) -> tuple[str, ...]:
 def _texts(row: Row) -> tuple[str, ...]:
     paper = TABLE_6.get(row.name) if row.by == OURS else None
     printed = (paper.column, f"{paper.psnr:.2f}", f"{paper.ssim:.3f}") if paper else ("-", "-", "-")
-    ms = ("-" if v is None else f"{v:.2f}" for v in (row.ms, row.scene_ms))
+    ms = ("-" if v is None else f"{v:.3g}" if v < 100 else f"{v:.0f}" for v in (row.ms, row.scene_ms))
     return (row.title, *ms, *(_show(metric, row.mean(metric)) for metric in QUALITY), *printed)
 
 

@@ -97,7 +97,7 @@ def simulate(argv: Sequence[str] = ()) -> int:
             run.name,
             run.threads,
             f"{ms:.1f}",
-            f"{a.height * a.width * a.ticks / ms / 1e3:.0f}",
+            f"{a.height * a.width * a.ticks / ms / 1e3:.4g}",
             f"{numpy_ms / ms:.3g}",
             f"{zoo_ms / ms:.3g}" if zoo else "-",
             str(off.max()),
