@@ -97,6 +97,6 @@ def along_rays(camera: Views, pixels: Tensor, out: RenderOutput, rng: torch.Gene
     jitter = 1 + JITTER * (2 * torch.rand(2, len(pixels), generator=rng) - 1)
     origin, direction = rays(camera)
     forward = camera.w2c[0, 2, :3]
-    towards = direction[0].T[pixels]  # [P, 3]
+    towards = direction[0].T[pixels].to(forward)  # [P, 3]
     distance = z * jitter.to(z) / (towards @ forward)  # [2, P]
     return (origin + distance[..., None] * towards).reshape(-1, 3).float()

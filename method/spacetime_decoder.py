@@ -45,14 +45,18 @@ class Decoder(nn.Module):
         origin, direction = rays(views)
         o = (origin.float() - self.center) / self.scale  # [V, 3]
         by_origin = o @ self.first[:, 2:5].T  # [V, 6]
-        return self.first[:, 5:].expand(len(o), -1, -1) @ direction.float() + by_origin[..., None]
+        return self.first[:, 5:].expand(len(o), -1, -1) @ direction + by_origin[..., None]
 
 
 def rays(views: Views) -> tuple[Tensor, Tensor]:
-    """Camera centres [V, 3] and unit directions [V, 3, H * W] of the pixels' rays, in world coordinates."""
+    """Camera centres [V, 3] and float32 unit directions [V, 3, H * W] of the pixels' rays, in world coordinates.
+
+    Directions are sums of a row's and a column's vector: a seventh of the time of a product with all pixels in float64.
+    """
     R, t = views.w2c[:, :3, :3], views.w2c[:, :3, 3]
+    back = (R.mT @ torch.linalg.inv(views.K.to(R)))[:, :, None, None]  # [V, 3, 1, 1, 3] pixel to ray
     down, across = (torch.arange(n, device=R.device) + 0.5 for n in (views.height, views.width))
-    v, u = torch.meshgrid(down, across, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)]).flatten(1).to(R)  # [3, H * W]
-    direction = R.mT @ torch.linalg.inv(views.K.to(R)) @ pixels
-    return -(R.mT @ t[..., None])[..., 0], direction / direction.norm(dim=1, keepdim=True)
+    rows = back[..., 1] * down[:, None] + back[..., 2]  # [V, 3, H, 1]
+    direction = rows.float() + (back[..., 0] * across).float()
+    direction = direction * direction.square().sum(1, keepdim=True).rsqrt()
+    return -(R.mT @ t[..., None])[..., 0], direction.flatten(2)
