@@ -133,6 +133,11 @@ def load(name: str) -> Callable[..., Any]:
     return _import(COMMANDS[name])
 
 
+def load_speed(name: str) -> Callable[..., Any]:
+    """The function of a speed command, such as "images"; it takes a list of arguments."""
+    return _import(SPEED[name])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 

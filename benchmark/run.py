@@ -248,11 +248,14 @@ def run_benchmark(
 
 def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path) -> int:
     """Table 6 compares pictures, not methods: the command `speed images` measures it."""
-    from spike4dgs.benchmark.cli import load
+    from spike4dgs.benchmark.cli import load_speed
 
     worlds = [world for number in (1, 2) for world in published(number).worlds]
     chosen = scenes or tuple(p for world in worlds if (p := data / f"{world}-0-{profile}").is_dir())
-    return int(load("table-6")(chosen, out))
+    if not chosen:
+        fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
+        raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
+    return int(load_speed("images")([*map(str, chosen), "--out", str(out)]))
 
 
 def write_pictures(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:

@@ -1,8 +1,10 @@
 """`submit`: check a result record, compute it again from the files where they are at hand, and rank it.
 
-    LEADERBOARD/entries/METHOD.json         one record per method, labelled verified or self-reported
-    LEADERBOARD/entries/METHOD@SPLIT.json   the same on another split than the default one
-    LEADERBOARD/leaderboard.json            ranked rows, made from the entries alone
+    LEADERBOARD/entries/DATASET/METHOD.json         one record per method, labelled verified or self-reported
+    LEADERBOARD/entries/DATASET/METHOD@SPLIT.json   the same on another split than the default one
+    LEADERBOARD/leaderboard.json                    ranked rows, made from the entries alone
+
+DATASET is the ids of the scenes, joined by "+".
 
 Fit time, speed and memory are taken from prediction.json: they cannot be computed again. Metrics whose weights this
 machine lacks are kept as claimed, and the entry lists them as unverified.
@@ -161,9 +163,9 @@ def _confidence(entry: Entry) -> tuple[bool, int]:
 
 
 def entry_name(record: Mapping[str, Any]) -> str:
-    """The file name of a record's entry, without suffix: the method, and the split unless it is the default one."""
+    """Where a record's entry is, without suffix: the dataset, the method, and the split unless it is the default."""
     name, split = str(record["method"]["name"]), record["dataset"]["split"]
-    return name if split == DEFAULT_SPLIT else f"{name}@{split}"
+    return f"{record['dataset']['name']}/{name if split == DEFAULT_SPLIT else f'{name}@{split}'}"
 
 
 def _claim(record: Mapping[str, Any]) -> str:
@@ -177,14 +179,15 @@ def read_entry(path: Path) -> Entry:
     entry = read_json(path, "a leaderboard entry")
     check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), path, "submit the record again")
     check_record(entry["record"], path)
-    if (name := entry_name(entry["record"])) != path.stem:
-        raise problem(path, f"the entry of {path.stem}", name, "rename the file")
+    found = f"{path.parent.name}/{path.stem}"
+    if (name := entry_name(entry["record"])) != found:
+        raise problem(path, f"the entry of {found}", name, "rename the file or its folder")
     return entry
 
 
 def write_leaderboard(folder: Path) -> dict[str, Any]:
     """Make leaderboard.json from the entries: same entries, same bytes. Returns its content."""
-    entries = [read_entry(p) for p in sorted((folder / "entries").glob("*.json"))]
+    entries = [read_entry(p) for p in sorted((folder / "entries").glob("*/*.json"))]
     boards: dict[str, list[Entry]] = {}
     for entry in entries:
         contest = {"dataset": entry["record"]["dataset"], "protocol": entry["record"]["protocol"]}

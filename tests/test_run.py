@@ -237,7 +237,7 @@ def test_run_benchmark_leaves_results_pictures_and_entries(
     for name in ("sheet_pattern-0.png", "scatter.png"):
         with Image.open(out / name) as image:
             assert min(image.size) > 300
-    assert read_entry(out / "leaderboard/entries/quick+counts.json")["label"] == "verified"
+    assert read_entry(out / "leaderboard/entries/pattern-0/quick+counts.json")["label"] == "verified"
     rows = json.loads((out / "leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
     assert [r["rank"] for r in rows] == [1, 2]
     record = json.loads((out / "results/counts.json").read_text())
@@ -276,7 +276,7 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
     assert go(1) == 1
     assert "pass --replace" in capsys.readouterr().err
     assert go(1, replace=True) == 0
-    assert read_entry(tmp_path / "board/entries/quick+counts.json")["record"]["method"]["seed"] == 1
+    assert read_entry(tmp_path / "board/entries/pattern-0/quick+counts.json")["record"]["method"]["seed"] == 1
 
 
 @pytest.mark.usefixtures("installed")

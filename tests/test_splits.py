@@ -250,14 +250,15 @@ def test_splits_never_mix_in_a_leaderboard(scene: Path, tmp_path: Path, capsys: 
     text = capsys.readouterr().out
     assert "counts: verified, rank 1 of 1 on pattern-0\n" in text
     assert "counts: verified, rank 1 of 1 on pattern-0, split corner\n" in text
-    entries = sorted(p.name for p in (tmp_path / "board/entries").iterdir())
-    assert entries == ["counts.json", "counts@corner.json"]
+    names = sorted(p.name for p in (tmp_path / "board/entries/pattern-0").iterdir())
+    assert names == ["counts.json", "counts@corner.json"]
     board = json.loads((tmp_path / "board/leaderboard.json").read_text())["boards"]
     rows = {b["dataset"]["split"]: [row["entry"] for row in b["rows"]] for b in board}
-    assert rows == {"center": ["entries/counts.json"], "corner": ["entries/counts@corner.json"]}
-    (tmp_path / "board/entries/counts@corner.json").rename(tmp_path / "board/entries/counts@views-3.json")
-    with pytest.raises(UserError, match="expected the entry of counts@views-3, found counts@corner"):
-        read_entry(tmp_path / "board/entries/counts@views-3.json")
+    assert rows == {"center": ["entries/pattern-0/counts.json"], "corner": ["entries/pattern-0/counts@corner.json"]}
+    entries = tmp_path / "board/entries/pattern-0"
+    (entries / "counts@corner.json").rename(entries / "counts@views-3.json")
+    with pytest.raises(UserError, match="entry of pattern-0/counts@views-3, found pattern-0/counts@corner"):
+        read_entry(entries / "counts@views-3.json")
 
 
 def test_run_benchmark_keeps_the_splits_apart(
