@@ -19,10 +19,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.rig import rig
@@ -32,6 +32,9 @@ from spike4dgs.benchmark.images import encode_srgb, write_png
 from spike4dgs.benchmark.poses import align_cameras
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.method.fit import Start
+
+if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
+    import pycolmap
 
 Float32 = NDArray[np.float32]
 
@@ -88,6 +91,8 @@ def map_views(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated:
     The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
     nothing can be aligned and the mapping is empty.
     """
+    import pycolmap
+
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
         names = _write_pictures(Path(folder), scene.cameras, pictures)
         database = Path(folder) / "database.db"
@@ -103,13 +108,15 @@ def map_views(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated:
 def _write_pictures(folder: Path, cameras: Sequence[Camera], pictures: Float32) -> list[str]:
     names = [f"{camera.id}.png" for camera in cameras]
     for name, picture in zip(names, pictures, strict=True):
-        image = encode_srgb(picture)
-        write_png(folder / name, cv2.resize(image, None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC))
+        image = cv2.resize(encode_srgb(picture), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
+        write_png(folder / name, np.asarray(image, np.uint8))
     return names
 
 
 def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: bool) -> None:
     """Features and matches of all pairs into the database; all views share one camera."""
+    import pycolmap
+
     reader = pycolmap.ImageReaderOptions()
     size = (camera.width * ENLARGE / 2, camera.height * ENLARGE / 2)
     if calibrated:
@@ -139,6 +146,8 @@ def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: 
 
 
 def _options(seed: int, calibrated: bool) -> pycolmap.GlobalPipelineOptions:
+    import pycolmap
+
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
     options.mapper.num_threads, options.mapper.random_seed = 1, seed
@@ -154,10 +163,12 @@ def _in_scene(
 ) -> Mapping:
     """The model's views and points, moved by the similarity that fits its views to the calibrated ones."""
     images = {i.name: i for i in model.images.values() if i.has_pose}
+    camera = next(iter(model.cameras.values()))  # all views share it
     places = [k for k, name in enumerate(names) if name in images]
     if len(places) < 2:
         return Mapping((), np.zeros((0, 3)), np.zeros(0, np.float32))
-    estimated = [_camera(images[names[k]], cameras[k]) for k in places]
+    K = camera.calibration_matrix() / ENLARGE
+    estimated = [_camera(images[names[k]], K, cameras[k]) for k in places]
     move = align_cameras(estimated, [cameras[k] for k in places])
     view = {images[names[k]].image_id: k for k in places}
     points, values = [], []
@@ -172,9 +183,9 @@ def _in_scene(
     )
 
 
-def _camera(image: pycolmap.Image, like: Camera) -> Camera:
-    """The view as COLMAP places it, with the intrinsics that it used."""
-    K, pose = image.camera.calibration_matrix() / ENLARGE, image.cam_from_world().matrix()
+def _camera(image: pycolmap.Image, K: NDArray[np.float64], like: Camera) -> Camera:
+    """The view as COLMAP places it, with the intrinsics K that it used."""
+    pose = image.cam_from_world().matrix()
     return replace(like, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], R=pose[:, :3], t=pose[:, 3])
 
 
@@ -186,6 +197,8 @@ def _at(picture: Float32, xy: NDArray[np.float64]) -> float:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep COLMAP's log off the terminal; what matters is raised or returned."""
+    import pycolmap
+
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:

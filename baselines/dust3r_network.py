@@ -9,7 +9,7 @@ CC BY-NC-SA 4.0 (no commercial use); they are neither shipped nor downloaded. Th
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -183,6 +183,15 @@ def _double(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
 
 
+class Levels(nn.Module):
+    """The head's layers by level, finest first, with the published names."""
+
+    def __init__(self, widths: Sequence[int], features: int) -> None:
+        super().__init__()
+        self.layer_rn = nn.ModuleList(nn.Conv2d(w, features, 3, padding=1, bias=False) for w in widths)
+        self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(features) for _ in widths)
+
+
 class Dpt(nn.Module):
     """Tokens of four layers -> point and confidence of each pixel, [B, 4, H, W], before the output's exponentials."""
 
@@ -190,7 +199,7 @@ class Dpt(nn.Module):
         super().__init__()
         widths, features = shape.head_widths, shape.head_features
         tokens = (shape.encoder_width, *[shape.decoder_width] * 3)
-        scalers = (
+        scalers: tuple[list[nn.Module], ...] = (
             [nn.ConvTranspose2d(widths[0], widths[0], 4, stride=4)],
             [nn.ConvTranspose2d(widths[1], widths[1], 2, stride=2)],
             [],
@@ -199,10 +208,7 @@ class Dpt(nn.Module):
         self.act_postprocess = nn.ModuleList(
             nn.Sequential(nn.Conv2d(t, w, 1), *scaler) for t, w, scaler in zip(tokens, widths, scalers, strict=True)
         )
-        self.scratch = nn.Module()
-        self.scratch.layer_rn = nn.ModuleList(nn.Conv2d(w, features, 3, padding=1, bias=False) for w in widths)
-        for level in range(1, 5):
-            self.scratch.add_module(f"refinenet{level}", Fusion(features))
+        self.scratch = Levels(widths, features)
         half = features // 2
         self.head = nn.ModuleDict(  # named by place: 1 and 3 have no parameters
             {
@@ -217,9 +223,9 @@ class Dpt(nn.Module):
         maps = [x.transpose(1, 2).unflatten(2, (rows, columns)) for x in layers]
         levels = [post(x) for post, x in zip(self.act_postprocess, maps, strict=True)]
         levels = [conv(x) for conv, x in zip(self.scratch.layer_rn, levels, strict=True)]
-        x = self.scratch.refinenet4(levels[3])[:, :, :rows, :columns]  # odd counts of patches are rounded up
-        for level in (3, 2, 1):
-            x = getattr(self.scratch, f"refinenet{level}")(x, levels[level - 1])
+        fuse = self.scratch
+        x = fuse.refinenet4(levels[3])[:, :, :rows, :columns]  # odd counts of patches are rounded up
+        x = fuse.refinenet1(fuse.refinenet2(fuse.refinenet3(x, levels[2]), levels[1]), levels[0])
         out: Tensor = self.head["4"](functional.relu(self.head["2"](_double(self.head["0"](x)))))
         return out
 
@@ -234,9 +240,10 @@ class Dust3r(nn.Module):
         self.enc_blocks = nn.ModuleList(EncoderBlock(s.encoder_width, s.encoder_heads) for _ in range(s.encoder_layers))
         self.enc_norm = _norm(s.encoder_width)
         self.decoder_embed = nn.Linear(s.encoder_width, s.decoder_width)
-        for name in ("dec_blocks", "dec_blocks2"):
-            blocks = (DecoderBlock(s.decoder_width, s.decoder_heads) for _ in range(s.decoder_layers))
-            self.add_module(name, nn.ModuleList(blocks))
+        self.dec_blocks, self.dec_blocks2 = (
+            nn.ModuleList(DecoderBlock(s.decoder_width, s.decoder_heads) for _ in range(s.decoder_layers))
+            for _ in range(2)
+        )
         self.dec_norm = _norm(s.decoder_width)
         self.downstream_head1, self.downstream_head2 = (nn.ModuleDict({"dpt": Dpt(s)}) for _ in range(2))
 
