@@ -29,7 +29,6 @@ from spike4dgs.generators.render import MultiViewRenderer
 from spike4dgs.generators.tasks import RenderKeys, RenderStills, Stills, cameras_of, held_out_view, plan_of, world_of
 
 _TICKS = 3
-_WHOLE = "whole frames"  # so slow that its error is measured around the first of the ticks alone
 _MORE = 4  # times the samples, of the truth
 
 
@@ -56,7 +55,7 @@ def settings(job: Job) -> dict[str, Job]:
         f"keys 4x sparser: {4 * p.max_key_px:g} px": replace(job, profile=replace(p, max_key_px=4 * p.max_key_px)),
         f"half the samples: {p.spp // 2}": replace(job, profile=replace(p, spp=p.spp // 2)),
         "every tick": replace(job, adaptive=False),
-        _WHOLE: replace(job, whole_frames=True),
+        "whole frames": replace(job, whole_frames=True),
     }
 
 
@@ -95,8 +94,7 @@ def tradeoff(
         spp = changed.profile.spp
         if spp not in stills:
             stills[spp] = RenderStills(changed)(None)
-        n = 1 if name == _WHOLE else _TICKS
-        rows.append(_measure(name, changed, stills[spp], ticks[:n], truth[:n], moving[:n]))
+        rows.append(_measure(name, changed, stills[spp], ticks, truth, moving))
         console.print(f"{name}: {rows[-1].keys_minutes:.1f} min, {rows[-1].mean_percent:.2f} %", markup=False)
         _write(rows, out / f"{world}.csv")  # after every setting: the last ones take longest
         title = f"{world}, {profile}: {p.width}x{p.height}, {p.seconds * 1e3:g} ms, {len(p.views)} views"
@@ -106,14 +104,30 @@ def tradeoff(
 
 
 def needed(plan: KeyPlan, ticks: Sequence[int]) -> list[int]:
-    """The keys that the radiance at these ticks is made of: the coarse ones around them, and all between."""
-    coarse, last = plan.chain[0], plan.ticks[-1]
-    found: set[int] = set()
+    """The keys that the radiance at these ticks is made of (as `KeyStore.radiance` goes through them).
+
+    At least one of every spacing is among them, because its time is wanted.
+    """
+    chain, last = plan.chain, plan.ticks[-1]
+    seen: set[int] = set()
+
+    def read(tick: int) -> None:
+        if tick in seen or not 0 <= tick <= last:
+            return
+        seen.add(tick)
+        finest = tick % chain[-1] == 0
+        if finest and plan.level(tick) == 0:
+            return
+        spacing = chain[plan.level(tick) - 1] if finest else chain[-1]
+        for k in range(-1, 3):
+            read((tick // spacing + k) * spacing)
+
     for tick in ticks:
-        first = tick // coarse * coarse
-        low, high = max(first - coarse, 0), min(first + 2 * coarse, last)
-        found |= set(range(low, high + 1, plan.chain[-1]))
-    return sorted(found)
+        read(tick)
+    keys = {t for t in seen if t % chain[-1] == 0}
+    for level in set(range(len(chain))) - {plan.level(t) for t in keys}:
+        keys.add(next(t for t in plan.ticks if plan.level(t) == level))
+    return sorted(keys)
 
 
 def _truth(job: Job, ticks: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -10,8 +10,10 @@ import pytest
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators import spacing, speed, tradeoff
+from spike4dgs.generators.keyframes import KeyStore
 from spike4dgs.generators.motion import KeyPlan
 from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.render import Still
 
 
 def drifting(n, px_per_tick, height=12, width=40):
@@ -74,11 +76,38 @@ def test_speed_reports_both_sides_and_the_error(tmp_path, capsys):
     assert "numpy" in capsys.readouterr().out
 
 
-def test_tradeoff_renders_the_keys_that_its_ticks_need_and_no_others():
-    plan = KeyPlan(400, 20_000, 0.5, (20, 4))
-    assert tradeoff.needed(plan, [0]) == list(range(0, 41, 4))
-    assert tradeoff.needed(plan, [110, 119]) == list(range(80, 141, 4))
-    assert tradeoff.needed(plan, [399]) == list(range(360, 401, 4))
+@pytest.mark.parametrize("ticks", [[0], [22], [399], [111, 276], [200], [17, 18]])
+def test_tradeoff_renders_the_keys_that_its_ticks_need_and_no_others(ticks, tmp_path):
+    plan, rng = KeyPlan(400, 20_000, 0.5, (20, 4, 2)), np.random.default_rng(0)
+    still = Still(np.ones((1, 3, 8, 3), np.float32), np.ones((1, 3, 8, 3), np.float32))
+    full, part = KeyStore(tmp_path / "full"), KeyStore(tmp_path / "part")
+    keys = tradeoff.needed(plan, ticks)
+    assert {plan.level(t) for t in keys} == {0, 1, 2}, "the time of each spacing is wanted"
+    for store in (full, part):
+        store.folder.mkdir()
+        store.set_still(still)
+    for tick in plan.ticks:
+        mask = rng.random((3, 8)) < (1.0 if plan.level(tick) == 0 else 0.4)
+        arrays = {"given0": np.packbits(mask), "values0": rng.random(int(mask.sum())).astype(np.float32)}
+        full.put(tick, arrays)
+        if tick in keys:
+            part.put(tick, arrays)
+    for tick in ticks:
+        np.testing.assert_array_equal(part.radiance(0, plan, tick), full.radiance(0, plan, tick))
+    needless = 0
+    for key in keys:
+        path = part.folder / f"{key:06d}.npz"
+        path.rename(tmp_path / "aside")
+        try:
+            [part.radiance(0, plan, tick) for tick in ticks]
+            needless += 1
+        except UserError:
+            pass
+        (tmp_path / "aside").rename(path)
+    assert needless <= 2, "but one of each spacing"
+
+
+def test_tradeoff_compares_settings_of_a_known_world():
     job = Job("car", 0, 0, "paper", PROFILES["paper"], 0.1)
     listed = list(tradeoff.settings(job).values())
     assert listed[0] == job and len({repr(j) for j in listed}) >= 4
