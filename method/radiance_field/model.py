@@ -1,0 +1,195 @@
+"""Everything that is learned, and how a ray's two pictures come out of it: hierarchical sampling with skipping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.images import Float32
+from spike4dgs.method.fit import count_bytes
+from spike4dgs.method.hexplane import HexPlaneShape
+from spike4dgs.method.radiance_field.blocks import in_blocks
+from spike4dgs.method.radiance_field.field import Deformation, Field, encode_position
+from spike4dgs.method.radiance_field.march import Rays, camera_rays, resample, spread, weigh
+from spike4dgs.method.radiance_field.occupancy import Occupancy
+from spike4dgs.method.trainer import one_torch_thread
+
+RAYS_AT_ONCE = 2048  # in a render: bounds memory at about 100 MB
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Sizes of the networks and numbers of samples."""
+
+    depth: int
+    width: int
+    coarse_depth: int
+    coarse_width: int
+    position_frequencies: int
+    direction_frequencies: int
+    coarse_samples: int
+    fine_samples: int
+    occupancy_cells: int
+    occupancy_least: float
+    deformation: HexPlaneShape
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Where things are: depths between which rays are sampled, the box of all samples, and the box of the points."""
+
+    near: float  # m along the cameras' axes
+    far: float
+    low: Tensor  # [3] m, the corners of the box of all samples of the training views
+    high: Tensor  # [3]
+    points_low: Tensor  # [3] m, the corners of the box that the deformation's planes lie in
+    points_high: Tensor  # [3]
+    scale: float  # m, the unit of densities (1 / scale) and movements
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """K samples of R rays: row and column in a table [R, n], and where they are in the canonical field."""
+
+    ray: Tensor  # [K] int64
+    column: Tensor  # [K] int64
+    points: Tensor  # [K, 3] in [-1, 1]
+
+    def and_also(self, others: Samples) -> Samples:
+        """These samples and others of the same rays."""
+        pairs = zip((self.ray, self.column, self.points), (others.ray, others.column, others.points), strict=True)
+        return Samples(*(torch.cat(pair) for pair in pairs))
+
+
+class DynamicField(nn.Module):
+    """A coarse and a fine canonical field, one deformation before both, and the grid of what is empty."""
+
+    def __init__(self, shape: FieldShape, bounds: Bounds, brightest: float, generator: torch.Generator) -> None:
+        super().__init__()
+        self.shape, self.bounds = shape, bounds
+        encoding = shape.position_frequencies, shape.direction_frequencies, brightest, generator
+        self.coarse = Field(shape.coarse_depth, shape.coarse_width, *encoding)
+        self.fine = Field(shape.depth, shape.width, *encoding)
+        box = bounds.points_low, bounds.points_high
+        self.deformation = Deformation(shape.deformation, *box, bounds.scale, generator)
+        self.occupancy = Occupancy(bounds.low, bounds.high, shape.occupancy_cells, shape.occupancy_least)
+
+    def parameter_groups(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Parameters of both fields, of the deformation's planes, and of its layers."""
+        fields: list[Tensor] = [*self.coarse.parameters(), *self.fine.parameters()]
+        return fields, list(self.deformation.planes.parameters()), self.deformation.mlp()
+
+    def trace(self, rays: Rays, t: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """The coarse and the fine field's radiance [R] along rays at t in [0, 1].
+
+        Samples are random with a generator, and in the middles of their bins without.
+        """
+        device = rays.origins.device
+        s, view = self.shape, encode_position(_unit(rays.directions), self.shape.direction_frequencies)
+        inner = spread(len(rays), s.coarse_samples - 1, generator).to(device)
+        places = torch.cat([inner, inner.new_ones(len(rays), 1)], 1)  # the last sample is on the opaque far plane
+        samples = self._samples(rays, places, t, 0)
+        density, value = _evaluate(self.coarse, samples, view, s.coarse_samples)
+        weights = weigh(density / self.bounds.scale, self.depth(places), rays.lengths)
+        coarse = (weights * value).sum(-1)
+
+        u = spread(len(rays), s.fine_samples, generator).to(device)
+        more = resample(places, weights.detach(), u)
+        samples = samples.and_also(self._samples(rays, more, t, s.coarse_samples))
+        places, order = torch.cat([places, more], 1).sort(dim=1, stable=True)
+        both = _evaluate(self.fine, samples, view, s.coarse_samples + s.fine_samples)
+        density, value = (x.gather(1, order) for x in both)
+        weights = weigh(density / self.bounds.scale, self.depth(places), rays.lengths)
+        return coarse, (weights * value).sum(-1)
+
+    def depth(self, places: Tensor) -> Tensor:
+        """Depths in metres of places in [0, 1] between the near and the far plane."""
+        return self.bounds.near + (self.bounds.far - self.bounds.near) * places
+
+    def look(self, t: float, share: float, generator: torch.Generator) -> None:
+        """Let the occupancy grid look at a share of its cells at t in [0, 1]."""
+
+        def density(points: Tensor) -> Tensor:
+            return in_blocks(self.fine.density_rows, [self._canonical(points, t)], [])[:, 0] / self.bounds.scale
+
+        self.occupancy.look(density, share, generator)
+
+    def _samples(self, rays: Rays, places: Tensor, t: float, first: int) -> Samples:
+        """The samples at `places` [R, n] that need a network, as columns `first` and following."""
+        points = rays.at(self.depth(places))
+        kept = self.occupancy(points) | (places == 1)  # the far plane is no empty space
+        ray, column = torch.nonzero(kept, as_tuple=True)
+        return Samples(ray, first + column, self._canonical(points[kept], t))
+
+    def _canonical(self, points: Tensor, t: float) -> Tensor:
+        """Canonical points [K, 3] in [-1, 1] of points [K, 3] m at t; where nothing moves they stay."""
+        index = torch.nonzero(self.occupancy.moves(points))[:, 0]
+        moved = points.index_copy(0, index, self.deformation(points[index], t))
+        return 2 * (moved - self.occupancy.low) / (self.occupancy.high - self.occupancy.low) - 1
+
+
+def _unit(directions: Tensor) -> Tensor:
+    return directions / directions.norm(dim=-1, keepdim=True)
+
+
+def _evaluate(field: Field, samples: Samples, view: Tensor, columns: int) -> tuple[Tensor, Tensor]:
+    """Density and value, each [R, columns], of a field at the samples, for encoded views [R, E]; 0 elsewhere."""
+    out = in_blocks(field.rows, [samples.points, view[samples.ray]], list(field.parameters()))  # [K, 2]
+    full = out.new_zeros(len(view), columns, 2).index_put((samples.ray, samples.column), out)
+    return full[..., 0], full[..., 1]
+
+
+def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Tensor, scale: float) -> Bounds:
+    """Near and far from the depths of the points [N, 3] that the cameras see, outliers left out, with a margin.
+
+    0.5 % of the points at either end are left out, as a plane sweep has outliers; the margin is a twentieth of the
+    range. `low`, `high` and `scale` are the extent's.
+    """
+    depths, corners = [], []
+    for camera in cameras:
+        uv, z = camera.project(points.astype(np.float64))
+        depths.append(z[(z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)])
+    a, b = np.quantile(np.concatenate(depths), [0.005, 0.995])
+    near, far = max(a - 0.05 * (b - a), 0.5 * a), b + 0.05 * (b - a) + 1e-3 * scale
+    for camera in cameras:
+        w, h = camera.width, camera.height
+        uv = np.array([[u, v] for u in (0, w) for v in (0, h)], np.float64)
+        corners += [camera.unproject(uv, np.full(4, z)) for z in (near, far)]
+    box = np.concatenate(corners)
+
+    def tensor(a: NDArray[np.float64]) -> Tensor:
+        return torch.as_tensor(a, dtype=torch.float32)
+
+    return Bounds(float(near), float(far), tensor(box.min(0)), tensor(box.max(0)), low, high, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class RadianceModel:
+    """A fitted field as a model: renders a camera at a time."""
+
+    field: DynamicField
+    duration_us: float
+    device: str
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the networks, the planes and the grid."""
+        return count_bytes(self.field.state_dict().values())
+
+    @torch.no_grad()
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        t = min(max(t_us / self.duration_us, 0.0), 1.0)
+        rays = camera_rays(camera, self.device)
+        with one_torch_thread():
+            parts = [
+                self.field.trace(rays[slice(a, a + RAYS_AT_ONCE)], t, None)[1]
+                for a in range(0, len(rays), RAYS_AT_ONCE)
+            ]
+        return torch.cat(parts).view(camera.height, camera.width).cpu().numpy()
