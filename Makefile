@@ -4,13 +4,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 SCENES := data/car-0-small data/turntable-0-small
+METHODS := nearest-view tfp+static tfi+4dgs tfp+4dgs
 
 .PHONY: benchmark test check wheel clean
 
 # The main job: two small scenes, four recipes, table, sheets and leaderboard entries. Killed runs resume.
 benchmark: $(STAMP)
 	$(BIN)/spike4dgs make-dataset car turntable --profile small --out data
-	$(BIN)/spike4dgs run-benchmark $(SCENES) --out runs/small
+	$(BIN)/spike4dgs run-benchmark $(SCENES) --methods $(METHODS) --out runs/small
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

@@ -1,32 +1,59 @@
-"""The recipes of this package: `METHODS` is what the entry point `spike4dgs.methods` names."""
+"""The recipes of this package: `METHODS` is what the entry point `spike4dgs.methods` names.
+
+The rows of the paper's tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf.
+"""
 
 from __future__ import annotations
 
+from itertools import product
+
+from spike4dgs.baselines.colmap import colmap, colmap_uncalibrated
+from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.rig import rig
 from spike4dgs.baselines.spike_to_image import IMAGES
+from spike4dgs.baselines.test_view import PosedRecipe
 from spike4dgs.benchmark.recipes import Method, Recipe
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.radiance_field import RADIANCE_FIELD
 from spike4dgs.method.supervision import SUPERVISIONS
+from spike4dgs.method.tracking import TRACKING
 
-PARTS = Parts(images=IMAGES, initialization={"rig": rig}, motion=MOTIONS, supervision=SUPERVISIONS)
+PARTS = Parts(
+    images=IMAGES,
+    initialization={
+        "rig": rig,
+        "colmap": colmap,
+        "colmap-uncalibrated": colmap_uncalibrated,
+        "dust3r": dust3r,
+        "dust3r-uncalibrated": dust3r_uncalibrated,
+    },
+    motion=MOTIONS,
+    supervision=SUPERVISIONS,
+    algorithms={"tracking": TRACKING, "radiance-field": RADIANCE_FIELD},
+)
+_MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
 
 RECIPES = (
-    Recipe("tfi+4dgs", images="tfi", initialization="rig", motion="hexplane", supervision="pixel"),
-    Recipe("tfp+4dgs", images="tfp", initialization="rig", motion="hexplane", supervision="pixel"),
-    # The floor gets as many steps as the deforming recipes have in all, so that only motion makes the difference.
-    Recipe(
-        "tfp+static",
-        images="tfp",
-        initialization="rig",
-        motion="static",
-        supervision="pixel",
-        settings={"coarse_steps": 1500},
+    *(
+        Recipe(f"{images}+{name}", images, "rig", motion, "pixel")
+        for (name, motion), images in product(_MOTIONS.items(), ("tfi", "tfp", "spk2img"))
     ),
+    Recipe("dy-spikegs", "tfp", "rig", "hexplane", "spike-render"),
+    Recipe("dy-spikenerf", "tfp", "rig", "radiance-field", "spike"),
+    # The floor gets as many steps as the deforming recipes have in all, so that only motion makes the difference.
+    Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
+)
+
+# The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one.
+POSED = (
+    Recipe("tfp+colmap+4dgs", "tfp", "colmap", "hexplane", "pixel"),
+    Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
 )
 
 METHODS: dict[str, Method] = {
     **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in RECIPES},
+    **{recipe.name: PosedRecipe(recipe, PARTS) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

@@ -86,11 +86,15 @@ class FitJob:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A fitting loop, the defaults of its settings, and the step counts of its publication."""
+    """A fitting loop, the defaults of its settings, the step counts of its publication, and what it compares.
+
+    `supervisions` names what the loop itself implements; empty for the trainer, which takes any of the table.
+    """
 
     settings: FitSettings
     fit: Callable[[FitJob], Model]
     published: Mapping[str, int] = field(default_factory=dict)
+    supervisions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -138,6 +142,9 @@ class RecipeMethod:
         self.algorithm = parts.algorithms.get(recipe.motion) or self._trainer()
         self.settings = make_settings(recipe.settings, f"recipe {recipe.name}", self.algorithm.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": asdict(self.settings)}  # type: ignore[call-overload]
+        self.trained_on: tuple[str, ...] = ()
+        if learned := getattr(parts.images.get(recipe.images), "learned", lambda: None)():
+            self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
 
     def fit(
         self,
@@ -158,7 +165,8 @@ class RecipeMethod:
         images = _part(parts.images, recipe.images, recipe, "images")
         initialize = _part(parts.initialization, recipe.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe.motion, recipe, "motion")
-        _part(parts.supervision, recipe.supervision, recipe, "supervision")
+        own = dict.fromkeys(self.algorithm.supervisions)
+        _part(own or parts.supervision, recipe.supervision, recipe, "supervision")
         progress(0, 1, "initialisation")
         start = initialize(scene, seed)
         progress(0, 1, "pictures")

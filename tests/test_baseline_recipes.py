@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spike4dgs.baselines.recipes import METHODS, PARTS, RECIPES
+from spike4dgs.baselines.recipes import METHODS, PARTS, POSED, RECIPES
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.recipes import Budget, Recipe, find_methods, get_method
 from spike4dgs.benchmark.scene import Scene, TrainingScene, open_scene
+from spike4dgs.benchmark.tables import published
 from spike4dgs.method.fit import RecipeMethod
 
 TINY = Budget(scale=0.01)
-NAMES = ["nearest-view", "tfi+4dgs", "tfp+4dgs", "tfp+static"]
+# One of each kind of fit that needs no weights and no features in the pictures.
+FITTED = ["nearest-view", "tfp+static", "tfi+4dgs", "tfp+stg", "tfp+d3dgs", "dy-spikegs", "dy-spikenerf"]
+EXTRA = ["nearest-view", "tfp+colmap+4dgs", "tfp+dust3r+4dgs", "tfp+static"]  # beside the rows of the paper's tables
 
 
 def quiet(done: int, total: int, note: str = "") -> None:
@@ -28,19 +31,30 @@ def scene(small_scene: Path) -> Scene:
     return open_scene(small_scene)
 
 
-def test_the_four_methods_have_the_names_that_results_are_compared_by() -> None:
-    assert sorted(METHODS) == NAMES
+def test_every_row_of_the_papers_tables_is_a_method() -> None:
     assert all(method.name == name for name, method in METHODS.items())
-    assert [r.name for r in RECIPES] == ["tfi+4dgs", "tfp+4dgs", "tfp+static"]
+    for number in (1, 2):
+        assert set(published(number).rows) - {"spike4dgs"} == set(METHODS) - set(EXTRA)
+
+
+@pytest.mark.parametrize("recipe", [*RECIPES, *POSED], ids=lambda r: r.name)
+def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
+    images, motions = recipe.name.split("+")[0], {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
+    if not recipe.name.startswith("dy-"):
+        assert recipe.images == images
+        assert recipe.motion == motions.get(recipe.name.split("+")[-1], "static")
+    assert recipe.initialization == (recipe.name.split("+")[1] if recipe in POSED else "rig")
+    assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
+    assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
 
 
 def test_the_entry_point_finds_them() -> None:
     found = find_methods()
-    assert all(found[name] is METHODS[name] for name in NAMES)
+    assert all(found[name] is METHODS[name] for name in METHODS)
     assert get_method("tfp+static") is METHODS["tfp+static"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", METHODS)
 def test_params_survive_json(name: str) -> None:
     params = METHODS[name].params
     assert json.loads(json.dumps(params, allow_nan=False)) == params
@@ -49,13 +63,13 @@ def test_params_survive_json(name: str) -> None:
 
 def test_params_tell_recipes_and_settings_apart() -> None:
     texts = {json.dumps(m.params, sort_keys=True) for m in METHODS.values()}
-    changed = RecipeMethod(dataclasses.replace(RECIPES[0], settings={"levels": 1}), PARTS)
+    changed = RecipeMethod(dataclasses.replace(METHODS["tfi+4dgs"].recipe, settings={"levels": 1}), PARTS)
     texts.add(json.dumps(changed.params, sort_keys=True))
-    assert len(texts) == 5
+    assert len(texts) == len(METHODS) + 1
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_each_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
+@pytest.mark.parametrize("name", FITTED)
+def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
     reports: list[tuple[int, int]] = []
     model = METHODS[name].fit(
         scene.training, TINY, "cpu", 0, lambda done, total, note="": reports.append((done, total))
@@ -137,8 +151,17 @@ def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path
 
 
 def test_recipes_that_are_compared_differ_in_one_part() -> None:
-    tfi, tfp, static = (r.as_dict() for r in RECIPES)
-    assert [k for k in tfi if tfi[k] != tfp[k]] == ["name", "images"]
-    assert [k for k in tfp if tfp[k] != static[k]] == ["name", "motion", "settings"]
-    steps = METHODS["tfp+4dgs"].params["settings"]
-    assert static["settings"] == {"coarse_steps": steps["coarse_steps"] + steps["fine_steps"]}
+    recipes = {r.name: r.as_dict() for r in (*RECIPES, *POSED)}
+
+    def differ(a: str, b: str) -> set[str]:
+        return {k for k in recipes[a] if recipes[a][k] != recipes[b][k]} - {"name"}
+
+    for motion in ("d3dgs", "stg", "4dgs"):
+        assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"} == differ(f"tfi+{motion}", f"spk2img+{motion}")
+    for images in ("tfi", "tfp", "spk2img"):
+        assert differ(f"{images}+d3dgs", f"{images}+4dgs") == {"motion"} == differ(f"{images}+stg", f"{images}+4dgs")
+    assert differ("tfp+4dgs", "dy-spikegs") == {"supervision"}
+    assert differ("tfp+4dgs", "tfp+colmap+4dgs") == {"initialization"} == differ("tfp+4dgs", "tfp+dust3r+4dgs")
+    assert differ("tfp+4dgs", "tfp+static") == {"motion", "settings"}
+    static, moving = (METHODS[name].settings for name in ("tfp+static", "tfp+4dgs"))
+    assert static.coarse_steps == moving.coarse_steps + moving.fine_steps, "the floor has as many steps"

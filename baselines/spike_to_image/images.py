@@ -15,8 +15,18 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
+class Learned:
+    """What a trained part has in it: runs with other weights are other methods."""
+
+    sha256: str  # of the weight file
+    trained_on: tuple[str, ...]  # data sets, such as scenes as ID@REVISION
+
+
+@dataclass(frozen=True)
 class ImageMaker:
     """A named way from spikes to pictures. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
+
+    `learned` tells of the weights in use; None where nothing is learned or no weights are there.
 
     >>> IMAGES["tfp"](stream, ticks=[100, 200], gain=0.6).shape  # doctest: +SKIP
     (2, 250, 400)
@@ -26,6 +36,7 @@ class ImageMaker:
     definition: str
     source: str
     rate: Callable[[SpikeStream, int], Float32]
+    learned: Callable[[], Learned | None] = lambda: None
 
     def __call__(self, stream: SpikeStream, ticks: Sequence[int], gain: float) -> Float32:
         """Linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`; `gain`: spikes per tick of white.
