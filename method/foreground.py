@@ -69,10 +69,25 @@ def foreground_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
 
     Something static behind a moving thing lies in its mask from some places only, where the array is wide enough.
     """
+    hits, seen = _votes(points, views, masks)
+    return (seen > 0) & (hits > MOST_VIEWS * seen)
+
+
+def stray_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
+    """Which points [N, 3] m are in some pictures, but not in the masks of most of them: bool [N].
+
+    Nothing moves there. What has left all pictures is not astray.
+    """
+    hits, seen = _votes(points, views, masks)
+    return (seen > 0) & (hits <= MOST_VIEWS * seen)
+
+
+def _votes(points: Tensor, views: Views, masks: Tensor) -> tuple[Tensor, Tensor]:
+    """In how many masks, and in how many pictures, each point is: ([N], [N])."""
     inside, uv = _in_picture(points, views)
     x, y = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)  # [C, N]
     hit = masks[torch.arange(len(views), device=masks.device)[:, None], y, x] & inside
-    return (hit.sum(0) > MOST_VIEWS * inside.sum(0)) & inside.any(0)
+    return hit.sum(0), inside.sum(0)
 
 
 def _in_picture(points: Tensor, views: Views) -> tuple[Tensor, Tensor]:

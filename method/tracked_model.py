@@ -48,8 +48,8 @@ class Tracks:
 
     def put(self, index: int, values: dict[str, Tensor]) -> None:
         """Set the values at one of the times."""
-        self.means[index], self.colors[index] = values["means"].detach(), values["colors"].detach()
-        self.quats[index] = torch.nn.functional.normalize(values["quats"].detach(), dim=-1)
+        self.means[index], self.colors[index] = values["means"], values["colors"]
+        self.quats[index] = torch.nn.functional.normalize(values["quats"], dim=-1)
 
     def between(self, t_us: float) -> dict[str, Tensor]:
         """Values at any time: places and rotations linearly between the times and beyond them, colours between them.

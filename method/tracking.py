@@ -15,6 +15,8 @@ What differs from the publication, and why:
   term only forbids moving Gaussians to be seen where nothing ever moves.
 - Gaussians of the background stand still, the limit of an infinite background weight, and only the part of the
   pictures in which something moves is rendered again. `freeze_background` False gives the published soft term.
+- A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
+  stays where it was at the time before.
 - Lengths are relative to the Gaussians' spacing (`tracking_losses`), learning rates fall within each time.
 - No exposure per camera (the array is calibrated), and no term for a floor (not every scene has one).
 """
@@ -30,7 +32,7 @@ from torch import Tensor
 
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
-from spike4dgs.method.foreground import foreground_masks, foreground_points, moving_window
+from spike4dgs.method.foreground import foreground_masks, foreground_points, moving_window, stray_points
 from spike4dgs.method.gaussians import Gaussians, from_points
 from spike4dgs.method.motion import MOTIONS
 from spike4dgs.method.optimizer import Decay, make_adam, set_rates
@@ -86,7 +88,8 @@ class TrackingSettings:
     means_rate: float = 1.2e-3  # x scene scale (1.6e-4 in 2,000 steps)
     means_rate_last: float = 4e-5
     quats_rate: float = 2e-3  # (1e-3)
-    colors_rate: float = 2.5e-3  # as published
+    colors_rate: float = 2.5e-3  # as published; slower, colours follow wheels and highlights too late
+    colors_rate_last: float = 5e-4
     beta1: float = 0.9
     beta2: float = 0.99  # (0.999, which would average over far more steps than a time has)
 
@@ -176,6 +179,7 @@ class Tracker:
         self.job, self.gaussians, self.settings = job, gaussians, job.settings
         footage = job.footage
         self.window = moving_window(footage.views, masks, self.settings.margin_px)
+        self.masks = masks
         self.pictures, self.quiet = self.window.cut(footage.pictures), ~self.window.cut(masks)
         moving = foreground_points(gaussians.means, footage.views, masks)
         with torch.no_grad():
@@ -228,7 +232,7 @@ class Tracker:
         rates = {
             "means": Decay(s.means_rate * scale, s.means_rate_last * scale),
             "quats": Decay(s.quats_rate, s.quats_rate),
-            "colors": Decay(s.colors_rate, s.colors_rate),
+            "colors": Decay(s.colors_rate, s.colors_rate_last),
         }
         steps = step_count(s, visit)
         for step in range(steps):
@@ -240,7 +244,11 @@ class Tracker:
             loss = loss_of(leaves, order[: s.views_per_step].sort().values.tolist())
             loss.backward()
             adam.step()
-        tracks.put(index, leaves)
+        found = {name: leaf.detach() for name, leaf in leaves.items()}
+        stray = stray_points(found["means"][: self.count], self.job.footage.views, self.masks)
+        for name in ("means", "quats"):
+            found[name][: self.count][stray] = old[name][: self.count][stray]
+        tracks.put(index, found)
         return float(loss.detach())
 
     def loss(self, index: int, old: dict[str, Tensor]) -> Callable[[dict[str, Tensor], list[int]], Tensor]:
@@ -279,4 +287,4 @@ class Tracker:
         self.tracks.load(saved.part("tracks"))
 
 
-TRACKING = Algorithm(TrackingSettings(), fit_tracking, PUBLISHED)
+TRACKING = Algorithm(TrackingSettings(), fit_tracking, PUBLISHED, ("pixel",))

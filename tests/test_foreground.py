@@ -6,7 +6,13 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.method.foreground import foreground_masks, foreground_points, moving_window, temporal_deviation
+from spike4dgs.method.foreground import (
+    foreground_masks,
+    foreground_points,
+    moving_window,
+    stray_points,
+    temporal_deviation,
+)
 from spike4dgs.method.splat import Views
 
 WORLD = ToyWorld(width=64, height=40, travel=0.3)
@@ -73,12 +79,14 @@ def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
     truth = board.reshape(-1)
     assert moving[truth].mean() > 0.97
     assert moving[~truth].mean() < 0.15  # what the board's rim passes over
+    assert np.array_equal(stray_points(points, Views.from_cameras(WORLD.cameras), masks).numpy(), ~moving)
 
 
-def test_points_behind_all_cameras_or_out_of_their_sight_do_not_move() -> None:
+def test_points_behind_all_cameras_or_out_of_their_sight_neither_move_nor_stray() -> None:
     masks = torch.ones(len(WORLD.cameras), WORLD.height, WORLD.width, dtype=torch.bool)
     points = torch.tensor([[0.0, -9.0, 1.0], [50.0, 0.0, 1.0]])
     assert not foreground_points(points, Views.from_cameras(WORLD.cameras), masks).any()
+    assert not stray_points(points, Views.from_cameras(WORLD.cameras), masks).any()  # they have left
 
 
 def test_window_shows_the_same_pixels_through_the_same_lines_of_sight() -> None:

@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,12 +10,15 @@ from scipy.spatial.transform import Rotation, Slerp
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.recipes import Budget, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
-from spike4dgs.method.fit import FitJob, Start, measure
+from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, Start, measure
 from spike4dgs.method.footage import Footage
 from spike4dgs.method.foreground import foreground_masks
 from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.splat import Views
+from spike4dgs.method.supervision import SUPERVISIONS
 from spike4dgs.method.tracked_model import TrackedModel, Tracks
 from spike4dgs.method.tracking import (
     PUBLISHED,
@@ -139,6 +142,18 @@ def test_only_the_window_is_drawn_and_the_gradient_is_that_of_the_whole_picture(
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 
 
+def test_what_flies_off_to_where_nothing_moves_stays_where_it_was() -> None:
+    j = job(**TINY)
+    g = from_points(j.start.points, j.start.values, opacity=0.5)
+    tracker = Tracker(j, g, foreground_masks(j.footage.pictures))
+    tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+    tracks = tracker.tracks
+    tracks.means[1, 7] -= torch.tensor([0.0, 0.0, 0.45])  # from there its velocity takes it far above the board
+    tracker.track(Visit(3, 2, 1))
+    assert torch.equal(tracks.means[3, 7], tracks.means[2, 7])
+    assert (tracks.means[3, 8:] != tracks.means[2, 8:]).any(dim=1).float().mean() > 0.9
+
+
 class Killed(Exception):
     pass
 
@@ -235,6 +250,19 @@ def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
     assert torch.equal(model.at(9999.0).means, model.at(2500.0).means)
     assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
     assert model.size_bytes == 4 * (6 * 12 + 3 * (4 * 7 + 5))
+
+
+def test_a_recipe_runs_it_from_spikes_to_pictures() -> None:
+    def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
+        return np.stack([stream.counts(t - 10, t + 10) / (20 * gain) for t in ticks]).astype(np.float32)
+
+    parts = Parts({"mean": images}, {"true": lambda scene, seed: shown()[1]}, {}, SUPERVISIONS, {"tracking": TRACKING})
+    recipe = Recipe("test", "mean", "true", "tracking", "pixel", {**TINY, "time_spacing_ticks": 110})
+    model = RecipeMethod(recipe, parts).fit(WORLD.training, Budget(2.0), "cpu", 0, silent)
+    image = model.render(WORLD.held_out, 6000.0)
+    truth = WORLD.look(WORLD.held_out, 0.5)[0]
+    assert len(model.tracks.times_us) == 3
+    assert -10 * np.log10(((image - truth) ** 2).mean()) > 12  # after six steps
 
 
 def test_budget_scales_steps_only_and_the_publications_counts_are_settings() -> None:
