@@ -1,6 +1,6 @@
 """The terms of `tracking_losses` on the CPU: value and gradient of their weighted sum in one pass over the pairs.
 
-The twin in plain torch is `tracking_losses.physical_terms`, which takes ten times as long: it writes every
+The twin in plain torch is `tracking_losses.physical_terms`, which takes three times as long: it writes every
 intermediate of every pair to memory.
 """
 
