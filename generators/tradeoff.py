@@ -176,17 +176,18 @@ def _write(rows: Sequence[Row], path: Path) -> None:
 def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    markers = "os^vDPX"  # settings that cost the same lie on each other
     for axes, kind, where in zip(
         figure.subplots(1, 2), ("", "_moving"), ("whole picture", "where it moves"), strict=True
     ):
-        for row in rows:
+        for row, marker in zip(rows, markers, strict=False):
             values: Any = (row.keys_minutes, getattr(row, f"mean_percent{kind}"))
-            axes.plot(*values, "o")
-            axes.annotate(row.setting, values, (5, 4), textcoords="offset points", fontsize=7)
+            axes.plot(*values, marker, label=row.setting, linestyle="none", alpha=0.8)
         axes.set(xscale="log", xlabel="time of the keys, min", ylabel="mean error, %", title=where)
         axes.margins(0.25, 0.15)
         axes.grid(True, color="0.9")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(title)
     with atomic_path(path) as part:
         figure.savefig(part, dpi=100)
