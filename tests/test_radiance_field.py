@@ -17,6 +17,7 @@ from spike4dgs.method.radiance_field import PUBLISHED, RADIANCE_FIELD, RadianceF
 from spike4dgs.method.radiance_field.fit import Fitter
 from spike4dgs.method.radiance_field.march import camera_rays
 from spike4dgs.method.radiance_field.model import RadianceModel
+from spike4dgs.method.settings import make_settings
 from spike4dgs.method.splat import Views
 
 WORLD = ToyWorld(width=40, height=25, n_ticks=80)
@@ -184,8 +185,8 @@ def test_times_open_up_from_the_middle() -> None:
 def test_budgets_scale_the_steps_and_published_values_are_settings() -> None:
     s = RADIANCE_FIELD.settings
     assert s.scaled(0.5) == replace(s, steps=round(s.steps / 2))
-    paper = replace(s, **PUBLISHED)
-    assert paper.steps == 200_000 and paper.width == 256
+    paper = make_settings(PUBLISHED, "paper", s)
+    assert paper.steps == 200_000 and paper.width == 256 and paper.field_rate == 5e-4
 
 
 def test_spikes_of_the_stream_are_what_a_rate_is_compared_with() -> None:
