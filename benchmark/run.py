@@ -98,9 +98,12 @@ def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> l
             log.unlink(missing_ok=True)
         except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
             write_text(log, traceback.format_exc())
-            reason = str(e) if isinstance(e, UserError) else f"{type(e).__name__}: {e}"
-            status = "skipped" if isinstance(e, WeightsError) else "failed"
-            cells = [missing_cell(status, f"{reason} (see logs/{log.name})"[:2000])] * len(folders)
+            if isinstance(e, WeightsError):
+                missing = missing_cell("skipped", e.reason)  # records travel: no paths of this machine
+            else:
+                reason = str(e) if isinstance(e, UserError) else f"{type(e).__name__}: {e}"
+                missing = missing_cell("failed", f"{reason} (see logs/{log.name})"[:2000])
+            cells = [missing] * len(folders)
         for variant, cell in zip(job.variants, cells, strict=True):
             shown.note(f"{'' if variant == job.info else SUFFIX[1:] + ': '}{cell_summary(cell)}")
     return cells

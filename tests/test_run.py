@@ -21,6 +21,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.images import read_exr
 from spike4dgs.benchmark.run import run_benchmark
 from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.leaderboard.submit import read_entry
 
 # Also the state of the checkout, which somebody may change while the tests run.
@@ -324,3 +325,12 @@ def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device("auto") == "cpu" == choose_device("cpu")
+
+
+def test_a_method_without_its_weights_is_skipped_and_the_record_has_no_path(small_scene: Path, tmp_path: Path) -> None:
+    error = WeightsError(f"{tmp_path}/net.pth: expected weights, found no such file", "needs net.pth")
+    (record,) = run(tmp_path / "out", [small_scene], FailingMethod("learned", error))
+    (cell,) = record["scenes"].values()
+    assert (cell["status"], cell["error"]) == ("skipped", "needs net.pth")
+    assert str(tmp_path) not in json.dumps(record["scenes"])
+    assert str(tmp_path) in (tmp_path / "out/logs/learned__pattern-0.log").read_text()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, sha256_file
+from spike4dgs.benchmark.weights import WeightsError
 
 if TYPE_CHECKING:
     from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet
@@ -35,11 +36,12 @@ class Card:
 def weights_path() -> Path:
     """The weight file in use: what the environment variable SPIKE4DGS_SPK2IMG names, else the one that is shipped.
 
-    Raises UserError where there is no such file.
+    Raises WeightsError where there is no such file.
     """
     path = Path(os.environ.get(VARIABLE) or SHIPPED)
     if not path.is_file():
-        raise problem(path, "weights of Spk2ImgNet", "no such file", _FIX)
+        missing = problem(path, "weights of Spk2ImgNet", "no such file", _FIX)
+        raise WeightsError(str(missing), f"no trained weights {path.name}: {_FIX}")
     return path
 
 
