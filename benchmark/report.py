@@ -15,7 +15,7 @@ from rich.table import Table
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.images import encode_srgb, read_exr
 from spike4dgs.benchmark.metrics import METRICS, Metric
-from spike4dgs.benchmark.result import Cell, Record
+from spike4dgs.benchmark.result import COSTS, Cell, Record
 from spike4dgs.benchmark.scene import Scene, Target
 
 if TYPE_CHECKING:
@@ -23,12 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ERROR_MAX = 0.3  # the error maps' white: larger errors look the same
-_COSTS = {
-    "fit_seconds": ("fit\ns", "{:.1f}"),
-    "render_fps": ("render\nfps", "{:.1f}"),
-    "peak_memory_mb": ("peak\nMB", "{:.0f}"),
-    "model_mb": ("model\nMB", "{:.1f}"),
-}
 
 
 def make_console() -> Console:
@@ -52,8 +46,8 @@ def results_table(records: Sequence[Record]) -> Table:
     table.add_column("method")
     for m in metrics:
         table.add_column(m.id.replace("_", "\n"), justify="right")
-    for title, _ in _COSTS.values():
-        table.add_column(title, justify="right")
+    for title, _ in COSTS.values():
+        table.add_column(title.replace(", ", "\n"), justify="right")
     scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
     for scene in scenes:
         named = [(r["method"]["name"], r["scenes"][scene]) for r in records if scene in r["scenes"]]
@@ -79,7 +73,7 @@ def _add_block(
         for m in metrics:
             text = m.format(values[m.id])
             texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and values[m.id] == best.get(m.id, "") else text)
-        costs = ["" if cell.get(k) is None else form.format(cell[k]) for k, (_, form) in _COSTS.items()]
+        costs = ["" if cell.get(k) is None else f"{cell[k]:.{digits}f}" for k, (_, digits) in COSTS.items()]
         status = cell.get("status", "ok")
         shown = escape(name) + (f" [red]({status})[/red]" if status != "ok" else "")
         table.add_row(escape(title) if i == 0 else "", shown, *texts, *costs, end_section=i == len(rows) - 1)

@@ -25,21 +25,18 @@ SCHEMA = "spike4dgs-result/1"
 PROTOCOL: dict[str, Any] = {"name": "held-out-views", "version": 1}  # raise the version when a score would change
 Record = dict[str, Any]
 Cell = dict[str, Any]
+COSTS = {  # of a cell -> title, digits shown to people
+    "fit_seconds": ("fit, s", 1),
+    "render_fps": ("images/s", 1),
+    "peak_memory_mb": ("memory, MB", 0),
+    "model_mb": ("model, MB", 1),
+}
 _AGAIN = "score the predictions again"
 
 
 def missing_cell(status: str, error: str) -> Cell:
     """A cell without values: `status` is failed or skipped, `error` is the reason in one line."""
-    nothing = (
-        "gain_aligned",
-        "predictions_sha256",
-        "fit_seconds",
-        "render_fps",
-        "peak_memory_mb",
-        "model_mb",
-        "budget",
-        "device",
-    )
+    nothing = ("gain_aligned", "predictions_sha256", *COSTS, "budget", "device")
     return {
         "status": status,
         "metrics": dict.fromkeys(METRICS),

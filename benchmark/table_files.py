@@ -10,11 +10,10 @@ from typing import Any
 
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.metrics import METRICS
-from spike4dgs.benchmark.tables import COSTS
+from spike4dgs.benchmark.result import COSTS
 
 Table = Mapping[str, Any]  # what `tables.build_table` gives
 Mark = Callable[[str, int], str]  # text of a value, its place (0 best, 1 second) -> marked text
-_COST_DIGITS = {"fit_seconds": 1, "render_fps": 1, "peak_memory_mb": 0, "model_mb": 2}
 
 
 def write_table(folder: Path, table: Table) -> None:
@@ -71,9 +70,9 @@ def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]
             header += [f"{m['title']}, published", "rank / published"]
             columns.append([METRICS[m["id"]].format(c["published"]) for c in cells])
             columns.append([f"{c['rank'] or '-'} / {c['published_rank'] or '-'}" for c in cells])
-    for cost, title in COSTS.items():
+    for cost, (title, digits) in COSTS.items():
         header.append(title)
-        columns.append([_number(r["costs"][cost], f"{{:.{_COST_DIGITS[cost]}f}}") or "-" for r in table["rows"]])
+        columns.append([_number(r["costs"][cost], f"{{:.{digits}f}}") or "-" for r in table["rows"]])
     taus = "; ".join(f"{METRICS[m].title} {t:.2f}" for m, t in table["agreement"].items() if t is not None)
     title = "Mean over scenes" + (f" (Kendall's tau with the published order: {taus})" if taus else "")
     return title, header, [list(row) for row in zip(*columns, strict=True)]

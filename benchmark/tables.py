@@ -16,17 +16,11 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics import METRICS, Metric
-from spike4dgs.benchmark.result import Record
+from spike4dgs.benchmark.result import COSTS, Record
 
 SCHEMA = "spike4dgs-table/1"
 IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
 ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics
-COSTS = {
-    "fit_seconds": "fit, s",
-    "render_fps": "images/s",
-    "peak_memory_mb": "memory, MB",
-    "model_mb": "model, MB",
-}
 
 
 @dataclass(frozen=True)

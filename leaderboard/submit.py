@@ -24,7 +24,7 @@ from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.metrics import METRICS, PRIMARY
-from spike4dgs.benchmark.result import Cell, Record, check_record, is_complete, read_record, same_value
+from spike4dgs.benchmark.result import COSTS, Cell, Record, check_record, is_complete, read_record, same_value
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.score import open_for, open_scenes, prediction_folders, score_scene
@@ -135,7 +135,7 @@ def _check_same(claimed: Cell, computed: Cell, metrics: Collection[str], where: 
             if not same_value(claimed["per_image"][name][metric], value, METRICS[metric].tolerance):
                 found = str(claimed["per_image"][name][metric])
                 raise problem(f"{where}, {name}", f"{metric} = {value} as computed from the files", found, fix)
-    for key in ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb", "budget", "device", "fitted_with"):
+    for key in (*COSTS, "budget", "device", "fitted_with"):
         if claimed[key] != computed[key]:
             raise problem(where, f"{key} {computed[key]} as in prediction.json", str(claimed[key]), fix)
 
