@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.method.fit import count_bytes
 from spike4dgs.method.gaussians import Gaussians
 from spike4dgs.method.splat import Views, render
 
@@ -82,8 +83,7 @@ class TrackedModel:
     @property
     def size_bytes(self) -> int:
         """Bytes of the Gaussians and of the tracks."""
-        tensors = [*self.gaussians.tensors().values(), *self.tracks.tensors().values()]
-        return sum(t.numel() * t.element_size() for t in tensors)
+        return count_bytes([*self.gaussians.tensors().values(), *self.tracks.tensors().values()])
 
     def at(self, t_us: float) -> Gaussians:
         """The Gaussians at a time of the clip; times outside of it take its ends."""
