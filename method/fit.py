@@ -93,7 +93,7 @@ class Algorithm:
 
     settings: FitSettings
     fit: Callable[[FitJob], Model]
-    published: Mapping[str, int] = field(default_factory=dict)
+    published: Mapping[str, float] = field(default_factory=dict)
     supervisions: tuple[str, ...] = ()
 
 
