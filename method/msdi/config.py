@@ -1,0 +1,100 @@
+"""Sizes of MSDI's networks: one code, three frozen configurations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MsdiConfig:
+    """What `Msdi` is built from. Widths are channels."""
+
+    name: str
+    ticks: int  # T, of the window that the network sees; its picture is that of the middle
+    extractor_widths: tuple[int, ...]  # of each level, the first at full size, each next at half; one: a single layer
+    generator_widths: tuple[int, int]  # of the first two of BCONV's three layers
+    generator_sees_pixel: bool  # BCONV also gets the spikes of its own pixel, to which the features are blind
+    embed_channels: int  # what the patch embedding sees, mixed from the extractor's features
+    patch: int  # px, 16 or 8
+    encoder_layers: int
+    encoder_width: int
+    encoder_heads: int
+    fusion_layers: int
+    fusion_width: int
+    fusion_heads: int
+    head_widths: tuple[int, int, int, int]  # of the head's four levels, finest first
+    head_features: int
+
+    @property
+    def features(self) -> int:
+        """Channels of the extractor's features: four directions."""
+        return 4 * self.extractor_widths[0]
+
+    @property
+    def hooks(self) -> tuple[int, int, int, int]:
+        """What the head sees: 0 is the encoder's output, k that of the fusion's k-th layer."""
+        n = self.fusion_layers
+        return 0, n // 2, 3 * n // 4, n
+
+
+# The paper: ViT-L encoders of DUSt3R and the 24-layer transformer of Fast3R's published weights (1024 wide), with
+# their DPT head; one shift-based layer of 96 channels a direction and BCONV as in the blind-spot network. Three
+# embedded channels are what the pre-trained patch embedding takes.
+PAPER = MsdiConfig(
+    name="paper",
+    ticks=41,
+    extractor_widths=(96,),
+    generator_widths=(384, 96),
+    generator_sees_pixel=False,
+    embed_channels=3,
+    patch=16,
+    encoder_layers=24,
+    encoder_width=1024,
+    encoder_heads=16,
+    fusion_layers=24,
+    fusion_width=1024,
+    fusion_heads=16,
+    head_widths=(96, 192, 384, 768),
+    head_features=256,
+)
+
+# For two CPU cores, at 64x104 px: patches of 8 give as many tokens there as patches of 16 at twice the size, for a
+# quarter of the pixels. The extractor is a pyramid, for one layer sees three rows and columns; the picture also takes
+# the pixel's own spikes, which say more of it than any neighbour.
+SMALL = MsdiConfig(
+    name="small",
+    ticks=41,
+    extractor_widths=(16, 32, 64),
+    generator_widths=(64, 32),
+    generator_sees_pixel=True,
+    embed_channels=16,
+    patch=8,
+    encoder_layers=6,
+    encoder_width=192,
+    encoder_heads=6,
+    fusion_layers=24,
+    fusion_width=128,
+    fusion_heads=4,
+    head_widths=(48, 64, 96, 128),
+    head_features=64,
+)
+
+TINY = MsdiConfig(  # for tests
+    name="tiny",
+    ticks=9,
+    extractor_widths=(4, 6),
+    generator_widths=(8, 6),
+    generator_sees_pixel=True,
+    embed_channels=4,
+    patch=16,
+    encoder_layers=2,
+    encoder_width=16,
+    encoder_heads=2,
+    fusion_layers=4,
+    fusion_width=16,
+    fusion_heads=2,
+    head_widths=(4, 6, 8, 8),
+    head_features=8,
+)
+
+CONFIGS = {config.name: config for config in (PAPER, SMALL, TINY)}
