@@ -1,0 +1,1 @@
+"""The recorder: an array of spike cameras over USB, written as a scene folder."""
