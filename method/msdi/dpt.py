@@ -1,0 +1,108 @@
+"""The head of DUSt3R and Fast3R (Ranftl et al. 2021): tokens of four layers to a point and a confidence per pixel.
+
+Parameters are named as in the published weights of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+_LARGEST = 30.0  # of what is put into an exponential: e^30 is beyond all scenes, e^89 is beyond float32
+
+
+class ResidualUnit(nn.Module):
+    """Two 3x3 convolutions around which the input goes."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = nn.Conv2d(width, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, C, H, W]."""
+        out: Tensor = x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
+        return out
+
+
+class Fusion(nn.Module):
+    """Add a finer level to the coarser ones, and double the size."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.resConfUnit1, self.resConfUnit2 = ResidualUnit(width), ResidualUnit(width)
+        self.out_conv = nn.Conv2d(width, width, 1)
+
+    def forward(self, x: Tensor, finer: Tensor | None = None) -> Tensor:
+        """[B, C, h, w] -> [B, C, 2 h, 2 w]."""
+        x = self.resConfUnit2(x if finer is None else x + self.resConfUnit1(finer))
+        out: Tensor = _double(self.out_conv(x))  # a 1x1 convolution and an interpolation commute: the cheap order
+        return out
+
+
+def _double(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+
+
+class Levels(nn.Module):
+    """The head's layers by level, finest first, with the published names."""
+
+    def __init__(self, widths: Sequence[int], features: int) -> None:
+        super().__init__()
+        self.layer_rn = nn.ModuleList(nn.Conv2d(w, features, 3, padding=1, bias=False) for w in widths)
+        self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(features) for _ in widths)
+
+
+class Dpt(nn.Module):
+    """Tokens of four layers -> point and confidence of each pixel, before the output's exponentials.
+
+    `tokens` are the widths of the four layers, `widths` those of the four levels; `patch` is 16 px, or 8, for which the
+    last doubling is left out.
+    """
+
+    def __init__(self, tokens: Sequence[int], widths: Sequence[int], features: int, patch: int = 16) -> None:
+        super().__init__()
+        self.patch = patch
+        scalers: tuple[list[nn.Module], ...] = (
+            [nn.ConvTranspose2d(widths[0], widths[0], 4, stride=4)],
+            [nn.ConvTranspose2d(widths[1], widths[1], 2, stride=2)],
+            [],
+            [nn.Conv2d(widths[3], widths[3], 3, stride=2, padding=1)],
+        )
+        self.act_postprocess = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(t, w, 1), *scaler) for t, w, scaler in zip(tokens, widths, scalers, strict=True)
+        )
+        self.scratch = Levels(widths, features)
+        half = features // 2
+        self.head = nn.ModuleDict(  # named by place: 1 and 3 have no parameters
+            {
+                "0": nn.Conv2d(features, half, 3, padding=1),
+                "2": nn.Conv2d(half, half, 3, padding=1),
+                "4": nn.Conv2d(half, 4, 1),
+            }
+        )
+
+    def forward(self, layers: list[Tensor], rows: int, columns: int) -> Tensor:
+        """[B, 4, rows * patch, columns * patch] of `layers`, [B, rows * columns, C] of the four hooks."""
+        maps = [x.transpose(1, 2).unflatten(2, (rows, columns)) for x in layers]
+        levels = [post(x) for post, x in zip(self.act_postprocess, maps, strict=True)]
+        levels = [conv(x) for conv, x in zip(self.scratch.layer_rn, levels, strict=True)]
+        fuse = self.scratch
+        x = fuse.refinenet4(levels[3])[:, :, :rows, :columns]  # odd counts of patches are rounded up
+        x = fuse.refinenet1(fuse.refinenet2(fuse.refinenet3(x, levels[2]), levels[1]), levels[0])
+        x = self.head["0"](x)
+        out: Tensor = self.head["4"](functional.relu(self.head["2"](_double(x) if self.patch == 16 else x)))
+        return out
+
+
+def unpack(out: Tensor) -> tuple[Tensor, Tensor]:
+    """[B, 4, H, W] -> points x / |x| * (exp|x| - 1) [B, H, W, 3] and confidence 1 + exp(c) [B, H, W], float32.
+
+    Exponents are bounded by 30, so that no training step can make an infinity.
+    """
+    x = out[:, :3].float().permute(0, 2, 3, 1)
+    length = x.norm(dim=-1, keepdim=True)
+    reach = torch.expm1(length.clamp(max=_LARGEST))
+    return x / length.clamp(min=1e-8) * reach, 1 + out[:, 3].float().clamp(max=_LARGEST).exp()
