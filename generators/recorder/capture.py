@@ -6,79 +6,37 @@ are in; what is still on its way is read and dropped), CLOSED.
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.gaps import Gap
-from spike4dgs.generators.recorder.profile import RigProfile
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.generators.recorder.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
+from spike4dgs.generators.recorder.cutting import Cutter, First, agree, first_frame
+from spike4dgs.generators.recorder.gaps import INTERRUPTED
+from spike4dgs.generators.recorder.layouts import COUNTER, Layout, make_layout
+from spike4dgs.generators.recorder.profile import PRIMARY, CameraProfile, RigProfile
+from spike4dgs.generators.recorder.rates import Rate, Rates
+from spike4dgs.generators.recorder.reader import Reader
+from spike4dgs.generators.recorder.reads import OK
+from spike4dgs.generators.recorder.ring import Ring
+from spike4dgs.generators.recorder.ticks import Run
 from spike4dgs.generators.recorder.transport import Link
 
 UInt8 = NDArray[np.uint8]
 
-STATES = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
+__all__ = ["STATES", "CameraClip", "CameraStats", "Clip", "Rate", "Sink", "capture"]
 
-# What continuous mode writes with: camera, true tick of the first frame, raw frames [n, frame_bytes] of consecutive
-# ticks. The frames are a view of the ring: copy or write them before returning. Called from capture()'s thread only.
-Sink = Callable[[str, int, UInt8], None]
+OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = STATES = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
 
-
-@dataclass(frozen=True)
-class CameraStats:
-    """How one camera's capture went."""
-
-    bytes: int  # received after the trigger, dropped ones included
-    blocks: int  # reads that ended with data
-    short_reads: int
-    backlog: int  # most ring slots that waited for the consumer at once
-    slots: int  # of the ring
-    lost_ticks: int  # within the clip
-    idle_mean_ms: float  # time from one read's end to the next read's submission while none was in flight: mean, worst
-    idle_worst_ms: float
-    starved: int  # how often no read was in flight
-    queued: bool
-    end: str  # "ok", or the reason that stopped this camera alone
-
-
-@dataclass(frozen=True)
-class Rate:
-    """What `on_rate` is told about one camera, a few times a second."""
-
-    bytes_per_s: float
-    ticks: int  # received since the trigger
-    spikes_per_tick: float  # mean over the pixels of the newest frames, 0..1
-    backlog: int  # ring slots that wait
-    lost_ticks: int
-
-
-@dataclass(frozen=True, eq=False)
-class CameraClip:
-    """What one camera delivered. In continuous mode `frames` and `ticks` are empty: the sink has had them."""
-
-    camera: str
-    frames: UInt8  # [n, frame_bytes] raw, as received; a view of the ring where nothing is missing
-    ticks: NDArray[np.int64]  # [n] true tick of each frame, ascending, within the clip
-    gaps: tuple[Gap, ...]  # every tick of the clip that has no frame
-    arrival: NDArray[np.int64]  # [m, 2]: ticks complete when a read ended, CLOCK_MONOTONIC ns
-    stats: CameraStats
-
-
-@dataclass(frozen=True, eq=False)
-class Clip:
-    """A capture of all cameras; ticks count from the first one after the trigger."""
-
-    n_ticks: int
-    cameras: tuple[CameraClip, ...]
-    sync: str  # "frame tags", or "arrival times" where the layout has none or the cameras' counters are not common
-    interrupted: bool  # stopped before the wanted length
-
-    @property
-    def complete(self) -> bool:
-        """Whether no camera lost anything."""
-        return not any(c.gaps for c in self.cameras)
+_LOOK_S = 0.005  # how often this thread looks at the others
+# Counters that one trigger has set differ by what a camera sends before the last one is started; others by anything.
+_SKEW_S = 0.1
+_SPARE_SLOTS = 8  # each short read takes a whole slot
 
 
 def capture(
@@ -93,14 +51,242 @@ def capture(
 ) -> Clip:
     """Record `seconds` of every camera of `links` (camera id -> opened link); the links are closed in any case.
 
-    Each camera is rehearsed first: started, it must deliver one block, and is stopped again. Then secondaries are
-    started before the primary, and every camera's first byte begins its first frame. A camera without a stop
-    sequence cannot start anew: its tick 0 is the first complete frame after TRIGGERED.
+    Each camera is rehearsed first: started, it must deliver a block, and is stopped again. Then secondaries are started
+    before the primary, and every camera's first byte begins its first frame. Where a camera cannot be stopped, all go
+    on from the rehearsal, and tick 0 is the first whole frame after TRIGGERED.
 
     Without `sink` everything stays in memory and `frames` are views of it. With it (continuous mode) whole frames are
     handed on while the capture runs, and a sink that is too slow costs ticks, which are recorded as gaps.
 
+    A camera that fails after the trigger stops alone, and the rest of its clip is a gap: after a stall, too much data
+    (babble), unplugging, `timeout_ms` without data, or, without tags, a short read in the middle of a frame. A short
+    read between frames, or with tags, loses nothing by itself, and is counted.
+
     `stop`, when set, ends the capture early with what there is, as does the first KeyboardInterrupt. Raises UserError
-    where a camera cannot be armed; later failures stop that camera alone and are gaps of the clip.
+    where a camera cannot be armed, or where nothing was captured; what the sink raises is passed on.
     """
-    raise NotImplementedError
+    run = _Capture(profile, links, round(seconds * profile.fps), sink, on_rate, stop or threading.Event())
+    say = on_state or (lambda state: None)
+    try:
+        say(OPEN)
+        run.arm()
+        say(ARMED)
+        run.trigger()
+        say(TRIGGERED)
+        run.record()
+        say(DRAIN)
+        run.drain()
+        return run.clip()
+    finally:
+        run.close()
+        say(CLOSED)
+
+
+class _Capture:
+    """The steps of `capture`, in their order, and what they share."""
+
+    def __init__(
+        self,
+        profile: RigProfile,
+        links: Mapping[str, Link],
+        n_ticks: int,
+        sink: Sink | None,
+        on_rate: Callable[[Mapping[str, Rate]], None] | None,
+        stop: threading.Event,
+    ) -> None:
+        self.profile, self.n_ticks, self.sink, self.on_rate, self.stop = profile, n_ticks, sink, on_rate, stop
+        self.layout = make_layout(profile.layout, profile.width, profile.height)
+        self.links = {c.id: links[c.id] for c in sorted(profile.cameras, key=_primary) if c.id in links}
+        self.restart = all(link.restartable for link in links.values())
+        slots = _slots(profile, self.layout, n_ticks, continuous=sink is not None)
+        self.rings = {camera: Ring(slots, profile.transfer_bytes) for camera in self.links}
+        self.readers: dict[str, Reader] = {}
+        self.cutters: dict[str, Cutter] = {}
+        self.sync = ARRIVAL_TIMES
+        self.sending = self.interrupted = False
+
+    def arm(self) -> None:
+        """Every camera delivers a block. Those that can be started anew are stopped again."""
+        self._start(keep=False)
+        while not all(r.proven for r in self.readers.values()) and not self.stop.is_set():
+            for camera, reader in self.readers.items():
+                if not reader.alive and not reader.proven:
+                    self._raise_error(reader)
+                    fix = "check its cable, and start and endpoint_in in the rig profile"
+                    raise problem(f"camera {camera}", "data after its start sequence", reader.end or "none", fix)
+            time.sleep(_LOOK_S)
+        if self.restart:
+            self._halt()
+            self.drain()
+            for ring in self.rings.values():
+                ring.reset()
+
+    def trigger(self) -> None:
+        """From here on everything is kept."""
+        if self.restart:
+            self._start(keep=True)
+        for reader in self.readers.values():
+            reader.keep.set()
+
+    def record(self) -> None:
+        """Wait for all cameras' last bytes; hand frames to the sink meanwhile."""
+        rates = Rates(self.layout, self.readers, self.on_rate)
+        try:
+            while any(r.alive for r in self.readers.values()) and not self.stop.is_set():
+                self._agree()
+                busy = self.sink is not None and self._write(self.sink)
+                rates.tell()
+                if not busy:
+                    self.stop.wait(_LOOK_S)
+        except KeyboardInterrupt:
+            self.stop.set()
+        self.interrupted = self.stop.is_set() and any(r.alive for r in self.readers.values())
+        self._halt()
+        self._agree(last=True)
+
+    def drain(self) -> None:
+        """Stop the cameras, the primary first, and drop what they still send."""
+        self._stop()
+        if self.restart:
+            for link in self.links.values():
+                link.drain()
+
+    def clip(self) -> Clip:
+        """Everything that is left becomes frames; gaps and statistics."""
+        while self.sink is not None and self._write(self.sink):
+            pass
+        # Continuous mode has nothing left to pop; else every block still waits.
+        runs = {c: self.cutters[c].cut(ring.blocks()) for c, ring in self.rings.items()}
+        n_ticks = self.n_ticks
+        if self.interrupted:
+            sound = [self.cutters[c].next_tick for c, r in self.readers.items() if r.end == OK]
+            n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in self.cutters.values()))
+        if n_ticks <= 0:
+            raise problem("capture", "a whole tick of every camera", "an end before it", "record for longer")
+        cameras = [self._camera_clip(c.id, runs[c.id], n_ticks) for c in self.profile.cameras if c.id in self.links]
+        return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)
+
+    def close(self) -> None:
+        """Whatever happened: no thread reads, no camera sends, no device is held."""
+        self._halt()
+        self._stop()
+        for link in self.links.values():
+            link.close()
+
+    def _start(self, keep: bool) -> None:
+        p = self.profile
+        self.readers = {c: Reader(c, link, self.rings[c], self.layout, p.timeout_ms) for c, link in self.links.items()}
+        for reader in self.readers.values():
+            if keep:
+                reader.keep.set()
+                if not self.layout.has_tags():  # the first byte begins tick 0
+                    reader.wanted = self.n_ticks * self.layout.frame_bytes
+            reader.begin()
+        for reader in self.readers.values():
+            reader.ready.wait()
+            self._raise_error(reader)
+        self.sending = True
+        for link in self.links.values():  # secondaries first
+            link.start()
+        now = time.monotonic_ns()
+        for reader in self.readers.values():
+            reader.begun_ns = now
+
+    def _stop(self) -> None:
+        for link in reversed(self.links.values()) if self.sending else ():
+            link.stop()
+        self.sending = False
+
+    def _halt(self) -> None:
+        for reader in self.readers.values():
+            reader.halt.set()
+        for reader in self.readers.values():
+            reader.join()
+
+    def _agree(self, last: bool = False) -> None:
+        """Decide, once every camera has a whole frame, where tick 0 is and how many bytes each has to bring."""
+        for reader in self.readers.values():
+            self._raise_error(reader)
+        if self.cutters:
+            return
+        firsts = {c: first_frame(self.layout, self.rings[c].blocks()) for c in self.readers}
+        if not (last or self._overdue()) and any(f is None and self.readers[c].alive for c, f in firsts.items()):
+            return
+        found = {c: f for c, f in firsts.items() if f is not None}
+        origin = None
+        if self.layout.count_tags() and found:
+            origin = agree([f.counter for f in found.values()], round(_SKEW_S * self.profile.fps))
+            self.sync = ARRIVAL_TIMES if origin is None else FRAME_TAGS
+        for camera, reader in self.readers.items():
+            first = found.get(camera, First(0, 0, origin or 0))
+            ahead = 0 if origin is None else (origin - first.counter) % COUNTER
+            reader.wanted = first.position + (ahead + self.n_ticks) * self.layout.frame_bytes
+            self.cutters[camera] = Cutter(camera, self.layout, self.rings[camera], origin, first.lead)
+
+    def _overdue(self) -> bool:
+        """Whether one camera is so far ahead that another without a frame is left out of the agreement."""
+        most = max(_SKEW_S * self.profile.fps * self.layout.frame_bytes, 4 * self.profile.transfer_bytes)
+        readers = [r for r in self.readers.values() if r.origin is not None]
+        return any(r.ring.position - (r.origin or 0) > most for r in readers)
+
+    def _write(self, sink: Sink) -> bool:
+        """Hand one block of each camera to the sink; whether there was any."""
+        busy = False
+        for camera, cutter in self.cutters.items():
+            if (block := self.rings[camera].pop()) is not None:
+                busy = True
+                for run in cutter.cut([block]):
+                    frames = run.frames[: max(self.n_ticks - run.first_tick, 0)]
+                    if len(frames):
+                        sink(camera, run.first_tick, frames)
+                self.rings[camera].release()
+        return busy
+
+    def _camera_clip(self, camera: str, runs: Sequence[Run], n_ticks: int) -> CameraClip:
+        reader, ring, cutter = self.readers[camera], self.rings[camera], self.cutters[camera]
+        end = reader.end or OK
+        gaps = cutter.finish(n_ticks, INTERRUPTED if end == OK else end)
+        frames, ticks = _joined(runs, n_ticks, self.layout.frame_bytes)
+        idle = reader.idle
+        stats = CameraStats(
+            bytes=ring.position - (reader.origin or 0),
+            blocks=reader.blocks,
+            short_reads=reader.short_reads,
+            backlog=ring.backlog,
+            slots=ring.slots,
+            lost_ticks=sum(g.ticks for g in gaps),
+            idle_mean_ms=idle.total_ns / max(idle.reads, 1) * 1e-6,
+            idle_worst_ms=idle.worst_ns * 1e-6,
+            starved=idle.starved,
+            queued=reader.link.queued,
+            end=end,
+        )
+        return CameraClip(camera, frames, ticks, gaps, cutter.arrival, stats)
+
+    @staticmethod
+    def _raise_error(reader: Reader) -> None:
+        if reader.error is not None:
+            raise reader.error
+
+
+def _joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
+    """Frames [n, frame_bytes] of all runs within the clip, not copied where there is one run, and their ticks [n]."""
+    cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
+    ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
+    if len(cut) == 1:
+        return cut[0][1], ticks[0]
+    empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
+    return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
+
+
+def _primary(camera: CameraProfile) -> bool:
+    return camera.role == PRIMARY
+
+
+def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
+    """Ring slots: for the whole clip; in continuous mode for `ring_seconds`, and twice the reads in flight at least."""
+    ticks = profile.ring_seconds * profile.fps if continuous else n_ticks
+    if layout.count_tags() and not continuous:
+        ticks += _SKEW_S * profile.fps  # frames before the tick that all cameras have
+    slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)
+    return max(slots, 2 * profile.transfers) if continuous else slots + profile.transfers + _SPARE_SLOTS

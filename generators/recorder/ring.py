@@ -1,0 +1,106 @@
+"""The memory that one camera's reads fill: allocated before the capture starts, and never waited for.
+
+Reads take slots in turn. Where the consumer has not given one back in time, the read goes to a spare buffer whose
+bytes nobody keeps: the USB side goes on, and what is lost is known to the byte.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+UInt8 = NDArray[np.uint8]
+
+_SPARE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """What one read brought: bytes [position, position + bytes) of the camera's stream. `data` is None if dropped."""
+
+    data: UInt8 | None  # [bytes], a view of the ring
+    position: int
+    bytes: int
+    arrival_ns: int
+
+
+class Ring:
+    """`slots` buffers of `slot_bytes`, filled by one thread and emptied by another, both in order.
+
+    The filling thread calls `take` for each read it queues and `put` for each that ended; the emptying thread calls
+    `pop`, and `release` when it no longer needs the block.
+    """
+
+    def __init__(self, slots: int, slot_bytes: int) -> None:
+        self.slots, self.slot_bytes = slots, slot_bytes
+        self.memory = np.empty((slots + 1, slot_bytes), np.uint8)  # the last row is the spare buffer
+        self.memory.fill(0)  # has the system map the pages now, not while the camera sends
+        self._lock = threading.Lock()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, with no read in flight and no block waiting."""
+        self.position = 0  # bytes that came so far
+        self.dropped = 0  # of these, in the spare buffer
+        self.waiting = 0  # slots with blocks that the consumer has not popped
+        self.backlog = 0  # most that waited at once
+        self._flying: deque[int] = deque()
+        self._filled: deque[tuple[int, Block]] = deque()
+        self._next = self._used = 0  # used: in flight, waiting, or popped
+        self._popped: int | None = None
+
+    def take(self) -> UInt8:
+        """The buffer [slot_bytes] for the next read: a free slot, or the spare one."""
+        with self._lock:
+            slot = self._next if self._used < self.slots else _SPARE
+            if slot != _SPARE:
+                self._next = (slot + 1) % self.slots
+                self._used += 1
+        self._flying.append(slot)
+        return self.memory[slot]
+
+    def put(self, n: int, arrival_ns: int, keep: bool = True) -> Block:
+        """Note that the oldest read has brought `n` bytes, and hand them to the consumer unless not to `keep` them."""
+        slot = self._flying.popleft()
+        data = None if slot == _SPARE else self.memory[slot, :n]
+        block = Block(data, self.position, n, arrival_ns)
+        self.position += n
+        if keep:
+            self.dropped += n if data is None else 0
+            with self._lock:
+                self._filled.append((slot, block))
+                self.waiting += slot != _SPARE
+                self.backlog = max(self.backlog, self.waiting)
+        elif slot != _SPARE:
+            self._free()
+        return block
+
+    def pop(self) -> Block | None:
+        """The oldest block that waits, or None. The block popped before it is released."""
+        self.release()
+        if not self._filled:
+            return None
+        with self._lock:
+            slot, block = self._filled.popleft()
+            self.waiting -= slot != _SPARE
+        self._popped = slot
+        return block
+
+    def release(self) -> None:
+        """Give the popped block's slot back to the reads."""
+        if self._popped is not None and self._popped != _SPARE:
+            self._free()
+        self._popped = None
+
+    def blocks(self) -> list[Block]:
+        """Every block that waits, oldest first; they keep waiting."""
+        with self._lock:
+            return [block for _, block in self._filled]
+
+    def _free(self) -> None:
+        with self._lock:
+            self._used -= 1
