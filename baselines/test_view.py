@@ -20,9 +20,11 @@ from torch import Tensor
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.provenance import Provenance
 from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
-from spike4dgs.method.fit import FittedModel, Parts, RecipeMethod
+from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.trainer import one_torch_thread
 
@@ -79,16 +81,20 @@ class RefinableModel:
         """The model's own."""
         return self.model.render(camera, t_us)
 
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """The model's own."""
+        self.model.save(path, provenance)
+
     def refine(self, camera: Camera, picture: Float32, still: NDArray[np.bool_], t_us: float) -> Camera:
         """The camera near `camera` from which the model looks most like `picture`; see `refine_pose`."""
         model = self.model
         with torch.no_grad():
-            splats = model.motion.splats(model.gaussians, min(max(t_us / model.duration_us, 0.0), 1.0))
+            splats = model.splats(t_us)
         _, z = camera.project(splats.means.double().cpu().numpy())
         depth_m = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
 
         def draw(views: Views) -> Tensor:
-            return model.motion.picture(render(splats, views).image, views)
+            return model.picture(render(splats, views).image, views)
 
         return refine_pose(draw, camera, picture, still, depth_m, self.refinement, model.device)
 

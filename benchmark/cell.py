@@ -27,6 +27,7 @@ from spike4dgs.benchmark.environment import (
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
+from spike4dgs.benchmark.provenance import Provenance, Savable
 from spike4dgs.benchmark.recipes import Budget, Method, Model, Progress
 from spike4dgs.benchmark.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.result import PROTOCOL
@@ -85,11 +86,13 @@ def is_done(job: Job, folder: Path) -> bool:
     return predictions.info.key == job.key
 
 
-def run_job(job: Job, folders: Sequence[Path], work: Path, progress: Progress, note: Callable[[str], None]) -> None:
-    """Fit, render and write the predictions of the job's variants to `folders`.
+def run_job(
+    job: Job, folders: Sequence[Path], model_path: Path, work: Path, progress: Progress, note: Callable[[str], None]
+) -> None:
+    """Fit, save the model to `model_path` if it can be saved, and render the predictions of the job's variants.
 
-    `work` holds the checkpoint until the folders are whole. Only the fit sees `scene.training`; held-out cameras
-    appear only in the calls to render, and refined ones are found after the fit.
+    They go to `folders`; `work` holds the checkpoint until these are whole. Only the fit sees `scene.training`;
+    held-out cameras appear only in the calls to render, and refined ones are found after the fit.
     """
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
@@ -99,6 +102,8 @@ def run_job(job: Job, folders: Sequence[Path], work: Path, progress: Progress, n
         note(f"resuming after {clock.before:.0f} s of fitting")
     model = job.method.fit(job.scene.training, job.budget, job.device, job.seed, progress, checkpoint)
     fit_seconds = clock.seconds()
+    if isinstance(model, Savable):
+        model.save(model_path, _provenance(job, fit_seconds))
     cameras = job.scene.cameras
     for method, folder in zip(job.variants, folders, strict=True):
         if method != job.info:
@@ -137,6 +142,25 @@ def _predict(
                 created=utc_now(),
             )
         )
+
+
+def _provenance(job: Job, fit_seconds: float) -> Provenance:
+    scene = job.scene
+    return Provenance(
+        method=job.info.as_dict(),
+        scene=scene.id,
+        scene_revision=scene.revision,
+        split=scene.split,
+        cameras=scene.training.cameras,
+        rate_hz=scene.rate_hz,
+        n_ticks=scene.n_ticks,
+        radiance_gain=scene.radiance_gain,
+        budget=job.budget.label,
+        device=job.device,
+        fit_seconds=fit_seconds,
+        harness=harness(),
+        created=utc_now(),
+    )
 
 
 def _megabytes(model: Model) -> float | None:

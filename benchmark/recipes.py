@@ -81,7 +81,8 @@ class Progress(Protocol):
 
 
 class Model(Protocol):
-    """A fitted scene. An attribute `size_bytes` may be added: what it takes on disk, without code."""
+    """A fitted scene. Two attributes may be added: `size_bytes`, what it takes on disk, without code, and `save`, which
+    writes it (`provenance.Savable`): a run keeps what it can save."""
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Gray linear radiance [H, W] float32 (1.0 = white) seen by `camera` at the time `t_us`."""

@@ -1,6 +1,7 @@
 """`run-benchmark`: every method on every scene, then scores, table, pictures and leaderboard entries.
 
 OUT/predictions/METHOD/SCENE/   what was rendered: the only thing a later run resumes by (its content key)
+OUT/models/METHOD/SCENE.safetensors   the fitted model, for `render` and `view`
 OUT/results/METHOD.json         the result records, scored from those files
 OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
 OUT/work/KEY/                   the checkpoint of an unfinished fit
@@ -93,7 +94,8 @@ def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> l
             if all(is_done(job, folder) for folder in folders):
                 shown.note("predictions are there: scored from the files")
             else:
-                run_job(job, folders, out / "work" / job.key[:16], shown.progress, shown.note)
+                model = out / "models" / job.method.name / f"{job.scene.id}.safetensors"
+                run_job(job, folders, model, out / "work" / job.key[:16], shown.progress, shown.note)
             cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in folders]
             log.unlink(missing_ok=True)
         except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -18,11 +18,12 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.footage import Footage
-from spike4dgs.method.gaussians import Gaussians, from_points
+from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.motion import PUBLISHED, Extent, Motion
 from spike4dgs.method.settings import TrainSettings, make_settings
-from spike4dgs.method.splat import Views, render
+from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision_model import Supervision
 from spike4dgs.method.trainer import Trainer, seeded
 
@@ -108,29 +109,6 @@ class Parts:
     algorithms: Mapping[str, Algorithm] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class FittedModel:
-    """Gaussians and how they move."""
-
-    gaussians: Gaussians
-    motion: Motion
-    duration_us: float
-    device: str
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of the Gaussians and of the motion model."""
-        return count_bytes([*self.gaussians.tensors().values(), *self.motion.state_dict().values()])
-
-    @torch.no_grad()
-    def render(self, camera: Camera, t_us: float) -> Float32:
-        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
-        t = min(max(t_us / self.duration_us, 0.0), 1.0)
-        views = Views.from_cameras([camera], device=self.device)
-        image = render(self.motion.splats(self.gaussians, t), views).image
-        return self.motion.picture(image, views)[0].clamp(min=0).cpu().numpy()
-
-
 class RecipeMethod:
     """`benchmark.recipes.Method` for a recipe whose parts are found in `parts`.
 
@@ -181,7 +159,8 @@ class RecipeMethod:
         recipe, parts = self.recipe, self.parts
 
         def fit(job: FitJob) -> FittedModel:
-            return fit_gaussians(job, parts.motion[recipe.motion], parts.supervision[recipe.supervision])
+            spec = MotionSpec(recipe.motion, job.extent, job.settings)
+            return fit_gaussians(job, spec, parts.motion[recipe.motion], parts.supervision[recipe.supervision])
 
         return Algorithm(TrainSettings(), fit, PUBLISHED.get(recipe.motion, {}))
 
@@ -195,22 +174,17 @@ class RecipeMethod:
         return make_settings(steps, where, self.settings)
 
 
-def fit_gaussians(job: FitJob, make_motion: MotionMaker, supervise: SupervisionMaker) -> FittedModel:
+def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, supervise: SupervisionMaker) -> FittedModel:
     """Run the trainer on Gaussians that start at the job's points."""
     settings, start = job.settings, job.start
-    motion = make_motion(job.extent, settings, seeded(job.seed, -1)).to(job.device)
+    motion = make_motion(spec.extent, spec.settings, seeded(job.seed, -1)).to(job.device)
     first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=job.device)
     first = motion.attach(first, job.footage)
     supervision = supervise(settings, job.scene).to(job.device)
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
     gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
-    return FittedModel(gaussians, motion, job.scene.duration_us, job.device)
-
-
-def count_bytes(tensors: Iterable[Tensor]) -> int:
-    """What tensors take in a file."""
-    return sum(t.numel() * t.element_size() for t in tensors)
+    return FittedModel(gaussians, motion, job.scene.duration_us, job.device, spec)
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:

@@ -25,7 +25,11 @@ class Extent:
 
 
 class Motion(nn.Module):
-    """How Gaussians move. A model says where they are at a time; the rest has defaults that cost nothing."""
+    """How Gaussians move. A model says where they are at a time; the rest has defaults that cost nothing.
+
+    What it needs to draw is in its state dict and in `Gaussians.extra`, or follows from the extent and the settings
+    that it was made from: a saved model is built again from these.
+    """
 
     moves = True  # False: all times look the same, and only the static stage is trained
     rests_first = True  # a static stage comes before the moving one

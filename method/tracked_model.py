@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -10,9 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.method.fit import count_bytes
+from spike4dgs.benchmark.provenance import Provenance
+from spike4dgs.method.fitted_model import count_bytes
 from spike4dgs.method.gaussians import Gaussians
-from spike4dgs.method.splat import Views, render
+from spike4dgs.method.model_file import ModelFile, group, write_model
+from spike4dgs.method.splat import Splats, Views, render
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,8 @@ class Tracks:
 class TrackedModel:
     """The Gaussians of the first time and their tracks."""
 
+    KIND: ClassVar = "tracking"
+
     gaussians: Gaussians
     tracks: Tracks
     duration_us: float
@@ -98,5 +104,27 @@ class TrackedModel:
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.gaussians.means.device)
-        image = render(self.at(t_us).splats(), views).image[0, :, :, 0]
-        return image.clamp(min=0).cpu().numpy()
+        image = render(self.splats(t_us), views).image
+        return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+
+    def splats(self, t_us: float) -> Splats:
+        """What is drawn at `t_us`."""
+        return self.at(t_us).splats()
+
+    def picture(self, image: Tensor, views: Views) -> Tensor:
+        """The drawn channel [V, H, W, 1] -> gray radiance [V, H, W]."""
+        return image[..., 0]
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model to one file; see `saved_model.load_model`."""
+        t = self.tracks
+        tracks = {**t.tensors(), "times_us": t.times_us, "free": t.free, "rows": t.rows}
+        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks)
+        write_model(path, ModelFile(self.KIND, {}, tensors, provenance))
+
+    @classmethod
+    def from_file(cls, file: ModelFile, device: str) -> TrackedModel:
+        """What `save` wrote. Raises KeyError or TypeError for another version's."""
+        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
+        tracks = {k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()}
+        return cls(gaussians, Tracks(**tracks), file.provenance.duration_us)

@@ -9,7 +9,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.recipes import Budget, Model
-from spike4dgs.method.fit import FittedModel
+from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.splat import set_threads
 from spike4dgs.method.splat.threads import get_threads
 

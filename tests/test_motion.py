@@ -5,7 +5,7 @@ import pytest
 import torch
 from toy_world import ToyWorld
 
-from spike4dgs.method.fit import FittedModel
+from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Gaussians
 from spike4dgs.method.hexplane import plane_tv, time_smoothness, time_sparsity
@@ -105,5 +105,6 @@ def test_pictures_are_never_negative() -> None:
     g = gaussians()
     g.colors[:] = -1.0
     static = MOTIONS["static"](EXTENT, SETTINGS, seeded(0, 0))
-    image = FittedModel(g, static, 1000.0, "cpu").render(WORLD.cameras[0], 500.0)
+    model = FittedModel(g, static, 1000.0, "cpu", MotionSpec("static", EXTENT, SETTINGS))
+    image = model.render(WORLD.cameras[0], 500.0)
     assert image.dtype == np.float32 and (image == 0).all()

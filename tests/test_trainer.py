@@ -12,7 +12,8 @@ from spike4dgs.benchmark.recipes import Budget, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.method.density import Pressure, refine
-from spike4dgs.method.fit import FittedModel, Parts, RecipeMethod, Start, choose_ticks, film, measure
+from spike4dgs.method.fit import Parts, RecipeMethod, Start, choose_ticks, film, measure
+from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.motion import MOTIONS
 from spike4dgs.method.settings import TrainSettings, make_settings

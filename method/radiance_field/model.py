@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,8 +14,10 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.images import Float32
-from spike4dgs.method.fit import count_bytes
+from spike4dgs.benchmark.provenance import Provenance
+from spike4dgs.method.fitted_model import count_bytes
 from spike4dgs.method.hexplane import HexPlaneShape
+from spike4dgs.method.model_file import ModelFile, group, write_model
 from spike4dgs.method.radiance_field.blocks import in_blocks
 from spike4dgs.method.radiance_field.field import Deformation, Field, encode_position
 from spike4dgs.method.radiance_field.march import Rays, camera_rays, resample, spread, weigh
@@ -173,6 +177,8 @@ def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Ten
 class RadianceModel:
     """A fitted field as a model: renders a camera at a time."""
 
+    KIND: ClassVar = "radiance-field"
+
     field: DynamicField
     duration_us: float
     device: str
@@ -193,3 +199,21 @@ class RadianceModel:
                 for a in range(0, len(rays), RAYS_AT_ONCE)
             ]
         return torch.cat(parts).view(camera.height, camera.width).cpu().numpy()
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model to one file; see `saved_model.load_model`."""
+        field = self.field
+        bounds = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(field.bounds).items()}
+        config = {"shape": asdict(field.shape), "bounds": bounds, "brightest": field.fine.brightest}
+        write_model(path, ModelFile(self.KIND, config, group(field=field.state_dict()), provenance))
+
+    @classmethod
+    def from_file(cls, file: ModelFile, device: str) -> RadianceModel:
+        """What `save` wrote. Raises KeyError, TypeError or RuntimeError for another version's."""
+        config: dict[str, Any] = dict(file.config)
+        planes = {**config["shape"]["deformation"], "spatial": tuple(config["shape"]["deformation"]["spatial"])}
+        shape = FieldShape(**{**config["shape"], "deformation": HexPlaneShape(**planes)})
+        values = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in config["bounds"].items()}
+        field = DynamicField(shape, Bounds(**values), config["brightest"], torch.Generator())
+        field.load_state_dict(file.part("field"))
+        return cls(field.to(device), file.provenance.duration_us, device)

@@ -1,0 +1,93 @@
+"""What the one trainer gives: Gaussians and how they move, in memory and in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.images import Float32
+from spike4dgs.benchmark.provenance import Provenance
+from spike4dgs.method.gaussians import Gaussians
+from spike4dgs.method.model_file import ModelFile, group, write_model
+from spike4dgs.method.motion import MOTIONS, Extent, Motion
+from spike4dgs.method.settings import TrainSettings, make_settings
+from spike4dgs.method.splat import Splats, Views, render
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSpec:
+    """What a motion model is built from: with it and the model's state, it can be built again."""
+
+    name: str  # in `motion.MOTIONS`
+    extent: Extent
+    settings: TrainSettings
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        e = self.extent
+        extent = {"low": e.low.tolist(), "high": e.high.tolist(), "scale": e.scale, "n_ticks": e.n_ticks}
+        return {"name": self.name, "extent": {**extent, "width": e.width}, "settings": asdict(self.settings)}
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any], where: str) -> MotionSpec:
+        """What `as_dict` gave. Raises UserError for settings that are not there."""
+        extent = {**value["extent"], **{k: torch.tensor(value["extent"][k]) for k in ("low", "high")}}
+        return cls(value["name"], Extent(**extent), make_settings(value["settings"], where, TrainSettings()))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """Gaussians and how they move."""
+
+    KIND: ClassVar = "gaussians"
+
+    gaussians: Gaussians
+    motion: Motion
+    duration_us: float
+    device: str
+    spec: MotionSpec
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the Gaussians and of the motion model."""
+        return count_bytes([*self.gaussians.tensors().values(), *self.motion.state_dict().values()])
+
+    @torch.no_grad()
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        views = Views.from_cameras([camera], device=self.device)
+        image = render(self.splats(t_us), views).image
+        return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+
+    def splats(self, t_us: float) -> Splats:
+        """What is drawn at `t_us`."""
+        return self.motion.splats(self.gaussians, min(max(t_us / self.duration_us, 0.0), 1.0))
+
+    def picture(self, image: Tensor, views: Views) -> Tensor:
+        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        return self.motion.picture(image, views)
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model to one file; see `saved_model.load_model`."""
+        tensors = group(gaussians=self.gaussians.tensors(), motion=self.motion.state_dict())
+        write_model(path, ModelFile(self.KIND, {"motion": self.spec.as_dict()}, tensors, provenance))
+
+    @classmethod
+    def from_file(cls, file: ModelFile, device: str) -> FittedModel:
+        """What `save` wrote. Raises KeyError, TypeError, RuntimeError or UserError for another version's."""
+        spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
+        motion = MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator())
+        motion.load_state_dict(file.part("motion"))
+        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
+        return cls(gaussians, motion.to(device), file.provenance.duration_us, device, spec)
+
+
+def count_bytes(tensors: Iterable[Tensor]) -> int:
+    """What tensors take in a file."""
+    return sum(t.numel() * t.element_size() for t in tensors)
