@@ -2,19 +2,44 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 ALPHA = 0.2  # weight of the confidence's logarithm, DUSt3R's
+_SMALLEST = 1e-8  # of a mean distance
 
 
 def image_loss(images: Tensor, truth: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Mean |image - truth| over the pixels that count."""
-    raise NotImplementedError
+    """Mean |image - truth| over the pixels that count: all, or those of `valid` (bool); 0 where there is none.
+
+    `images` and `truth` have the same shape, in spikes per tick. Pixels whose truth is not finite never count.
+    """
+    counted = truth.isfinite() if valid is None else truth.isfinite() & valid
+    # Replaced before the difference: a NaN that is masked afterwards still has a gradient of NaN.
+    difference = (images - truth.where(counted, images.detach())).abs()
+    return _mean(difference, counted)
 
 
 def point_loss(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor) -> Tensor:
-    """mean(C |X / z - Xgt / zgt| - alpha log C) of `points` and `truth` [B, V, H, W, 3] in view 0's frame.
+    """DUSt3R's loss (eqs. 3 and 4 there) over V views: mean of C |X / z - Xgt / zgt| - alpha log C.
 
-    `confidence` and `valid` (bool) are [B, V, H, W].
+    `points` and `truth` [B, V, H, W, 3] are in view 0's frame; `confidence` C > 1 and `valid` (bool) are [B, V, H, W].
+    z and zgt are the mean distances of a sample's valid points to the origin, over all its views together: each
+    network output may have a scale of its own, and the views of a sample share one. The mean is over the valid pixels
+    of the batch; 0 where there is none. Points whose truth is not finite never count.
     """
-    raise NotImplementedError
+    counted = valid & truth.isfinite().all(dim=-1)
+    seen = truth.where(counted[..., None], torch.ones((), dtype=truth.dtype, device=truth.device))
+    distance = torch.linalg.vector_norm(normalized(points, counted) - normalized(seen, counted), dim=-1)
+    return _mean(confidence * distance - ALPHA * confidence.log(), counted)
+
+
+def normalized(points: Tensor, counted: Tensor) -> Tensor:
+    """Points [B, V, H, W, 3] over the mean distance to the origin of those of their sample that count [B, V, H, W]."""
+    distance = torch.linalg.vector_norm(points, dim=-1).where(counted, 0.0)
+    mean = distance.sum(dim=(1, 2, 3)) / counted.sum(dim=(1, 2, 3)).clamp(min=1)
+    return points / mean.clamp(min=_SMALLEST)[:, None, None, None, None]
+
+
+def _mean(values: Tensor, counted: Tensor) -> Tensor:
+    return values.where(counted, 0.0).sum() / counted.sum().clamp(min=1)

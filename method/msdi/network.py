@@ -24,7 +24,7 @@ from spike4dgs.method.msdi.dpt import Dpt, unpack
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
 from spike4dgs.method.msdi.transformer import NORM_EPS, Block, grid, initialize
 
-VIEW_IDS = 1000  # of Fast3R's table; view 0 has number 0
+VIEW_IDS = 1000  # numbers that views may have, as in Fast3R; view 0 has number 0
 _FUSION_EPS = 1e-5  # of Fast3R's fusion layers, unlike the encoder's
 
 
@@ -89,23 +89,20 @@ class Encoder(nn.Module):
 class FusionTransformer(nn.Module):
     """Eq. 10: all tokens of all views attend to each other (Fast3R). Views differ by the embedding of their number."""
 
-    ids: Tensor
-
     def __init__(self, config: MsdiConfig) -> None:
         super().__init__()
-        width = config.fusion_width
+        self.width = width = config.fusion_width
         self.hooks = config.hooks
         self.embed = nn.Linear(config.encoder_width, width)
         self.blocks = nn.ModuleList(Block(width, config.fusion_heads, _FUSION_EPS) for _ in range(config.fusion_layers))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
-        self.register_buffer("ids", _sinusoids(VIEW_IDS, width), persistent=False)
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> list[Tensor]:
         """Tokens [B, V, n, C] to those of the four hooks, each [B V, n, C']."""
         batch, views = tokens.shape[:2]
         numbers = view_numbers(batch, views, shuffled=self.training).to(tokens.device)
-        x = (self.embed(tokens) + self.ids[numbers][:, :, None]).flatten(1, 2)  # [B, V n, C']
+        x = (self.embed(tokens) + sinusoids(numbers, self.width)[:, :, None]).flatten(1, 2)  # [B, V n, C']
         layers = [tokens.flatten(0, 1)]
         for k, block in enumerate(self.blocks, start=1):
             x = block(x)
@@ -116,10 +113,10 @@ class FusionTransformer(nn.Module):
 
 
 def view_numbers(batch: int, views: int, *, shuffled: bool) -> Tensor:
-    """The views' numbers [B, V] in the table: view 0 has 0.
+    """The views' numbers [B, V], by which the network tells them apart: view 0 has 0.
 
-    In training the others are distinct random numbers, by torch's generator, so that all of the table is seen and no
-    order is learnt; in inference they are spread evenly. Raises UserError for more views than numbers.
+    In training the others are distinct random numbers, by torch's generator, so that all numbers are seen and no order
+    is learnt; in inference they are spread evenly. Raises UserError for more views than numbers.
     """
     if not 1 <= views <= VIEW_IDS:
         raise problem("MSDI", f"1 to {VIEW_IDS} views", str(views), "give it fewer views at a time")
@@ -131,11 +128,11 @@ def view_numbers(batch: int, views: int, *, shuffled: bool) -> Tensor:
     return torch.stack([functional.pad(row + 1, (1, 0)) for row in rows])
 
 
-def _sinusoids(count: int, width: int) -> Tensor:
-    """Sines, then cosines, of 0 ... count - 1 at falling frequencies: [count, width]."""
+def sinusoids(numbers: Tensor, width: int) -> Tensor:
+    """Sines, then cosines, of the numbers [...] at width / 2 falling frequencies: [..., width] float32."""
     half = width // 2
-    angle = torch.arange(count)[:, None] * 10000.0 ** (-torch.arange(half) / half)
-    return torch.cat([angle.sin(), angle.cos()], dim=1)
+    angle = numbers[..., None] * 10000.0 ** (-torch.arange(half, device=numbers.device) / half)
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
 
 class Msdi(nn.Module):

@@ -1,0 +1,128 @@
+"""Weights that users bring, for the configuration `paper`: Fast3R's or DUSt3R's published files.
+
+| file | what is taken |
+|---|---|
+| Fast3R, `model.safetensors` of jedyang97/Fast3R_ViT_Large_512 | encoder, fusion transformer and the global head |
+| DUSt3R, `model.safetensors` of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt | encoder |
+
+DUSt3R's decoders work on pairs of views and are 768 wide, and so are the tokens that its heads take; neither has a
+place here (Fast3R starts from the same part of it). Fast3R's second head, for points in each view's own frame, is
+left. What no file has - extractor, image generator, the mixing layer before the patch embedding, the embedding of
+rays - keeps its values and must be trained. The weights are their authors' and come under their licences; they are
+neither shipped nor downloaded. Only safetensors files are read: nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.msdi.network import Msdi
+
+_FIX = "use model.safetensors of jedyang97/Fast3R_ViT_Large_512 or naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What came out of a file."""
+
+    source: str  # "fast3r" or "dust3r"
+    taken: tuple[str, ...]  # names of the network's tensors that the file gave
+    fresh: tuple[str, ...]  # names of those that it has not, which keep their values
+    left: tuple[str, ...]  # names in the file that have no place here
+
+
+# Published name -> ours; the first pattern that matches counts. The head's names agree from `dpt.` on.
+_ENCODER = (
+    (r"patch_embed\.proj\.(.*)", r"encoder.patch_embed.\1"),
+    (r"enc_blocks\.(.*)", r"encoder.blocks.\1"),
+    (r"enc_norm\.(.*)", r"encoder.norm.\1"),
+)
+_FAST3R = (
+    *((rf"encoder\.{pattern}", ours) for pattern, ours in _ENCODER),
+    (r"decoder\.decoder_embed\.(.*)", r"fusion.embed.\1"),
+    (r"decoder\.dec_blocks\.(.*)", r"fusion.blocks.\1"),
+    (r"decoder\.dec_norm\.(.*)", r"fusion.norm.\1"),
+    (r"downstream_head\.dpt\.(.*)", r"head.\1"),
+)
+_RULES = {"fast3r": _FAST3R, "dust3r": _ENCODER}
+_PARTS = {"fast3r": ("encoder.", "fusion.", "head."), "dust3r": ("encoder.",)}
+_OURS = ("encoder.mix.", "encoder.ray_embed.")  # of those parts, what only this network has
+
+# Some files keep the other of two names that a layer of the head has.
+_HEAD_NAMES = (
+    (re.compile(r"scratch\.layer([1-4])_rn\."), "scratch.layer_rn.{}."),
+    (re.compile(r"dpt\.act_([1-4])_postprocess\."), "dpt.act_postprocess.{}."),
+)
+
+
+def canonical_head(name: str) -> str:
+    """The name of a head's layer that `dpt.Dpt` uses, from either of its published names."""
+    for pattern, ours in _HEAD_NAMES:
+        name = pattern.sub(lambda m, ours=ours: ours.format(int(m[1]) - 1), name)  # type: ignore[misc]
+    return name
+
+
+def read_state(path: Path, fix: str) -> dict[str, Tensor]:
+    """The tensors of a safetensors file. Raises UserError with `fix` where it is no such file or damaged."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as e:
+        raise problem(path, "weights in safetensors format", str(e)[:120], fix) from None
+
+
+def source_of(names: Mapping[str, Tensor]) -> str | None:
+    """Whose state dict this is: "fast3r", "dust3r" or None."""
+    if any(name.startswith("decoder.dec_blocks.") for name in names):
+        return "fast3r"
+    if any(name.startswith("dec_blocks2.") for name in names):
+        return "dust3r"
+    return None
+
+
+def renamed(state: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    """Tensors under this network's names, and the names in the file that have no place here."""
+    ours: dict[str, Tensor] = {}
+    left = []
+    for name, tensor in state.items():
+        for pattern, replacement in _RULES[source]:
+            if match := re.fullmatch(pattern, canonical_head(name)):
+                ours[match.expand(replacement)] = tensor
+                break
+        else:
+            left.append(name)
+    return ours, tuple(left)
+
+
+def load_pretrained(network: Msdi, path: Path) -> Transfer:
+    """Take what a file of Fast3R or DUSt3R has for `network`, in place, and say what was taken.
+
+    Raises UserError where the file is neither's, is damaged, or is of other sizes than the network.
+    """
+    state = read_state(path, _FIX)
+    source = source_of(state)
+    if source is None:
+        raise problem(path, "the tensors of Fast3R or DUSt3R", f"others, such as {min(state, default='none')}", _FIX)
+    found, left = renamed(state, source)
+    own = network.state_dict()
+    wanted = {n for n in own if n.startswith(_PARTS[source]) and not n.startswith(_OURS)}
+    shapes = {n: tuple(t.shape) for n, t in found.items()}
+    if wrong := sorted(n for n in wanted | shapes.keys() if n not in own or shapes.get(n) != tuple(own[n].shape)):
+        first = wrong[0]
+        what = f"{len(wrong)} other tensors, the first {first} {shapes.get(first, 'missing')}"
+        expected = f"the {len(wanted)} tensors of {source} that configuration {network.config.name} takes"
+        raise problem(path, expected, what, _FIX)
+    with torch.no_grad():
+        for name, tensor in found.items():
+            own[name].copy_(tensor)
+    taken = tuple(sorted(found))
+    return Transfer(source, taken, tuple(n for n in own if n not in found), left)

@@ -1,0 +1,205 @@
+"""Camera poses from MSDI's points: PnP with RANSAC per view, with or without known intrinsics (section 3.3).
+
+Each pixel of a view names the point that it sees, in view 0's frame. SQPnP within RANSAC finds the pose under which
+most points fall on their pixels; Levenberg-Marquardt refines it on those, twice, the second time on what the first
+result counts in. Where no pose holds, the view has none, with the reason; a wrong pose is worse than no pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from spike4dgs.method.msdi.network import Estimate
+
+Float64 = NDArray[np.float64]
+
+FOCAL_ROUNDS = 10
+LEAST_POINTS = 6
+
+
+@dataclass(frozen=True)
+class PnpSettings:
+    """What counts as a pose.
+
+    DUSt3R and Fast3R take 10 rounds at 5 px of 512. With a third of the points right, a sample of four is right in one
+    of 81 rounds: 10 rounds mostly miss. RANSAC stops by itself once it is sure.
+    """
+
+    rounds: int = 2000
+    certainty: float = 0.9999
+    reach: float = 0.01  # of the picture's longer side: a point within this distance of its pixel is an inlier
+    least_inliers: float = 0.1  # share of the points below which a pose counts as none
+    least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
+    most_points: int = 4000  # evenly drawn from a view's points; more take longer and find no other pose
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPose:
+    """A view's pose, or why there is none."""
+
+    w2c: Float64 | None  # [4, 4] from view 0's frame to the camera's, OpenCV axes
+    inlier_share: float  # of the points used; 0 without a pose
+    focal_px: float | None  # estimated, where the intrinsics were unknown
+    reason: str = ""  # why there is no pose
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose."""
+        return self.w2c is not None
+
+
+def poses_of(estimate: Estimate, intrinsics: Float64 | None, seed: int = 0) -> list[list[ViewPose]]:
+    """Poses of each sample's views from what the network gave; `intrinsics` [B, V, 3, 3] or None. See `solve_poses`."""
+    points = estimate.points.detach().double().cpu().numpy()
+    confidence = estimate.confidence.detach().double().cpu().numpy()
+    known = [None] * len(points) if intrinsics is None else list(intrinsics)
+    return [solve_poses(p, c, K, seed) for p, c, K in zip(points, confidence, known, strict=True)]
+
+
+def solve_poses(
+    points: Float64,
+    confidence: Float64,
+    intrinsics: Float64 | None,
+    seed: int = 0,
+    settings: PnpSettings | None = None,
+) -> list[ViewPose]:
+    """The pose of each view from points [V, H, W, 3] in view 0's frame and their confidence [V, H, W].
+
+    `intrinsics` [V, 3, 3] are in pixels. Where they are None, the focal length of view 0's points serves all views,
+    with square pixels and the principal point in the middle. View 0's pose is the identity by definition; its inlier
+    share says how well its points fit. The same seed gives the same poses. Nothing is raised for bad points: such a
+    view has no pose.
+    """
+    settings = settings or PnpSettings()
+    height, width = confidence.shape[1:]
+    chosen = [_chosen(p, c, settings, seed) for p, c in zip(points, confidence, strict=True)]
+    focal = None
+    if intrinsics is None:
+        pixels, at = chosen[0]
+        focal = focal_from_points(at, pixels - np.array([width / 2, height / 2]))
+        if focal is None:
+            return [ViewPose(None, 0.0, None, "no focal length fits the points of view 0")] * len(points)
+        intrinsics = np.tile([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], (len(points), 1, 1))
+    reach_px = settings.reach * max(height, width)
+    first = _inliers(np.eye(3), np.zeros(3), chosen[0][1], chosen[0][0], intrinsics[0], reach_px)
+    poses = [ViewPose(np.eye(4), float(first.mean()) if len(first) else 0.0, focal)]
+    for (pixels, at), K in zip(chosen[1:], intrinsics[1:], strict=True):
+        poses.append(_pose(at, pixels, np.asarray(K, np.float64), focal, reach_px, seed, settings))
+    return poses
+
+
+def _pose(
+    points: Float64,
+    pixels: Float64,
+    K: Float64,
+    focal: float | None,
+    reach_px: float,
+    seed: int,
+    settings: PnpSettings,
+) -> ViewPose:
+    if len(points) < LEAST_POINTS:
+        return ViewPose(None, 0.0, focal, f"{len(points)} usable points, fewer than {LEAST_POINTS}")
+    found = solve_pose(points, pixels, K, seed, reach_px=reach_px, settings=settings)
+    if found is None:
+        return ViewPose(None, 0.0, focal, "no pose agrees with the points")
+    share = float(_inliers(*found, points, pixels, K, reach_px).mean())
+    if share < settings.least_inliers:
+        return ViewPose(None, 0.0, focal, f"the best pose agrees with {share:.0%} of the points")
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = found
+    return ViewPose(w2c, share, focal)
+
+
+def solve_pose(
+    points: Float64,
+    pixels: Float64,
+    K: Float64,
+    seed: int,
+    *,
+    reach_px: float,
+    settings: PnpSettings | None = None,
+) -> tuple[Float64, Float64] | None:
+    """World-to-camera (R [3, 3], t [3]) from points [N, 3] and their pixels [N, 2]; None where RANSAC finds no pose.
+
+    Points within `reach_px` of their pixel are inliers. The same seed gives the same pose.
+    """
+    settings = settings or PnpSettings()
+    # Points of unit size around the origin, which changes no pixel: OpenCV's thresholds assume such numbers.
+    middle = np.median(points, axis=0)
+    size = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    if not size > 0:
+        return None
+    points, pixels = (np.ascontiguousarray(x, np.float64) for x in ((points - middle) / size, pixels))
+    cv2.setRNGSeed(seed)
+    try:
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            points,
+            pixels,
+            K,
+            None,
+            iterationsCount=settings.rounds,
+            reprojectionError=reach_px,
+            confidence=settings.certainty,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if not found or inliers is None or len(inliers) < LEAST_POINTS:
+            return None
+        good = inliers[:, 0]
+        for _ in range(2):
+            turn, shift = cv2.solvePnPRefineLM(points[good], pixels[good], K, None, turn, shift)
+            R, t = cv2.Rodrigues(turn)[0], shift[:, 0]
+            good = np.flatnonzero(_inliers(R, t, points, pixels, K, reach_px))
+            if len(good) < LEAST_POINTS:
+                return None
+    except cv2.error:  # degenerate points, such as all on a line
+        return None
+    if not (np.isfinite(R).all() and np.isfinite(t).all()):
+        return None
+    return np.asarray(R, np.float64), np.asarray(size * t - R @ middle, np.float64)
+
+
+def _inliers(
+    R: Float64, t: Float64, points: Float64, pixels: Float64, K: Float64, reach_px: float
+) -> NDArray[np.bool_]:
+    """Which points [N, 3] lie before the camera and within `reach_px` of their pixels [N, 2]."""
+    p = points @ R.T + t
+    ahead = p[:, 2] > 1e-9
+    q = p @ K.T
+    uv = q[:, :2] / np.where(ahead, p[:, 2], 1.0)[:, None]
+    return ahead & (np.linalg.norm(uv - pixels, axis=1) <= reach_px)
+
+
+def _chosen(points: Float64, confidence: Float64, settings: PnpSettings, seed: int) -> tuple[Float64, Float64]:
+    """Pixel centres [N, 2] and points [N, 3] of a view's finite points of sufficient confidence."""
+    usable = np.isfinite(points).all(axis=-1) & np.isfinite(confidence)
+    if usable.any():
+        usable &= confidence >= np.quantile(confidence[usable], settings.least_confidence)
+    v, u = np.nonzero(usable)
+    if len(v) > settings.most_points:
+        few = np.sort(np.random.default_rng(seed).permutation(len(v))[: settings.most_points])
+        v, u = v[few], u[few]
+    return np.stack([u + 0.5, v + 0.5], axis=-1), points[v, u]
+
+
+def focal_from_points(points: Float64, offsets: Float64) -> float | None:
+    """The focal length f in px that makes sum |p - f q| smallest, q = (x / z, y / z) of points [N, 3] (Weiszfeld).
+
+    `offsets` p [N, 2] are pixels relative to the principal point. Each round solves the least squares that the last
+    one's residuals weigh; points that do not lie before the camera are left out. None where no positive one fits.
+    """
+    ahead = points[:, 2] > 1e-9
+    q, p = points[ahead, :2] / points[ahead, 2:], offsets[ahead]
+    qp, qq = np.sum(q * p, axis=1), np.sum(q * q, axis=1)
+    if not qq.sum() > 0:
+        return None
+    focal = qp.sum() / qq.sum()
+    for _ in range(FOCAL_ROUNDS):
+        weights = 1 / np.maximum(np.linalg.norm(p - focal * q, axis=1), 1e-8)
+        focal = (weights * qp).sum() / (weights * qq).sum()
+    return float(focal) if focal > 0 else None
