@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.calibration import Calibration, Recordings, estimate
 from spike4dgs.benchmark.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
@@ -51,6 +52,13 @@ class TrainingScene:
     rate_hz: float
     n_ticks: int
     radiance_gain: float  # spikes per tick of a pixel that sees radiance 1 (white)
+    recordings: tuple[Recordings | None, ...] = ()  # calibration recordings of each camera, if there are any
+
+    @cached_property
+    def calibrations(self) -> tuple[Calibration, ...] | None:
+        """What each camera does to light, estimated from its recordings; None unless all cameras have some."""
+        known = [r for r in self.recordings if r is not None]
+        return tuple(estimate(r) for r in known) if known and len(known) == len(self.cameras) else None
 
     @property
     def duration_us(self) -> float:
@@ -127,6 +135,17 @@ class Scene:
         bottom_up = bool(self.meta["sensor"]["rows_bottom_up"])
         return open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks)
 
+    def recordings(self, camera: str) -> Recordings | None:
+        """A camera's recordings before uniform light and in the dark; None where the scene has none."""
+        facts, c = self.meta.get("calibration", {}), self.cameras[camera]
+        if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
+            return None
+        bottom_up, streams = bool(self.meta["sensor"]["rows_bottom_up"]), []
+        for name in ("flat", "dark"):
+            path, ticks = self.manifest.path(f"calibration/{name}/{camera}.dat"), int(facts[f"{name}_ticks"])
+            streams.append(open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=ticks))
+        return Recordings(streams[0], streams[1], float(facts["flat_radiance"]))
+
     def ground_truth(self, target: Target) -> NDArray[np.float32]:
         """Radiance of a target, [H, W] float32."""
         return read_exr(self.manifest.path(f"images/{target.name}.exr"))
@@ -144,7 +163,9 @@ class Scene:
         """The part of the scene that methods see."""
         cameras = tuple(self.cameras[c] for c in self.train)
         streams = tuple(self.stream(c) for c in self.train)
-        return TrainingScene(self.id, self.revision, cameras, streams, self.rate_hz, self.n_ticks, self.radiance_gain)
+        clock = self.rate_hz, self.n_ticks, self.radiance_gain
+        recordings = tuple(self.recordings(c) for c in self.train)
+        return TrainingScene(self.id, self.revision, cameras, streams, *clock, recordings)
 
 
 def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = None) -> Scene:

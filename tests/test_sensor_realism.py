@@ -7,8 +7,8 @@ import pytest
 from conftest import shared_file
 from scipy.ndimage import gaussian_filter
 
+from spike4dgs.benchmark.calibration import rates
 from spike4dgs.benchmark.spikes import open_stream
-from spike4dgs.generators.calibration import rates
 from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
 from spike4dgs.generators.sensor_maps import dark_map, gain_map
 from spike4dgs.generators.sensor_statistics import WINDOWS, excess_variance, local_spread, stream_statistics
