@@ -61,8 +61,10 @@ class TrainSettings:
     smooth_weight: float = 1e-3
     sparse_weight: float = 1e-4
 
-    # Spike rendering.
-    spike_ticks: int = 40  # ticks for which a picture is fired, as many as TFP's window has
+    # Losses on spikes.
+    spike_ticks: int = 40  # ticks of a recorded window, as many as TFP's has
+    value_ticks: int = 40  # that a neuron fires for one spike value of SPSS; 1 makes it binary (see spike_variation)
+    phi_rate: float = 1e-3
     noise_rate: float = 1e-3
     noise_weight: float = 30.0  # of the noise embedding's mean square; with 0.1 it takes the pictures' edges: 7 dB lost
 

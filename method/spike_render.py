@@ -16,15 +16,13 @@ that a(x) alone could explain what it sees.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.method.optimizer import Decay
 from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.spike_cameras import fire, random_charge, recorded
 from spike4dgs.method.supervision_model import Render, Sample, Supervision, difference
 
 
@@ -40,43 +38,16 @@ class SpikeRender(Supervision):
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """The loss of one rendered sample."""
         s, gain = self.settings, self.scene.radiance_gain
-        start = max(0, sample.tick - s.spike_ticks // 2)
-        stop = min(self.scene.n_ticks, sample.tick + s.spike_ticks // 2)
-        recorded = np.stack([self.scene.streams[v].counts(start, stop) for v in sample.views])
+        counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         image = render(sample.t)
         noise = self.noise[list(sample.views)]
         rate = gain * (image * noise[:, 0].exp() + noise[:, 1])
-        # A camera's charge at a window's start is anything from 0 to 1. Drawn anew for each step, it makes the
-        # expected loss least at the right rate; a fixed one would leave rates free within a spike per window.
-        charge = torch.rand(rate.shape, generator=torch.Generator().manual_seed(sample.step)).to(rate)
-        unit = (stop - start) * gain
-        truth = torch.from_numpy(recorded.astype(np.float32)).to(rate) / unit
-        loss = difference(fire(rate, charge, stop - start) / unit, truth, s.ssim_weight)
+        unit = ticks * gain
+        fired = fire(rate, random_charge(rate, sample.step), ticks)
+        loss = difference(fired / unit, counts.to(rate) / unit, s.ssim_weight)
         return loss + s.noise_weight * noise.square().mean()
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
         """The noise embedding."""
         rate = self.settings.noise_rate
         return {"noise": ([self.noise], Decay(rate, rate))}
-
-
-def fire(rate: Tensor, charge: Tensor, ticks: int) -> Tensor:
-    """Spikes in `ticks` ticks of neurons that gather `rate` per tick from `charge` in [0, 1); threshold 1.
-
-    A neuron that loses 1 with each spike fires floor(charge + ticks rate) times while the rate lies in [0, 1], never
-    below, at every tick above. The gradient is straight through, ticks per unit of rate: exactly that of the count's
-    mean over all charges where the rate lies in (0, 1); beyond, it still draws the rate back.
-    """
-    spikes: Tensor = _Fire.apply(rate, charge, ticks)
-    return spikes
-
-
-class _Fire(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, rate: Tensor, charge: Tensor, ticks: int) -> Tensor:
-        ctx.ticks = ticks
-        return torch.floor(charge + ticks * rate).clamp(0, ticks)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        return grads[0] * ctx.ticks, None, None

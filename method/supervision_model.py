@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.optimizer import Decay
@@ -38,6 +39,10 @@ class Supervision(nn.Module):
 
 
 def difference(image: Tensor, picture: Tensor, w: float) -> Tensor:
-    """(1 - w) mean |image - picture| + w (1 - SSIM) of batches [V, H, W]."""
+    """(1 - w) mean |image - picture| + w (1 - SSIM) of batches [V, H, W].
+
+    A pixel of `picture` that is no number counts as met.
+    """
+    picture = torch.where(picture.isfinite(), picture, image.detach())
     absolute = (image - picture).abs().mean()
     return (1 - w) * absolute + w * (1 - ssim(image, picture)) if w else absolute

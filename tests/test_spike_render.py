@@ -9,7 +9,8 @@ import torch
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.method.settings import TrainSettings
-from spike4dgs.method.spike_render import SpikeRender, fire
+from spike4dgs.method.spike_cameras import fire
+from spike4dgs.method.spike_render import SpikeRender
 from spike4dgs.method.supervision import SUPERVISIONS
 from spike4dgs.method.supervision_model import Sample
 
