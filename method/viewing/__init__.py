@@ -1,0 +1,1 @@
+"""Looking at fitted models: camera paths, videos, the viewer, and how fast a model renders."""

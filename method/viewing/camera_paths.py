@@ -1,0 +1,127 @@
+"""Cameras that move: functions of s in [0, 1], laid out from the training cameras.
+
+Nothing is known of a scene but what the training cameras saw, so every path stays among them: a circle around the scene
+would show its back, which no view has seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from spike4dgs.benchmark.cameras import Camera, Float64, look_at
+from spike4dgs.benchmark.errors import problem
+
+Path = Callable[[float], Camera]
+PathName = Literal["orbit", "rig", "still"]
+ALONE = 0.05  # radius of the orbit around a single camera, in distances to what it looks at
+FAR = 5.0  # distance of the focus of cameras whose axes never meet, in radii of the array
+PARALLEL = 1e-4  # smallest eigenvalue, per camera, below which axes count as parallel: about half a degree
+
+
+def make_path(name: PathName, cameras: Sequence[Camera], camera: str | None = None) -> Path:
+    """The path called `name`; `still` stands at the training camera `camera`, or at the middle one."""
+    if camera is not None and name != "still":
+        raise problem("--camera", "--path still beside it", f"--path {name}", "leave one of them out")
+    if name == "orbit":
+        return orbit(cameras)
+    return rig(cameras) if name == "rig" else still(cameras, camera)
+
+
+def focus(cameras: Sequence[Camera]) -> Float64:
+    """The point [3] that is nearest to all optical axes: what an array looks at.
+
+    min over x of sum |(I - d d^T) (x - c)|^2. Where the axes are parallel, or meet behind the array, it is a point on
+    the mean axis, five of the array's radii away.
+    """
+    centers, axes = np.stack([c.center for c in cameras]), np.stack([c.R[2] for c in cameras])
+    middle, forward = centers.mean(0), axes.mean(0) / np.linalg.norm(axes.mean(0))
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3]
+    total = across.sum(0)
+    if np.linalg.eigvalsh(total)[0] > PARALLEL * len(cameras):
+        found = np.linalg.solve(total, np.einsum("cij,cj->i", across, centers))
+        if (found - middle) @ forward > 0:
+            return np.asarray(found)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max()) or 1.0
+    return np.asarray(middle + FAR * radius * forward)
+
+
+def orbit(cameras: Sequence[Camera]) -> Path:
+    """A closed ellipse as wide and as high as the array, around its middle, always looking at the focus."""
+    centers, target = np.stack([c.center for c in cameras]), focus(cameras)
+    middle, up = centers.mean(0), -np.mean([c.R[1] for c in cameras], axis=0)
+    first = look_at("orbit", middle, target, up, focal=1.0, width=1, height=1)
+    right, down = first.R[0], first.R[1]
+    reach = [float(np.abs((centers - middle) @ axis).max()) for axis in (right, down)]
+    if max(reach) == 0:
+        reach = [ALONE * float(np.linalg.norm(target - middle))] * 2
+    focal = float(np.mean([(c.fx + c.fy) / 2 for c in cameras]))
+    size = cameras[0]
+
+    def at(s: float) -> Camera:
+        angle = 2 * math.pi * s
+        place = middle + reach[0] * math.cos(angle) * right + reach[1] * math.sin(angle) * down
+        return look_at("orbit", place, target, up, focal=focal, width=size.width, height=size.height)
+
+    return at
+
+
+def rig(cameras: Sequence[Camera]) -> Path:
+    """From training camera to training camera, each time to the nearest one that was not visited, with soft stops."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    order = visiting_order(np.stack([c.center for c in cameras]))
+    stops = [cameras[i] for i in order]
+    turns = Rotation.from_matrix(np.stack([c.R for c in stops]))
+
+    def at(s: float) -> Camera:
+        place = min(max(s, 0.0), 1.0) * (len(stops) - 1)
+        i = min(int(place), max(len(stops) - 2, 0))
+        w = place - i
+        w = w * w * (3 - 2 * w)
+        a, b = stops[i], stops[min(i + 1, len(stops) - 1)]
+        R = Slerp([0.0, 1.0], turns[[i, min(i + 1, len(stops) - 1)]])(w).as_matrix()
+        values = {k: (1 - w) * getattr(a, k) + w * getattr(b, k) for k in ("fx", "fy", "cx", "cy")}
+        center = (1 - w) * a.center + w * b.center
+        return replace(stops[0], id="rig", R=R, t=-R @ center, **values)
+
+    return at
+
+
+def visiting_order(centers: Float64) -> list[int]:
+    """Indices of places [C, 3]: the one farthest from the middle first, then always the nearest that is left."""
+    left = set(range(len(centers)))
+    here = int(np.argmax(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    order = [here]
+    while left := left - {here}:
+        here = min(left, key=lambda i: (round(float(np.linalg.norm(centers[i] - centers[here])), 9), i))
+        order.append(here)
+    return order
+
+
+def still(cameras: Sequence[Camera], name: str | None = None) -> Path:
+    """One training camera, at all times. Raises UserError for a name that none has."""
+    known = {c.id: c for c in cameras}
+    if name is None:
+        middle = np.mean([c.center for c in cameras], axis=0)
+        chosen = min(cameras, key=lambda c: float(np.linalg.norm(c.center - middle)))
+    elif name in known:
+        chosen = known[name]
+    else:
+        raise problem("--camera", f"one of {', '.join(known)}", repr(name), "name one of them")
+    return lambda s: chosen
+
+
+def resized(camera: Camera, scale: float) -> Camera:
+    """The same view with `scale` times as many pixels each way, rounded to even numbers, which video codecs need.
+
+    A view is stretched by what the rounding takes, at most a pixel.
+    """
+    width, height = (max(2, 2 * round(scale * n / 2)) for n in (camera.width, camera.height))
+    x, y = width / camera.width, height / camera.height
+    sizes = {"fx": x * camera.fx, "fy": y * camera.fy, "cx": x * camera.cx, "cy": y * camera.cy}
+    return replace(camera, width=width, height=height, **sizes)

@@ -1,0 +1,101 @@
+"""`render`: a video of a fitted model in slow motion, along a path of cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.images import UInt8, encode_srgb, write_png
+from spike4dgs.method.saved_model import SavedModel, load_model
+from spike4dgs.method.viewing import camera_paths
+from spike4dgs.method.viewing.camera_paths import PathName, make_path, resized
+from spike4dgs.method.viewing.video import Write, check_video, video_writer
+
+
+def render(
+    model: Positional[Path],
+    *,
+    path: PathName = "orbit",
+    camera: str | None = None,
+    slow_motion: float = 1000.0,
+    fps: float = 30.0,
+    scale: float = 2.0,
+    out: Path | None = None,
+    frames: Path | None = None,
+    device: str = "cpu",
+) -> int:
+    """Render a fitted model along a path of cameras, in slow motion, to a video or a folder of pictures.
+
+    Args:
+        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        path: orbit: an ellipse as large as the camera array, around its middle; rig: from training camera to training
+            camera; still: one of them.
+        camera: The training camera of `still`; the middle one if left out.
+        slow_motion: How many times slower than the world; 1000 makes 20 s of 20 ms.
+        fps: Frames per second of the video.
+        scale: Size, as a multiple of the training views' each way.
+        out: Video, .mp4 (VP9) or .avi (Motion JPEG); SCENE-PATH.mp4 if left out, or none where --frames is given.
+        frames: New folder for the frames as PNG.
+        device: cpu or cuda.
+    """
+    for name, value in (("--slow-motion", slow_motion), ("--fps", fps), ("--scale", scale)):
+        if not 0 < value < math.inf:
+            raise problem(name, "a positive number", f"{value:g}", "correct it")
+    saved = load_model(model, device)
+    if out is None and frames is None:
+        out = Path(f"{saved.provenance.scene}-{path}.mp4")
+    if out is not None:
+        check_video(out)
+    if frames is not None:
+        check_new(frames)
+    times = frame_times(saved.provenance.duration_us, slow_motion, fps)
+    views = make_path(path, saved.provenance.cameras, camera)
+    first = resized(views(0.0), scale)
+    with ExitStack() as stack:
+        writers: list[Write] = []
+        if out is not None:
+            writers.append(stack.enter_context(video_writer(out, (first.width, first.height), fps)))
+        if frames is not None:
+            writers.append(png_writer(frames))
+        for picture in _shown(pictures(saved, views, times, scale), len(times), saved.title):
+            for write in writers:
+                write(picture)
+    seconds = len(times) / fps
+    for target in filter(None, (out, frames)):
+        print(f"{target}: {len(times)} frames of {first.width}x{first.height}, {seconds:.1f} s at {fps:g} frames/s")
+    return 0
+
+
+def frame_times(duration_us: float, slow_motion: float, fps: float) -> list[float]:
+    """Times in the clip, in microseconds, of the frames of a video that plays it `slow_motion` times slower."""
+    step_us = 1e6 / (fps * slow_motion)
+    count = max(1, math.ceil(duration_us / step_us - 1e-9))
+    return [i * step_us for i in range(count)]
+
+
+def pictures(saved: SavedModel, path: camera_paths.Path, times: list[float], scale: float) -> Iterator[UInt8]:
+    """The frames [H, W]: the model along the path, at each of the times, sRGB-encoded."""
+    for i, t_us in enumerate(times):
+        camera = resized(path(i / max(len(times) - 1, 1)), scale)
+        yield encode_srgb(saved.model.render(camera, t_us))
+
+
+def png_writer(folder: Path) -> Write:
+    """What writes frames as FOLDER/00000.png and so on."""
+    count = iter(range(10**9))
+    return lambda picture: write_png(folder / f"{next(count):05d}.png", picture)
+
+
+def _shown(frames: Iterator[UInt8], total: int, title: str) -> Iterator[UInt8]:
+    """The same frames, with a progress bar on a terminal."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console()
+    yield from track(frames, title, total, console=console, transient=True, disable=not console.is_terminal)

@@ -1,0 +1,137 @@
+"""`speed render`: how fast saved models render, side by side in one process, and how far from float64.
+
+Models take turns at every camera and time, so that whatever else the machine does meets all of them alike. The exact
+picture is composited in float64 at some patches; how a model moves its Gaussians is not part of the comparison.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.images import Float32
+from spike4dgs.benchmark.timing import show_table
+from spike4dgs.method.saved_model import SavedModel, load_model
+from spike4dgs.method.splat import Splats, Views
+from spike4dgs.method.splat import render as rasterise
+from spike4dgs.method.splat.reference import Projection, composite, project
+from spike4dgs.method.trainer import one_torch_thread
+from spike4dgs.method.viewing.camera_paths import resized
+
+PATCH = (32, 16)  # px, width and height
+PATCHES = ((0.2, 0.3), (0.5, 0.3), (0.8, 0.3), (0.2, 0.7), (0.5, 0.7), (0.8, 0.7))  # their middles, in pictures
+
+
+@runtime_checkable
+class Splatting(Protocol):
+    """A model that draws Gaussians."""
+
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        """Gray linear radiance [H, W]."""
+        ...
+
+    def splats(self, t_us: float) -> Splats:
+        """What is drawn at `t_us`."""
+        ...
+
+    def picture(self, image: Tensor, views: Views) -> Tensor:
+        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        ...
+
+
+def render(argv: Sequence[str] = ()) -> int:
+    """Time the pictures of saved models at the training cameras, over the clip, and compare them with float64."""
+    p = argparse.ArgumentParser("spike4dgs speed render", description=render.__doc__)
+    p.add_argument("models", type=Path, nargs="+", help="OUT/models/METHOD/SCENE.safetensors")
+    p.add_argument("--times", type=int, default=10, help="times of the clip at each camera")
+    p.add_argument("--scale", type=float, default=1.0, help="size, as a multiple of the training views' each way")
+    p.add_argument("--device", default="cpu", help="cpu or cuda")
+    p.add_argument("--csv", type=Path, help="write the table here too")
+    a = p.parse_args(list(argv))
+    models = [load_model(path, a.device) for path in a.models]
+    shots = [_shots(m, a.times, a.scale) for m in models]
+    with one_torch_thread():
+        for m, s in zip(models, shots, strict=True):
+            m.model.render(*s[0])  # compilation
+        times: list[list[float]] = [[] for _ in models]
+        for turn in range(max(map(len, shots))):
+            for i, m in enumerate(models):
+                times[i].append(_time_ms(m, *shots[i][turn % len(shots[i])]))
+        rows = [_row(*of) for of in zip(models, shots, times, strict=True)]
+    columns = ("model", "pixels", "Gaussians", "min ms", "median ms", "frames/s", "mean error", "largest error")
+    threads = f"{a.device}, torch {torch.__version__} on one thread beside the kernels' own"
+    show_table(f"Pictures of saved models; {threads}; errors against float64", columns, rows, a.csv)
+    return 0
+
+
+def _shots(saved: SavedModel, times: int, scale: float) -> list[tuple[Camera, float]]:
+    """Every training camera at `times` times in the middle of equal parts of the clip; cameras take turns."""
+    about = saved.provenance
+    cameras = [c if scale == 1 else resized(c, scale) for c in about.cameras]
+    return [(c, (i + 0.5) / times * about.duration_us) for i in range(times) for c in cameras]
+
+
+def _time_ms(saved: SavedModel, camera: Camera, t_us: float) -> float:
+    start = time.perf_counter()
+    saved.model.render(camera, t_us)  # a picture in memory of the host: a GPU has finished
+    return 1e3 * (time.perf_counter() - start)
+
+
+def _row(saved: SavedModel, shots: list[tuple[Camera, float]], times_ms: list[float]) -> tuple[str, ...]:
+    median, camera = statistics.median(times_ms), shots[0][0]
+    shown = (f"{min(times_ms):.2f}", f"{median:.2f}", f"{1e3 / median:.0f}")
+    name = (saved.title, f"{camera.width}x{camera.height}")
+    if not isinstance(saved.model, Splatting):
+        return *name, "", *shown, "", ""
+    differences = np.concatenate([d.ravel() for shot in shots[:: max(1, len(shots) // 3)][:3]
+                                  for d in errors(saved.model, *shot)])  # fmt: skip
+    count = str(len(saved.model.splats(shots[0][1])))
+    return *name, count, *shown, f"{differences.mean():.1e}", f"{differences.max():.1e}"
+
+
+@torch.no_grad()
+def errors(model: Splatting, camera: Camera, t_us: float) -> Iterator[Float32]:
+    """Absolute differences [h, w] of a model's picture from the exact one, at patches of it."""
+    picture = model.render(camera, t_us)
+    width, height = min(PATCH[0], camera.width), min(PATCH[1], camera.height)
+    for u, v in PATCHES:
+        x = min(max(int(u * camera.width) - width // 2, 0), camera.width - width)
+        y = min(max(int(v * camera.height) - height // 2, 0), camera.height - height)
+        exact = exact_patch(model, camera, t_us, (x, y), (width, height))
+        yield np.abs(picture[y : y + height, x : x + width] - exact)
+
+
+@torch.no_grad()
+def exact_patch(
+    model: Splatting, camera: Camera, t_us: float, corner: tuple[int, int], size: tuple[int, int]
+) -> Float32:
+    """Part of a model's picture, composited in float64: `size` (width, height) pixels from `corner` (x, y) on: [h, w].
+
+    The Gaussians are projected as for the whole picture; those that cannot reach the patch are left out.
+    """
+    defaults = rasterise.__kwdefaults__
+    drawn, views = model.splats(t_us), Views.from_cameras([camera])
+    wide = Splats(*(t.double().cpu() for t in (*drawn.geometry, drawn.colors)))
+    whole = (camera.width, camera.height)
+    seen = project(wide, views.w2c[0], views.K[0], whole, False, defaults["near"], defaults["eps2d"])
+    offset = torch.tensor(corner, dtype=torch.float64)
+    half = torch.tensor(size, dtype=torch.float64) / 2
+    near = ((seen.center - offset - half).abs() <= half + seen.radius[:, None]).all(-1)
+    part = Projection(*(getattr(seen, f.name)[near] for f in fields(seen)))
+    image, _ = composite(part, part.center - offset, wide.colors[part.index], size)
+    K = views.K.clone()
+    K[:, :2, 2] -= offset
+    device = drawn.means.device
+    cut = Views(views.w2c.to(device), K.to(device), *size)
+    picture = model.picture(image[None].to(drawn.colors), cut)
+    return picture[0].clamp(min=0).cpu().numpy()

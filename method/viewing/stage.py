@@ -1,0 +1,129 @@
+"""What the viewer shows: the model's picture, what the spikes say, and the difference of the two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.images import Float32, UInt8, encode_srgb
+from spike4dgs.benchmark.scene import TrainingScene, open_scene
+from spike4dgs.method.saved_model import SavedModel
+
+Mode = Literal["rendered", "spike rate", "error"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+WINDOW_TICKS = 40  # of the spike rate: 2 ms at 20 kHz, in which a bright pixel fires 24 times
+ERROR_MAX = 0.3  # white in an error picture, as in the sheets of a run
+BORDER = 24  # gray around a picture that is not as wide or high as the window
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A model, and the spikes that it was fitted to if the scene is at hand."""
+
+    saved: SavedModel
+    scene: TrainingScene | None = None
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The training cameras, as calibrated."""
+        return self.saved.provenance.cameras
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """What can be shown: without the scene there are no spikes."""
+        return MODES if self.scene else MODES[:1]
+
+    def picture(self, mode: Mode, camera: Camera, t_us: float) -> UInt8:
+        """RGB [H, W, 3] at `t_us`. For other modes than `rendered`, `camera` is a training camera of the scene."""
+        if mode == "rendered":
+            return _gray(self.saved.model.render(camera, t_us))
+        recorded = self.spike_rate(camera.id, t_us)
+        if mode == "spike rate":
+            return _gray(recorded)
+        error = np.clip(self.saved.model.render(camera, t_us), 0, 1) - np.clip(recorded, 0, 1)
+        return error_colors()[np.rint(np.abs(error).clip(max=ERROR_MAX) * (255 / ERROR_MAX)).astype(np.uint8)]
+
+    def spike_rate(self, camera: str, t_us: float) -> Float32:
+        """Spikes per tick in the window around `t_us`, over the radiance gain: [H, W], 1.0 = white.
+
+        Raises UserError where there is no scene, or where it has no such training camera.
+        """
+        scene = self.scene
+        names = [c.id for c in scene.cameras] if scene else []
+        if scene is None or camera not in names:
+            known = ", ".join(names) or "none: no scene is given"
+            raise problem("camera", f"a training camera of the scene ({known})", repr(camera), "choose one of them")
+        start, stop = window(scene.tick(t_us), scene.n_ticks)
+        counts = scene.streams[names.index(camera)].counts(start, stop)
+        return (counts / ((stop - start) * scene.radiance_gain)).astype(np.float32)
+
+
+def window(tick: int, n_ticks: int) -> tuple[int, int]:
+    """Ticks [start, stop) of the window around `tick`, moved where it would leave the clip."""
+    length = min(WINDOW_TICKS, n_ticks)
+    start = min(max(tick - length // 2, 0), n_ticks - length)
+    return start, start + length
+
+
+def open_stage(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) -> Stage:
+    """A model and its scene's training views. Raises UserError for another scene's folder."""
+    if scene is None:
+        return Stage(saved)
+    about = saved.provenance
+    opened = open_scene(scene, allow_gaps)
+    if opened.id != about.scene:
+        raise problem(scene, f"{about.scene}, which the model was fitted to", opened.id, "give that scene's folder")
+    opened = open_scene(scene, allow_gaps, about.split)
+    missing = {c.id for c in about.cameras} - set(opened.train)
+    if missing or opened.n_ticks != about.n_ticks or opened.rate_hz != about.rate_hz:
+        found = f"{opened.n_ticks} ticks at {opened.rate_hz:g} Hz, cameras {', '.join(opened.train)}"
+        expected = f"{about.n_ticks} ticks at {about.rate_hz:g} Hz, cameras {', '.join(c.id for c in about.cameras)}"
+        raise problem(scene, expected, found, "give the scene that the model was fitted to")
+    return Stage(saved, opened.training)
+
+
+def _gray(image: Float32) -> UInt8:
+    return np.repeat(encode_srgb(image)[:, :, None], 3, 2)
+
+
+@cache
+def error_colors() -> UInt8:
+    """The colours [256, 3] of an error from 0 to `ERROR_MAX`: those of the sheets."""
+    from matplotlib import colormaps
+
+    return (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+
+
+def padded(picture: UInt8, aspect: float) -> UInt8:
+    """The picture in the middle of a gray one whose width is `aspect` times its height."""
+    height, width = picture.shape[:2]
+    full = (max(height, round(width / aspect)), max(width, round(height * aspect)))
+    out = np.full((*full, 3), BORDER, np.uint8)
+    top, left = (full[0] - height) // 2, (full[1] - width) // 2
+    out[top : top + height, left : left + width] = picture
+    return out
+
+
+def free_camera(
+    rotation: NDArray[np.float64], position: NDArray[np.float64], fov: float, aspect: float, pixels: float
+) -> Camera:
+    """A camera of about so many pixels: camera-to-world rotation [3, 3] (OpenCV axes), position [3], vertical angle."""
+    height = max(16, round((pixels / aspect) ** 0.5))
+    width = max(16, round(height * aspect))
+    focal = 0.5 * height / np.tan(0.5 * fov)
+    return Camera("free", width, height, focal, focal, width / 2, height / 2, rotation.T, -rotation.T @ position)
+
+
+def matching(cameras: Sequence[Camera], name: str, aspect: float) -> tuple[Camera, float]:
+    """A camera by name, and the vertical angle of a window of that aspect that holds its whole picture."""
+    camera = next(c for c in cameras if c.id == name)
+    height = max(camera.height, camera.width / aspect)
+    return camera, float(2 * np.arctan(0.5 * height / camera.fy))

@@ -1,0 +1,55 @@
+"""Video files. OpenCV's own ffmpeg has no encoder for H.264; VP9 is what it has that browsers and players show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.images import UInt8
+
+# By suffix: codecs in order of preference. MPEG-4 part 2 is for builds of OpenCV without libvpx: players show it,
+# browsers do not. Motion JPEG opens everywhere and is several times larger.
+CODECS = {".mp4": ("vp09", "mp4v"), ".avi": ("MJPG",)}
+Write = Callable[[UInt8], None]
+
+
+def check_video(path: Path) -> None:
+    """Raise UserError for a suffix that is not in `CODECS`."""
+    if path.suffix not in CODECS:
+        raise problem(path, f"a video's name, {' or '.join(CODECS)}", repr(path.suffix), "choose one of them")
+
+
+@contextmanager
+def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
+    """Yield what writes a frame, gray [H, W] or RGB [H, W, 3]; the file appears when all are written.
+
+    `size` is (width, height), both even. Raises UserError for another suffix, where no codec works, and for frames of
+    another size.
+    """
+    import cv2
+
+    check_video(path)
+    with atomic_path(path) as part:
+        for codec in CODECS[path.suffix]:
+            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
+            if writer.isOpened():
+                break
+        else:
+            fix = "install opencv-contrib-python-headless, or pass --frames"
+            raise problem(path, "an encoder for video in OpenCV", "none", fix)
+
+        def write(frame: UInt8) -> None:
+            if frame.shape[:2] != size[::-1]:
+                raise problem(path, f"frames of {size[0]}x{size[1]}", f"{frame.shape}", "render all at one size")
+            gray = frame.ndim == 2
+            writer.write(np.repeat(frame[:, :, None], 3, 2) if gray else np.ascontiguousarray(frame[:, :, ::-1]))
+
+        try:
+            yield write
+        finally:
+            writer.release()

@@ -1,0 +1,204 @@
+"""`view`: a fitted model in the browser. Pictures are drawn here, by the project's own rasteriser, and sent as JPEG.
+
+While something changes, pictures have as many pixels as a training view; at rest they are drawn once more, with four
+times as many. Controls are shared by all browsers that look; each has its own camera.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.trainer import one_torch_thread
+from spike4dgs.method.viewing.camera_paths import focus, resized, still
+from spike4dgs.method.viewing.stage import Stage, free_camera, matching, open_stage, padded
+
+FREE = "free"
+LOOP_S = 4.0  # how long the clip takes when it plays
+SHARP = 2.0  # times as many pixels each way at rest
+JPEG = 85
+MOVED = 1e-3  # of the distance to the focus: a camera that is farther from where it was put was moved by somebody
+
+
+def view(
+    model: Positional[Path],
+    *,
+    scene: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    allow_gaps: bool = False,
+    device: str = "cpu",
+) -> int:
+    """Look at a fitted model in the browser: camera, time, and the spikes beside it. Ctrl-C ends it.
+
+    Args:
+        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        scene: The folder of its scene: also shows spike rates and errors at the training cameras.
+        host: Address to serve at; 0.0.0.0 lets other machines look.
+        port: Port to serve at; the next free one where it is taken.
+        allow_gaps: Accept a recording with gaps.
+        device: cpu or cuda.
+    """
+    need_viser()
+    viewer = Viewer(open_stage(load_model(model, device), scene, allow_gaps), host, port)
+    print(f"{viewer.stage.saved.title}: {viewer.url} (Ctrl-C ends it)", flush=True)
+    try:
+        viewer.run()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        viewer.stop()
+    return 0
+
+
+def need_viser() -> Any:
+    """The package viser. Raises UserError where it is not installed."""
+    try:
+        import viser
+    except ImportError:
+        raise problem("view", "the package viser", "none", "pip install 'spike4dgs[viewer]'") from None
+    return viser
+
+
+class Window:
+    """One browser that looks."""
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        self.stale = True  # what it shows is not what it should show
+        self.coarse = False  # it could be sharper
+        self.placed = np.zeros(3)  # where its camera was put last
+
+    def place(self, camera: Camera, target: np.ndarray) -> None:
+        """Put the browser's camera where `camera` is; it turns around what `camera` sees at the depth of `target`."""
+        client, forward = self.client, camera.R[2]
+        distance = max(float((target - camera.center) @ forward), 1e-3)
+        self.placed = camera.center
+        with client.atomic():
+            client.camera.position = camera.center
+            client.camera.look_at = camera.center + distance * forward
+            client.camera.up_direction = -camera.R[1]
+            client.camera.fov = matching((camera,), camera.id, client.camera.aspect)[1]
+
+
+class Viewer:
+    """The controls, and the loop that draws. `run` draws until `stop`; everything else happens in viser's threads."""
+
+    def __init__(self, stage: Stage, host: str, port: int) -> None:
+        self.stage, self.target = stage, focus(stage.cameras)
+        self.pictures = 0  # drawn so far
+        self._windows: dict[int, Window] = {}
+        self._wake, self._ended = threading.Event(), threading.Event()
+        self._ms: list[float] = []  # of the last pictures
+        self._told = 0.0
+        self.server = need_viser().ViserServer(host, port, label="Spike4DGS", verbose=False)
+        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
+        about, gui = stage.saved.provenance, self.server.gui
+        gui.add_markdown(f"**{about.name}** on {about.scene}")
+        tick_us = 1e6 / about.rate_hz
+        self.time = gui.add_slider("time, us", 0.0, about.duration_us - tick_us, tick_us, 0.0)
+        self.playing = gui.add_checkbox("play", False)
+        self.mode = gui.add_dropdown("show", stage.modes)
+        self.camera = gui.add_dropdown("camera", (FREE, *(c.id for c in stage.cameras)))
+        self.speed = gui.add_text("speed", "", disabled=True)
+        for control in (self.time, self.playing):
+            control.on_update(lambda _: self.redraw())
+        self.mode.on_update(lambda _: self._mode_changed())
+        self.camera.on_update(lambda _: self._camera_changed())
+        self.server.on_client_connect(self._arrived)
+        self.server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
+
+    def run(self) -> None:
+        """Draw what is stale, then what could be sharper, until `stop` is called."""
+        with one_torch_thread():
+            while not self._ended.is_set():
+                if self.playing.value:
+                    share = time.monotonic() / LOOP_S % 1.0
+                    self.time.value = share * self.stage.saved.provenance.duration_us
+                    self.redraw()
+                windows = list(self._windows.values())
+                stale = [w for w in windows if w.stale]
+                for w in stale or [w for w in windows if w.coarse][:1]:
+                    self._draw(w, 1.0 if stale else SHARP)
+                if not stale:
+                    self._wake.wait(0.1)
+                    self._wake.clear()
+
+    def stop(self) -> None:
+        """End the loop and the server."""
+        self._ended.set()
+        self._wake.set()
+        self.server.stop()
+
+    def redraw(self) -> None:
+        """Draw every window's picture again."""
+        for w in list(self._windows.values()):
+            w.stale = True
+        self._wake.set()
+
+    def _draw(self, w: Window, scale: float) -> None:
+        start = time.perf_counter()
+        w.stale, w.coarse = False, scale == 1.0
+        seen, chosen, mode = w.client.camera, self.camera.value, self.mode.value
+        if chosen == FREE:
+            first, turn = self.stage.cameras[0], need_viser().transforms.SO3(seen.wxyz).as_matrix()
+            camera = free_camera(turn, seen.position, seen.fov, seen.aspect, first.width * first.height)
+        else:
+            camera = matching(self.stage.cameras, chosen, seen.aspect)[0]
+        if mode == "rendered":
+            camera = resized(camera, scale)
+        picture = self.stage.picture(mode, camera, self.time.value)
+        w.client.scene.set_background_image(padded(picture, seen.aspect), format="jpeg", jpeg_quality=JPEG)
+        self.pictures += 1
+        self._tell(1e3 * (time.perf_counter() - start), camera)
+
+    def _tell(self, ms: float, camera: Camera) -> None:
+        """Show the speed: of the last pictures, now and then."""
+        self._ms = [*self._ms[-19:], ms]
+        now = time.monotonic()
+        if now - self._told > 0.5:
+            self._told, median = now, float(np.median(self._ms))
+            self.speed.value = f"{1e3 / median:.0f} frames/s ({median:.0f} ms, {camera.width}x{camera.height})"
+
+    def _arrived(self, client: Any) -> None:
+        w = Window(client)
+        w.place(still(self.stage.cameras)(0.0), self.target)
+        self._windows[client.client_id] = w
+        client.camera.on_update(lambda _: self._moved(w))
+        self._wake.set()
+
+    def _moved(self, w: Window) -> None:
+        """A browser's camera moved: by us, or by somebody, who then leaves the training camera."""
+        away = float(np.linalg.norm(w.client.camera.position - w.placed))
+        if self.mode.value == "rendered" and self.camera.value != FREE:
+            if away > MOVED * float(np.linalg.norm(self.target - w.placed)):
+                self.camera.value = FREE
+        w.stale = True
+        self._wake.set()
+
+    def _mode_changed(self) -> None:
+        """Spikes are only known where a camera stood: go to the nearest one."""
+        windows = list(self._windows.values())
+        if self.mode.value != "rendered" and self.camera.value == FREE and windows:
+            here = windows[0].client.camera.position
+            nearest = min(self.stage.cameras, key=lambda c: float(np.linalg.norm(c.center - here)))
+            self.camera.value = nearest.id
+        self.redraw()
+
+    def _camera_changed(self) -> None:
+        """Put every browser's camera at the chosen one; spikes cannot be shown from anywhere else."""
+        if self.camera.value == FREE:
+            self.mode.value = "rendered"
+        else:
+            camera = next(c for c in self.stage.cameras if c.id == self.camera.value)
+            for w in list(self._windows.values()):
+                w.place(camera, self.target)
+        self.redraw()

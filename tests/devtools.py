@@ -1,0 +1,94 @@
+"""A browser without a window, driven by its devtools protocol: enough to load a page, press keys, take screenshots."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+WIDTH, HEIGHT = 900, 540
+
+
+def wait_for(what: str, check: Callable[[], Any], seconds: float = 120.0) -> Any:
+    """The first true value of `check`."""
+    end = time.monotonic() + seconds
+    while not (found := check()):
+        assert time.monotonic() < end, f"no {what} within {seconds:.0f} s"
+        time.sleep(0.05)
+    return found
+
+
+class Page:
+    """One page of a browser."""
+
+    def __init__(self, socket: Any) -> None:
+        self._socket, self._calls = socket, 0
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the protocol and wait for its answer."""
+        self._calls += 1
+        self._socket.send(json.dumps({"id": self._calls, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=120))
+            if answer.get("id") == self._calls:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+
+    def value(self, expression: str) -> Any:
+        """The value of a JavaScript expression."""
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def press(self, key: str) -> None:
+        """Press and release a key."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=KEYS[key])
+
+    def screenshot(self) -> np.ndarray:
+        """What the page shows, gray [H, W] uint8."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
+
+
+KEYS = {"End": 35, "Home": 36, "ArrowRight": 39}
+
+
+@contextmanager
+def browser(profile: Path) -> Iterator[Page]:
+    """A page of a new browser; the test is skipped where there is none."""
+    binary = next(filter(None, map(shutil.which, NAMES)), None)
+    if binary is None:
+        pytest.skip("no Chromium here")
+    from websockets.sync.client import connect
+
+    flags = ("--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--mute-audio")
+    software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+    place = (f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0")
+    command = [binary, *flags, *software, *place, "about:blank"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        port_file = profile / "DevToolsActivePort"
+        wait_for("devtools port", lambda: port_file.is_file() and port_file.read_text().count("\n"))
+        port = port_file.read_text().split()[0]
+
+        def page() -> Any:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+                return [t for t in json.load(answer) if t["type"] == "page"]
+
+        address = wait_for("page", page)[0]["webSocketDebuggerUrl"]
+        with connect(address, max_size=None) as socket:
+            yield Page(socket)
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
