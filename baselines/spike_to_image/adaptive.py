@@ -1,0 +1,165 @@
+"""Adaptive windows: every pixel's rate over the longest window in which its light does not change.
+
+Between two of its spikes a pixel gathers a whole number of thresholds of light, whatever the light does. With the
+spikes i ... j in the window of h ticks on either side of tick t, and T = t_j - t_i ticks between them, the rate is
+
+    r_h = (j - i) / T,    and under constant light it lies between (j - i) / (T + 1) and (j - i) / (T - 1),
+
+for both spikes are known to the tick. A count over the same window would leave 1 / 2h to either side of j - i over 2h:
+r_h is 1 / r_h times as precise.
+
+Of windows that grow by half an octave each, a pixel takes the longest before these bounds cease to have a point in
+common: then no constant light explains the spikes. (It is the rule of intersecting confidence intervals, with bounds
+that are certain but for shot noise.) A change that one pixel cannot see, a neighbour often can: of 3x3 pixels, all take
+the shortest window. At rest the window is the whole clip; where things move it shrinks to what the motion leaves. At
+the clip's ends windows are cut. A pixel with fewer than two spikes has their number / the clip.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker
+from spike4dgs.benchmark.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes import SpikeStream
+
+SHORTEST = 2.0  # ticks on either side
+GROWTH = math.sqrt(2)
+_BLOCK = 64  # bytes of a tick, 512 pixels, whose spikes are gathered at a time
+
+
+@dataclass(frozen=True, eq=False)
+class SpikeTimes:
+    """The spikes of all pixels, one pixel after the other, in the stored order of pixels."""
+
+    ticks: NDArray[np.int32]  # [N] ascending within a pixel
+    starts: NDArray[np.int64]  # [P + 1] pixel p has ticks[starts[p]:starts[p + 1]]
+
+
+@lru_cache(maxsize=1)
+def spike_times(stream: SpikeStream) -> SpikeTimes:
+    """All spike times of a stream; those of the last stream are kept, since pictures come stream by stream."""
+    packed, pixels = rows(stream.packed), stream.height * stream.width
+    starts = np.zeros(pixels + 1, np.int64)
+    blocks = -(-packed.shape[1] // _BLOCK)
+    in_threads(_count, blocks, packed, starts[1:])
+    np.cumsum(starts, out=starts)
+    ticks = np.empty(starts[-1], np.int32)
+    in_threads(_gather, blocks, packed, starts, ticks)
+    return SpikeTimes(ticks, starts)
+
+
+@kernel
+def _count(packed: UInt8, counts: NDArray[np.int64], start: int, stop: int) -> None:
+    first, end = start * _BLOCK, min(stop * _BLOCK, packed.shape[1])
+    for t in range(len(packed)):
+        for byte in range(first, end):
+            bits = packed[t, byte]
+            for k in range(8):
+                if bits >> k & 1 and 8 * byte + k < len(counts):
+                    counts[8 * byte + k] += 1
+
+
+@kernel
+def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], start: int, stop: int) -> None:
+    first, end, pixels = start * _BLOCK, min(stop * _BLOCK, packed.shape[1]), len(starts) - 1
+    at = starts[8 * first : min(8 * end, pixels)].copy()
+    for t in range(len(packed)):
+        for byte in range(first, end):
+            bits = packed[t, byte]
+            for k in range(8):
+                p = 8 * (byte - first) + k
+                if bits >> k & 1 and p < len(at):
+                    ticks[at[p]] = t
+                    at[p] += 1
+
+
+def half_windows(n_ticks: int) -> NDArray[np.float64]:
+    """The windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
+    steps = max(0, math.ceil(math.log(max(n_ticks, 1) / SHORTEST, GROWTH)))
+    return SHORTEST * GROWTH ** np.arange(steps + 1)
+
+
+def adaptive_image(stream: SpikeStream, tick: int) -> Float32:
+    """Spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window."""
+    spikes, halves = spike_times(stream), half_windows(stream.n_ticks)
+    pixels = stream.height * stream.width
+    level, image = np.empty(pixels, np.uint8), np.empty(pixels, np.float32)
+    in_threads(_choose, pixels, spikes.ticks, spikes.starts, tick, halves, level, small=pixels < 1 << 12)
+    shared = cv2.erode(level.reshape(stream.height, stream.width), np.ones((3, 3), np.uint8)).reshape(-1)
+    arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, shared, image)
+    in_threads(_estimate, pixels, *arguments, small=pixels < 1 << 12)
+    upright = image.reshape(stream.height, stream.width)
+    return upright[::-1] if stream.rows_bottom_up else upright
+
+
+@kernel
+def _choose(
+    ticks: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    tick: int,
+    halves: NDArray[np.float64],
+    level: UInt8,
+    start: int,
+    stop: int,
+) -> None:
+    """The longest window of each pixel whose bounds, and those of all shorter ones, have a point in common."""
+    for p in range(start, stop):
+        times = ticks[starts[p] : starts[p + 1]]
+        middle = np.searchsorted(times, tick)
+        i, j = middle, middle - 1  # the first and the last spike of the window
+        low, high = -np.inf, np.inf
+        level[p] = len(halves) - 1
+        for s in range(len(halves)):
+            while i > 0 and times[i - 1] >= tick - halves[s]:
+                i -= 1
+            while j + 1 < len(times) and times[j + 1] < tick + halves[s]:
+                j += 1
+            if j - i < 1:
+                continue
+            length = times[j] - times[i]
+            low, high = max(low, (j - i) / (length + 1)), min(high, (j - i) / (length - 1))
+            if low > high:
+                level[p] = s - 1
+                break
+
+
+@kernel
+def _estimate(
+    ticks: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    tick: int,
+    halves: NDArray[np.float64],
+    n_ticks: int,
+    level: UInt8,
+    image: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Each pixel's rate over its window, or over the shortest longer one that has two spikes."""
+    for p in range(start, stop):
+        times = ticks[starts[p] : starts[p + 1]]
+        image[p] = np.float32(len(times) / n_ticks)
+        if len(times) < 2:
+            continue
+        for s in range(level[p], len(halves)):
+            i, j = np.searchsorted(times, tick - halves[s]), np.searchsorted(times, tick + halves[s]) - 1
+            if j - i >= 1:
+                image[p] = np.float32((j - i) / (times[j] - times[i]))
+                break
+
+
+ADAPTIVE = ImageMaker(
+    name="adaptive",
+    definition="(spikes - 1) / (ticks from the first to the last) over the longest window, of 3x3 pixels the shortest, "
+    "that a constant rate explains",
+    source="this project; the rule is that of Goldenshluger and Nemirovski: On spatially adaptive estimation of "
+    "nonparametric regression, Math. Methods Stat. 6, 1997",
+    rate=adaptive_image,
+)
