@@ -104,7 +104,7 @@ class MultiViewRenderer(Sight):
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise problem("cameras", "one resolution for all", "several or none", "render them apart")
         scene = mitsuba_scene(world)
-        super().__init__(world, cameras, scene, _tracer(scene, cameras, seed))
+        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
         self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
@@ -250,7 +250,7 @@ class MultiViewRenderer(Sight):
         return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
 
 
-def _tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
+def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
     """The tracer for the process's variant. Imported here because the modules need the variant to be set."""
     if load_mitsuba().variant().startswith("scalar"):
         from spike4dgs.generators.scalar_tiles import TileTracer

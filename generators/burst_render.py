@@ -1,0 +1,83 @@
+"""Rendering training bursts: a rig's still picture once, and around each instant only what moves, at a few ticks.
+
+Less exact than `render`, and much cheaper: all pixels have the same number of samples, and light that moving things
+throw far around them is left out. Neither matters to a learner, for truth and spikes come from the same pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from spike4dgs.benchmark.bursts import REACH, Burst, Float32
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.images import gray
+from spike4dgs.generators.mitsuba_scene import mitsuba_scene
+from spike4dgs.generators.profiles import RATE_HZ
+from spike4dgs.generators.render import make_tracer
+from spike4dgs.generators.sensor_maps import dark_map, gain_map
+from spike4dgs.generators.sight import GROW_PX, Sight
+from spike4dgs.generators.worlds import WorldScene
+
+KEY_COUNTS = (3, 7, 15)  # pictures of a burst: 21, 7 or 3 ticks apart
+MOST_PX = 1.0  # that what moves may move between two of them; the last count serves whatever is faster still
+_FASTEST = 99.0  # percentile of the moving pixels' speeds: shadows that light grazes have no bound
+
+
+class BurstRenderer(Sight):
+    """Bursts of `cameras` (one resolution) in a world. `spp`, samples per pixel, is a power of two."""
+
+    def __init__(self, world: WorldScene, cameras: Sequence[Camera], *, seed: int, spp: int) -> None:
+        scene = mitsuba_scene(world)
+        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
+        self.spp = spp
+
+    @cached_property
+    def still(self) -> Float32:
+        """Radiance [V, H, W] without what moves."""
+        return self._radiance(np.arange(int(np.prod(self.shape))), moving=False).reshape(self.shape)
+
+    @cached_property
+    def still_depth(self) -> Float32:
+        """Metres along the optical axes [V, H, W] to what stands still, inf: nothing."""
+        forward = np.stack([c.R[2] for c in self.cameras])  # [V, 3]
+        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
+        return (self._still_hits[0].reshape(self.shape) * cosine).astype(np.float32)
+
+    def burst(self, tick: int, map_seed: int) -> Burst:
+        """The burst around the start of `tick`, REACH ticks or more from the clip's ends, with maps of `map_seed`."""
+        now, reach = tick / RATE_HZ, REACH / RATE_HZ
+        moving = self.traced(now - reach) | self.traced(now + reach) | self.traced(now)
+        depth, motion = self.depths(now), self._motion_px(now)
+        count = next((k for k in KEY_COUNTS if motion <= MOST_PX * (k - 1)), KEY_COUNTS[-1])
+        # Between the times at which it was looked for, a thing may be further away than it was grown by.
+        if (missed := int(np.ceil(motion / 4)) - GROW_PX) > 0:
+            moving = maximum_filter(moving, size=(1, 2 * missed + 1, 2 * missed + 1))
+        where = np.flatnonzero(moving)
+        keys = np.repeat(self.still[None], count, axis=0)
+        for key, offset in zip(keys, np.linspace(-reach, reach, count), strict=True):
+            self._scene.place(now + offset)
+            key[moving] = self._radiance(where, moving=True)
+        _, height, width = self.shape
+        return Burst(
+            keys=keys,
+            depth=depth,
+            moving=moving,
+            w2c=np.stack([c.w2c for c in self.cameras]),
+            K=np.stack([c.K for c in self.cameras]),
+            gain=np.stack([gain_map(height, width, map_seed, c.id) for c in self.cameras]),
+            dark=np.stack([dark_map(height, width, map_seed, c.id) for c in self.cameras]),
+        )
+
+    def _motion_px(self, now: float) -> float:
+        """How far the fastest parts move in the whole burst."""
+        speed = self.speeds(now)
+        return float(np.percentile(speed[speed > 0], _FASTEST)) * 2 * REACH / RATE_HZ if (speed > 0).any() else 0.0
+
+    def _radiance(self, pixels: np.ndarray, *, moving: bool) -> Float32:
+        """Gray radiance [K] of flat pixels; the same random numbers with and without what moves, at all times."""
+        rgb = self._tracer.trace(pixels, self.spp, 0, moving)
+        return gray(np.asarray(rgb * np.float32(self.world.exposure)))
