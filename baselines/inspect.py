@@ -12,6 +12,7 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.gaps import present
 from spike4dgs.benchmark.images import encode_srgb
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.benchmark.spikes import SpikeStream, open_stream
@@ -22,11 +23,12 @@ Mask = NDArray[np.bool_]
 HOT_SIGMA = 6.0  # robust standard deviations above the neighbours' median, from which a pixel is called hot
 _INTERVAL_TICKS = 2000  # inter-spike intervals are looked at in at most so many ticks
 _LONGEST_WINDOW = 60000  # ticks per count image
+_TIMELINE_BINS = 400
 
 
 @dataclass(frozen=True, eq=False)
 class StreamReport:
-    """Statistics of one stream. `rate` is spikes per tick [H, W]."""
+    """Statistics of one stream. `rate` is spikes per tick [H, W] over the ticks that a recording does not lack."""
 
     name: str
     rate: NDArray[np.float64]
@@ -35,6 +37,7 @@ class StreamReport:
     two_intervals: float  # share of pixels whose inter-spike intervals take at most two adjacent values
     rate_hz: float
     n_ticks: int
+    missing: int  # ticks within gaps
 
 
 def examine(name: str, stream: SpikeStream) -> StreamReport:
@@ -42,20 +45,22 @@ def examine(name: str, stream: SpikeStream) -> StreamReport:
 
     A pixel is dead where it never fires while the median of its 5x5 neighbourhood would fire at least ten times. It is
     hot where its rate is more than HOT_SIGMA robust standard deviations of (rate - neighbourhood median), and at least
-    half of that median, above it.
+    half of that median, above it. Ticks within gaps count nowhere.
     """
     from scipy.ndimage import median_filter
 
     counts = np.zeros((stream.height, stream.width), np.int64)
     for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
         counts += stream.counts(start, min(start + _LONGEST_WINDOW, stream.n_ticks))
-    rate = counts / stream.n_ticks
+    seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
+    rate = counts / seen
     around = median_filter(rate, size=5, mode="nearest")
     excess = rate - around
     sigma = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
-    dead = (counts == 0) & (around * stream.n_ticks >= 10)
-    hot = (excess > HOT_SIGMA * max(sigma, 1 / stream.n_ticks)) & (excess > 0.5 * around)
-    return StreamReport(name, rate, dead, hot, _two_intervals(stream), stream.rate_hz, stream.n_ticks)
+    dead = (counts == 0) & (around * seen >= 10)
+    hot = (excess > HOT_SIGMA * max(sigma, 1 / seen)) & (excess > 0.5 * around)
+    missing = sum(gap.ticks for gap in stream.gaps)
+    return StreamReport(name, rate, dead, hot, _two_intervals(stream), stream.rate_hz, stream.n_ticks, missing)
 
 
 def _two_intervals(stream: SpikeStream) -> float:
@@ -64,44 +69,79 @@ def _two_intervals(stream: SpikeStream) -> float:
     Steady light on a pixel that keeps the charge above the threshold gives exactly that: a test of the sensor model.
     """
     shape = stream.height, stream.width
-    last, spikes = np.full(shape, -1), np.zeros(shape, np.int64)
+    last, intervals, seen = np.full(shape, -1), np.zeros(shape, np.int64), present(stream.gaps, stream.n_ticks)
     shortest, longest = np.full(shape, np.iinfo(np.int64).max), np.zeros(shape, np.int64)
     for start in range(0, min(stream.n_ticks, _INTERVAL_TICKS), 100):
         for t, fired in enumerate(stream.window(start, min(start + 100, stream.n_ticks)), start):
+            if not seen[t]:  # an interval across a gap would be too long
+                last[:] = -1
+                continue
             again = (fired != 0) & (last >= 0)
             length = t - last[again]
             shortest[again] = np.minimum(shortest[again], length)
             longest[again] = np.maximum(longest[again], length)
             last[fired != 0] = t
-            spikes += fired
-    enough = spikes >= 3
+            intervals += again
+    enough = intervals >= 2
     return float(np.mean(longest[enough] - shortest[enough] <= 1)) if enough.any() else float("nan")
 
 
 def write_picture(path: Path, report: StreamReport, stream: SpikeStream) -> None:
-    """Write one PNG: TFP and TFI of the middle of the clip, the map of bad pixels, and the histogram of rates."""
+    """Write one PNG: TFP and TFI of the middle of the clip, the map of bad pixels, and the histogram of rates.
+
+    Where a recording has gaps, they are drawn over the course of the rate, and the pictures are of the middle of the
+    longest stretch without one.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    middle = stream.n_ticks // 2
+    middle = _middle(stream)
     gain = float(np.percentile(report.rate, 99)) or 1.0  # shown as white; the scale of a raw recording is unknown
     aspect = stream.height / stream.width
-    figure, axes = plt.subplots(2, 2, figsize=(12, 12 * aspect + 1.2), layout="constrained")
-    for axis, name in zip(axes[0], ("tfp", "tfi"), strict=True):
-        axis.imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
-        axis.set_title(f"{name.upper()} at tick {middle}")
-    _draw_bad_pixels(axes[1, 0], report)
-    axes[1, 1].hist(report.rate.ravel(), bins=100, color="0.3")
-    axes[1, 1].set(xlabel="spikes per tick", ylabel="pixels", title=f"Rates, mean {report.rate.mean():.4f}")
-    for axis in axes.flat[:3]:
-        axis.set_xticks([])
-        axis.set_yticks([])
+    heights = [6 * aspect + 0.6] * 2 + [2.4] * bool(stream.gaps)  # inches
+    mosaic = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]
+    figure, axes = plt.subplot_mosaic(mosaic, figsize=(12, sum(heights)), height_ratios=heights, layout="constrained")
+    for name in ("tfp", "tfi"):
+        axes[name].imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
+        axes[name].set_title(f"{name.upper()} at tick {middle}")
+    _draw_bad_pixels(axes["bad"], report)
+    axes["rates"].hist(report.rate.ravel(), bins=100, color="0.3")
+    axes["rates"].set(xlabel="spikes per tick", ylabel="pixels", title=f"Rates, mean {report.rate.mean():.4f}")
+    if stream.gaps:
+        _draw_gaps(axes["time"], stream)
+    for name in ("tfp", "tfi", "bad"):
+        axes[name].set_xticks([])
+        axes[name].set_yticks([])
     figure.suptitle(f"{report.name}: {stream.n_ticks} ticks of {stream.width}x{stream.height} at {stream.rate_hz:g} Hz")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     plt.close(figure)
+
+
+def _middle(stream: SpikeStream) -> int:
+    """The tick in the middle of the longest stretch of the clip that has data."""
+    edges = [-1, *(np.nonzero(~present(stream.gaps, stream.n_ticks))[0]), stream.n_ticks]
+    longest = int(np.argmax(np.diff(edges)))
+    return min(int(edges[longest] + 1 + edges[longest + 1]) // 2, stream.n_ticks - 1)
+
+
+def _draw_gaps(axis: Any, stream: SpikeStream) -> None:
+    """The course of the rate over the clip, interrupted where ticks lack, which is marked with the reason."""
+    bins = np.linspace(0, stream.n_ticks, min(stream.n_ticks, _TIMELINE_BINS) + 1).astype(int)
+    spikes = [int(np.bitwise_count(stream.packed[a:b]).sum()) for a, b in zip(bins[:-1], bins[1:], strict=True)]
+    seen = np.add.reduceat(present(stream.gaps, stream.n_ticks).astype(int), bins[:-1])
+    with np.errstate(invalid="ignore"):  # nothing is drawn where nothing is known
+        axis.stairs(np.array(spikes) / seen / (stream.width * stream.height), bins, color="0.3", baseline=None)
+    for i, reason in enumerate(sorted({gap.reason for gap in stream.gaps}), start=1):
+        spans = [(gap.first_tick, gap.ticks) for gap in stream.gaps if gap.reason == reason]
+        label = f"{reason}: {len(spans)} gap(s), {sum(ticks for _, ticks in spans)} ticks"
+        for first, ticks in spans:  # the edge keeps a single tick visible
+            axis.axvspan(first, first + ticks, color=f"C{i}", alpha=0.4, linewidth=1, label=label)
+            label = "_"
+    axis.set(xlabel="tick", ylabel="spikes per tick", xlim=(0, stream.n_ticks), title="Mean rate; marked: no data")
+    axis.legend(loc="upper right")
 
 
 def _draw_bad_pixels(axis: Any, report: StreamReport) -> None:
@@ -117,13 +157,22 @@ def _print_reports(reports: list[StreamReport]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("stream", "ticks", "mean", "median", "p1", "p99", "spikes/s", "dead", "hot", "two ISIs")
+    table = Table("stream", "ticks", "missing", "mean", "median", "p1", "p99", "spikes/s", "dead", "hot", "two ISIs")
     for r in reports:
         p1, p50, p99 = (f"{v:.4f}" for v in np.percentile(r.rate, (1, 50, 99)))
         per_second = f"{r.rate.mean() * r.rate_hz:.0f}"
         bad = f"{r.dead.sum()}", f"{r.hot.sum()}"
         table.add_row(
-            r.name, f"{r.n_ticks}", f"{r.rate.mean():.4f}", p50, p1, p99, per_second, *bad, f"{r.two_intervals:.1%}"
+            r.name,
+            f"{r.n_ticks}",
+            f"{r.missing}",
+            f"{r.rate.mean():.4f}",
+            p50,
+            p1,
+            p99,
+            per_second,
+            *bad,
+            f"{r.two_intervals:.1%}",
         )
     console = Console()
     console.print(table)
@@ -145,7 +194,7 @@ def _open(
                 ", ".join(given), "nothing for a folder, which states its own size", "values", "leave them out"
             )
         if (path / STREAM_FOLDER).is_file():
-            return open_stream_folder(path)
+            return open_stream_folder(path, allow_gaps)
         scene = open_scene(path, allow_gaps)
         return {camera: scene.stream(camera) for camera in scene.cameras}
     if not path.exists():
@@ -182,10 +231,13 @@ def inspect(
         allow_gaps: Accept recordings with gaps.
     """
     reports = []
-    for name, stream in _open(path, width, height, fps, top_down, allow_gaps).items():
+    streams = _open(path, width, height, fps, top_down, allow_gaps)
+    for name, stream in streams.items():
         report = examine(name, stream)
         write_picture(out / f"{path.resolve().name if path.is_dir() else path.stem}" / f"{name}.png", report, stream)
         reports.append(report)
     _print_reports(reports)
+    for gap in (gap for stream in streams.values() for gap in stream.gaps):
+        print(f"{gap.camera}: no data in ticks [{gap.first_tick}, {gap.stop_tick}): {gap.ticks} ticks, {gap.reason}")
     print(f"pictures: {out / (path.resolve().name if path.is_dir() else path.stem)}")
     return 0

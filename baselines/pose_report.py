@@ -79,6 +79,7 @@ def poses(
     seed: int = 0,
     split: str | None = None,
     out: Path | None = None,
+    allow_gaps: bool = False,
 ) -> int:
     """Estimate the training cameras of scenes and print a table of pose errors.
 
@@ -93,6 +94,7 @@ def poses(
         seed: Seed of everything random.
         split: Split whose training cameras are taken; each scene's default one if left out.
         out: Write the rows to this JSON file.
+        allow_gaps: Accept recordings with gaps.
     """
     if unknown := [name for name in initialization if name not in ESTIMATORS]:
         expected = f"names among {', '.join(ESTIMATORS)}"
@@ -101,7 +103,7 @@ def poses(
         raise problem("--images", f"one of {', '.join((CLIP, *IMAGES))}", repr(images), "correct the name")
     rows = []
     for path in scenes:
-        scene = open_scene(path, split=split).training
+        scene = open_scene(path, allow_gaps, split).training
         pictures = _pictures(scene, images)
         for name in initialization:
             rows.append(measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics))

@@ -6,7 +6,6 @@ manifest before it is used, so a damaged stream is refused by whoever reads it.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +18,7 @@ from spike4dgs.benchmark.calibration import Calibration, Recordings, estimate
 from spike4dgs.benchmark.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.gaps import Gap, read_gaps, refuse_gaps
 from spike4dgs.benchmark.images import read_exr, read_mask, read_rgb
 from spike4dgs.benchmark.manifest import Manifest, read_manifest
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -132,8 +132,9 @@ class Scene:
         """The packed stream of a camera, checked and memory-mapped."""
         path = self.manifest.path(self.meta["streams"][camera])
         c = self.cameras[camera]
-        bottom_up = bool(self.meta["sensor"]["rows_bottom_up"])
-        return open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks)
+        bottom_up, gaps = bool(self.meta["sensor"]["rows_bottom_up"]), tuple(g for g in self.gaps if g.camera == camera)
+        size = (c.width, c.height)
+        return open_stream(path, *size, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks, gaps=gaps)
 
     def recordings(self, camera: str) -> Recordings | None:
         """A camera's recordings before uniform light and in the dark; None where the scene has none."""
@@ -157,6 +158,11 @@ class Scene:
     def moving(self, target: Target) -> NDArray[np.bool_]:
         """The moving region of a target, [H, W] bool: where the `*_dynamic` metrics look."""
         return read_mask(self.manifest.path(f"masks/{target.name}.png"))
+
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Ticks that a recording lacks, in order of camera and tick. Raises UserError where scene.json is damaged."""
+        return read_gaps(self.meta["gaps"], dict.fromkeys(self.meta["streams"], self.n_ticks), self.root / "scene.json")
 
     @cached_property
     def training(self) -> TrainingScene:
@@ -190,12 +196,9 @@ def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = N
         raise problem(
             root / "scene.json", f"a split among {', '.join(meta['splits'])}", repr(chosen), "name one of them"
         )
-    if meta["gaps"] and not allow_gaps:
-        found = f"{len(meta['gaps'])} gap(s), the first {json.dumps(meta['gaps'][0])}"
-        raise problem(
-            root / "scene.json", "a recording without gaps", found, "pass --allow-gaps to read it all the same"
-        )
-    return Scene(root, meta, cameras, chosen, targets[chosen], manifest)
+    scene = Scene(root, meta, cameras, chosen, targets[chosen], manifest)
+    refuse_gaps(scene.gaps, root / "scene.json", allow_gaps)
+    return scene
 
 
 def check_meta(meta: dict[str, Any], path: Path) -> None:

@@ -195,6 +195,7 @@ _CONTENTS = {
     "  thing (0: none; names in scene.json); flow.x, flow.y, how far its point moves in pixels in the next 20 ticks.",
     "calibration/flat": "`calibration/flat/CAMERA.dat`: a recording of uniform light, packed like `spikes/`.",
     "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`.",
+    "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
     "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
     "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
     "events": "`events/CAMERA.npz`: an event camera: t (us), x, y (row 0 at the top), p (1: brighter, 0: darker).",

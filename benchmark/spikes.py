@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import writing
+from spike4dgs.benchmark.gaps import Gap
 
 UInt8 = NDArray[np.uint8]
 T = TypeVar("T", bound=np.generic)
@@ -31,7 +32,8 @@ def bytes_per_tick(width: int, height: int) -> int:
 class SpikeStream:
     """A packed stream. `packed` is [n_ticks, bytes_per_tick] uint8, usually a read-only memory map.
 
-    `rows_bottom_up` is the order of rows in the file; every method returns images with row 0 at the top.
+    `rows_bottom_up` is the order of rows in the file; every method returns images with row 0 at the top. `gaps` are
+    the ticks of a recording that were lost: they hold zeros, which are no measurement.
     """
 
     packed: UInt8
@@ -40,6 +42,7 @@ class SpikeStream:
     rate_hz: float
     rows_bottom_up: bool = True
     source: str = "memory"
+    gaps: tuple[Gap, ...] = ()
 
     @property
     def n_ticks(self) -> int:
@@ -91,9 +94,16 @@ def pack(spikes: NDArray[np.generic], rows_bottom_up: bool = True) -> UInt8:
 
 
 def open_stream(
-    path: Path, width: int, height: int, rate_hz: float, *, rows_bottom_up: bool = True, n_ticks: int | None = None
+    path: Path,
+    width: int,
+    height: int,
+    rate_hz: float,
+    *,
+    rows_bottom_up: bool = True,
+    n_ticks: int | None = None,
+    gaps: tuple[Gap, ...] = (),
 ) -> SpikeStream:
-    """Memory-map a stream file.
+    """Memory-map a stream file. `gaps`: what the file's description says it lacks.
 
     Raises UserError where the file is missing, empty, no whole number of ticks, or not `n_ticks` long (if given).
     """
@@ -109,7 +119,7 @@ def open_stream(
     if n_ticks is not None and found != n_ticks * size:
         raise problem(path, f"{n_ticks} ticks", f"{found // size}", "the stream is truncated or not this scene's")
     packed = np.memmap(path, dtype=np.uint8, mode="r", shape=(found // size, size))
-    return SpikeStream(packed, width, height, rate_hz, rows_bottom_up, str(path))
+    return SpikeStream(packed, width, height, rate_hz, rows_bottom_up, str(path), gaps)
 
 
 class SpikeWriter:

@@ -37,7 +37,9 @@ PRIMARY, SECONDARY = "primary", "secondary"
 BOTTOM_UP, TOP_DOWN = "bottom-up", "top-down"
 PACKET_BYTES = 1024  # of a SuperSpeed bulk endpoint: a read of another multiple ends in an overflow error
 
-_ID = matching("a name of letters, digits, '.', '_' and '-'", re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z").match)
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")  # of a camera and of a scene
+
+_ID = matching("a name of letters, digits, '.', '_' and '-'", NAME.match)
 _POSITIVE = number(0, 1e12, "a positive number")
 _FINITE = number(-1e12, 1e12, "a finite number")
 _VECTOR = tuple_of(_FINITE, "a list of numbers")
