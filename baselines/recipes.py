@@ -10,7 +10,7 @@ from itertools import product
 from spike4dgs.baselines.colmap import colmap, colmap_uncalibrated
 from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
 from spike4dgs.baselines.nearest_view import NearestView
-from spike4dgs.baselines.rig import rig
+from spike4dgs.baselines.rig import rig, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.baselines.test_view import PosedRecipe
 from spike4dgs.benchmark.recipes import Method, Recipe
@@ -24,6 +24,7 @@ PARTS = Parts(
     images=IMAGES,
     initialization={
         "rig": rig,
+        "rig-flat": rig_flat,
         "colmap": colmap,
         "colmap-uncalibrated": colmap_uncalibrated,
         "dust3r": dust3r,

@@ -3,6 +3,8 @@
 Static pixels are matched on the mean of the whole clip, where the spikes' quantisation noise has averaged out. Pixels
 that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
 ends those that are quiet just then, which is the background that something moving hides in the middle.
+
+`rig-flat` corrects every picture by its camera's calibrated gain and dark rate, where a scene has them.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
 NEIGHBOURS = 5  # points that tell the depth of a place without any
 
 
-def rig(scene: TrainingScene, seed: int) -> Start:
+def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
     """First points of a scene; see the module. Nothing is random, `seed` is not used.
 
     Raises UserError where all cameras stand in one place.
@@ -46,7 +48,7 @@ def rig(scene: TrainingScene, seed: int) -> Start:
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} in one place"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
-    mean = np.stack([_rate(s, 0, scene.n_ticks) for s in scene.streams]) / np.float32(scene.radiance_gain)
+    mean = _pictures(scene, 0, scene.n_ticks, flat_field)
     windows = _windows(scene.n_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
     moving = [_moving(np.stack(c)) for c in counts]
@@ -56,7 +58,7 @@ def rig(scene: TrainingScene, seed: int) -> Start:
     middle, last = len(windows) // 2, len(windows) - 1
     for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[place]
-        pictures = np.stack([_rate(s, start, stop) for s in scene.streams]) / np.float32(scene.radiance_gain)
+        pictures = _pictures(scene, start, stop, flat_field)
         near = slice(max(0, place - 1), place + 2)
         quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
@@ -65,6 +67,19 @@ def rig(scene: TrainingScene, seed: int) -> Start:
     points, values = _thin(scene.cameras, points, values)
     points, values = _fill(scene.cameras, mean, points, values)
     return Start(scene.cameras, points.astype(np.float32), values.astype(np.float32))
+
+
+def rig_flat(scene: TrainingScene, seed: int) -> Start:
+    """`rig` on corrected pictures."""
+    return rig(scene, seed, flat_field=True)
+
+
+def _pictures(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
+    """Mean radiance [C, H, W] of all views in a window."""
+    rates = np.stack([_rate(s, start, stop) for s in scene.streams])
+    if flat_field and scene.calibrations:
+        return np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
+    return rates / np.float32(scene.radiance_gain)
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:

@@ -64,6 +64,11 @@ class FitSettings(Protocol):
         """The most training pictures a view."""
         ...
 
+    @property
+    def flat_field(self) -> bool:
+        """Whether pictures are corrected by the cameras' calibrations."""
+        ...
+
     def scaled(self, scale: float) -> FitSettings:
         """The same settings with the step counts multiplied by a budget's scale."""
         ...
@@ -213,9 +218,12 @@ def choose_ticks(n_ticks: int, settings: FitSettings) -> tuple[int, ...]:
 def film(
     scene: TrainingScene, cameras: Sequence[Camera], images: ImageMaker, settings: FitSettings, device: str
 ) -> Footage:
-    """Pictures of all training views at the chosen times."""
+    """Pictures of all training views at the chosen times; see `FitSettings.flat_field`."""
     ticks = choose_ticks(scene.n_ticks, settings)
     pictures = np.stack([images(stream, ticks, scene.radiance_gain) for stream in scene.streams], axis=1)
+    if settings.flat_field and scene.calibrations:
+        for view, camera in enumerate(scene.calibrations):
+            pictures[:, view] = camera.radiance(pictures[:, view] * np.float32(scene.radiance_gain))
     views = Views.from_cameras(cameras, device=device)
     return Footage(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
 

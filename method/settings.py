@@ -24,6 +24,7 @@ class TrainSettings:
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their pictures belong to a later time
     max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
     coarse_share: float = 0.2  # middle share of the clip that the coarse stage of a moving scene sees
+    flat_field: bool = False  # correct the pictures by each camera's calibrated gain n(x, y) and dark rate, if known
 
     # Loss.
     ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs

@@ -68,6 +68,7 @@ class TrackingSettings:
     time_spacing_ticks: int = 16  # 0.8 ms at 20 kHz; between times everything is interpolated
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut
     max_times: int = 40  # bounds the time of a fit
+    flat_field: bool = False  # correct the pictures by each camera's calibration, if known
     start: float = 0.5  # where in the clip the first time is: 0 at its beginning, as published, 1 at its end
     clean_background: bool = True  # pixels that never change show their mean over the clip, without the spikes' noise
     margin_px: int = 8  # around what moves, more than half a window of SSIM

@@ -72,6 +72,7 @@ class RadianceFieldSettings:
     time_spacing_ticks: int = 10
     edge_ticks: int = 10
     max_times: int = 256
+    flat_field: bool = False  # correct the pictures by each camera's calibration, if known
 
     # Networks.
     depth: int = 4
