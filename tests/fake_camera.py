@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +53,8 @@ def frames_of(seed: int, layout: Layout, n: int, first_count: int = 0) -> UInt8:
 class FakeCamera:
     """Sends `stream` from its first byte after each start, `bytes_per_s` fast; silent after the last byte.
 
-    `faults`: stream byte -> status of the read that reaches it; SHORT ends the read there and loses nothing. They happen
-    only in the second start, so that the rehearsal passes. `lacking`: stream bytes [a, b) that are left out silently.
+    `faults`: stream byte -> status of the read that reaches it; a SHORT one ends there and loses nothing. They happen
+    in the second start only, so that the rehearsal passes, unless the camera cannot be started anew.
     """
 
     camera: CameraProfile
@@ -141,7 +140,7 @@ class FakeTransfers:
         return []
 
 
-def rig_of(streams: Mapping[int, UInt8] | list[UInt8], profile: RigProfile) -> dict[str, FakeCamera]:
+def rig_of(streams: Sequence[UInt8], profile: RigProfile) -> dict[str, FakeCamera]:
     """A fake camera for each stream, by id; all write to one log."""
     log: list[str] = []
     return {
@@ -152,6 +151,3 @@ def rig_of(streams: Mapping[int, UInt8] | list[UInt8], profile: RigProfile) -> d
 
 def layout_of(profile: RigProfile) -> Layout:
     return make_layout(profile.layout, profile.width, profile.height)
-
-
-__all__ = ["FakeCamera", "Path", "frames_of", "layout_of", "rig", "rig_of"]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
 from spike4dgs.generators.recorder.cutting import Cutter, First, agree, first_frame
 from spike4dgs.generators.recorder.gaps import INTERRUPTED
@@ -96,6 +96,7 @@ class _Capture:
     ) -> None:
         self.profile, self.n_ticks, self.sink, self.on_rate, self.stop = profile, n_ticks, sink, on_rate, stop
         self.layout = make_layout(profile.layout, profile.width, profile.height)
+        _compile(self.layout)
         self.links = {c.id: links[c.id] for c in sorted(profile.cameras, key=_primary) if c.id in links}
         self.restart = all(link.restartable for link in links.values())
         slots = _slots(profile, self.layout, n_ticks, continuous=sink is not None)
@@ -115,6 +116,8 @@ class _Capture:
                     fix = "check its cable, and start and endpoint_in in the rig profile"
                     raise problem(f"camera {camera}", "data after its start sequence", reader.end or "none", fix)
             time.sleep(_LOOK_S)
+        if self.stop.is_set():
+            raise _nothing()
         if self.restart:
             self._halt()
             self.drain()
@@ -162,7 +165,7 @@ class _Capture:
             sound = [self.cutters[c].next_tick for c, r in self.readers.items() if r.end == OK]
             n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in self.cutters.values()))
         if n_ticks <= 0:
-            raise problem("capture", "a whole tick of every camera", "an end before it", "record for longer")
+            raise _nothing()
         cameras = [self._camera_clip(c.id, runs[c.id], n_ticks) for c in self.profile.cameras if c.id in self.links]
         return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)
 
@@ -277,6 +280,18 @@ def _joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8,
         return cut[0][1], ticks[0]
     empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
     return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
+
+
+def _nothing() -> UserError:
+    return problem("capture", "a whole tick of every camera", "an end before it", "record for longer")
+
+
+def _compile(layout: Layout) -> None:
+    """Have the layout's kernels compiled before a camera sends."""
+    if layout.has_tags():
+        frame = layout.pack(np.zeros((1, layout.payload_bytes), np.uint8), 0)
+        layout.find(frame[0])
+        layout.unpack(frame, np.empty((1, layout.payload_bytes), np.uint8))
 
 
 def _primary(camera: CameraProfile) -> bool:

@@ -4,32 +4,45 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from collections import deque
 
 from spike4dgs.generators.recorder.layouts import Layout
-from spike4dgs.generators.recorder.reads import FATAL, OK, OVERFLOW, SHORT, TIME_OUT, Completion, Transfers
+from spike4dgs.generators.recorder.reads import FATAL, OK, SHORT, TIME_OUT, Completion, Transfers
 from spike4dgs.generators.recorder.ring import Block, Ring
 from spike4dgs.generators.recorder.transport import Link
 
 _LOOK_S = 0.05  # how often a thread that waits for data looks whether it is to end
 
 
-@dataclass
 class Idle:
-    """Times without a read in flight, after the trigger."""
+    """Times without a read in flight: from the end of the newest read to the submission of the next one."""
 
-    reads: int = 0
-    total_ns: int = 0
-    worst_ns: int = 0
-    starved: int = 0
+    def __init__(self) -> None:
+        self.reads = self.starved = self.total_ns = self.worst_ns = 0
+        self._submitted = self._ended = 0
+        self._arrival_ns = 0  # of the newest read that is known to have ended
+        self._open: deque[tuple[int, int]] = deque()  # submissions whose newest read before has not been told about
 
-    def add(self, ns: int | None) -> None:
-        """Count a read, before whose submission the camera had none for `ns`, or had one (None)."""
-        self.reads += 1
-        if ns is not None:
-            self.starved += 1
-            self.total_ns += ns
-            self.worst_ns = max(self.worst_ns, ns)
+    def ended(self, arrival_ns: int) -> None:
+        """The next read, in the order of submission, has ended."""
+        self._ended, self._arrival_ns = self._ended + 1, arrival_ns
+        if self._open and self._open[0][0] == self._ended:
+            self._add(self._open.popleft()[1] - arrival_ns)
+
+    def submitted(self, now_ns: int, starved: bool, counts: bool) -> None:
+        """A read was submitted; `starved`: when no other was in flight. Only those that count are part of the sums."""
+        self.reads += counts
+        if starved and counts:
+            if self._submitted == self._ended:
+                self._add(now_ns - self._arrival_ns)
+            else:  # the one before has ended too, and will be told about
+                self._open.append((self._submitted, now_ns))
+        self._submitted += 1
+
+    def _add(self, ns: int) -> None:
+        self.starved += 1
+        self.total_ns += max(ns, 0)
+        self.worst_ns = max(self.worst_ns, ns)
 
 
 class Reader:
@@ -78,15 +91,16 @@ class Reader:
             transfers = self.link.transfers()
             try:
                 for _ in range(transfers.depth):
-                    transfers.submit(self.ring.take())
+                    self._submit(transfers, starved=False)
                 self.ready.set()
                 self._read(transfers)
             finally:
                 rest = transfers.cancel()
             if self.end in (None, TIME_OUT):  # these reads follow without a hole: what they hold belongs to the stream
                 for done in rest:
-                    self._put(done)
-        except Exception as e:  # noqa: BLE001 - raised again by the thread that captures
+                    if done.bytes:
+                        self._put(done)
+        except Exception as e:  # raised again by the thread that captures
             self.error = e
         self.end = self.end or OK
         self.ready.set()
@@ -94,22 +108,23 @@ class Reader:
     def _read(self, transfers: Transfers) -> None:
         while not self.halt.is_set() and (self.wanted is None or self.ring.position < self.wanted):
             done = transfers.wait(_LOOK_S)
-            empty_ns = done.arrival_ns if done is not None and not transfers.in_flight else None
             if done is not None:
+                starved = not transfers.in_flight
+                self.idle.ended(done.arrival_ns)
                 self.end = self._put(done)
             if self.end is None and self._silent():
                 self.end = TIME_OUT
             if self.end is not None:
                 break
             if done is not None:
-                transfers.submit(self.ring.take())
-                if self.keep.is_set():
-                    self.idle.add(None if empty_ns is None else time.monotonic_ns() - empty_ns)
+                self._submit(transfers, starved)
+
+    def _submit(self, transfers: Transfers, starved: bool) -> None:
+        transfers.submit(self.ring.take())
+        self.idle.submitted(time.monotonic_ns(), starved, self.keep.is_set() and self.begun_ns is not None)
 
     def _put(self, done: Completion) -> str | None:
         """Hand a read's bytes on. Returns why the camera cannot go on, or None."""
-        if done.status == OVERFLOW:  # the device sent more than was asked for: what the buffer holds is undefined
-            return OVERFLOW
         keep = self.keep.is_set()
         if keep and self.origin is None:
             self.origin = self.ring.position

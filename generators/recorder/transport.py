@@ -156,7 +156,8 @@ def _claim(device: usb.core.Device, camera: CameraProfile) -> None:
             raise
         device.set_configuration()
     for interface in {camera.interface, camera.control_interface} - {None}:
-        with contextlib.suppress(NotImplementedError):  # systems and backends without kernel drivers
+        # Some systems and backends have no kernel drivers; one that stays is found out by the claim.
+        with contextlib.suppress(NotImplementedError, usb.core.USBError):
             if device.is_kernel_driver_active(interface):
                 device.detach_kernel_driver(interface)
         usb.util.claim_interface(device, interface)

@@ -1,0 +1,147 @@
+"""What is checked before a capture: the cameras on the bus, and room for their data in kernel, memory and on disk."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import usb.core
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.generators.recorder.layouts import make_layout
+from spike4dgs.generators.recorder.profile import CameraProfile, RigProfile
+from spike4dgs.generators.recorder.transport import udev_fix
+
+USBFS_LIMIT = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
+MEMINFO = Path("/proc/meminfo")
+
+SUPER_SPEED = 4  # LIBUSB_SPEED_SUPER; 5 is SuperSpeed+
+_SPEEDS = {1: "Low Speed", 2: "Full Speed", 3: "High Speed (480 Mbit/s)"}
+_SPARE_BYTES = 256 << 20  # for the program itself, and for what else the machine does
+
+
+def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, usb.core.Device]:
+    """The devices of the profile's cameras, camera id -> device.
+
+    Raises UserError, which names all cameras concerned, where a serial number is absent or twice on the bus, where a
+    link is slower than SuperSpeed, or where the devices cannot be asked.
+    """
+    found: dict[tuple[int, int, str], list[usb.core.Device]] = defaultdict(list)
+    for vendor, product in sorted({(c.vendor_id, c.product_id) for c in profile.cameras}):
+        for device in _devices(vendor, product, backend):
+            found[vendor, product, _serial(device)].append(device)
+    of = {c.id: found.get((c.vendor_id, c.product_id, c.serial), []) for c in profile.cameras}
+    cameras = {c.id: c for c in profile.cameras}
+    if missing := [cameras[i] for i, devices in of.items() if not devices]:
+        others = ", ".join(sorted(serial for _, _, serial in found)) or "none"
+        fix = "check cable and power, or correct the serial in the rig profile"
+        raise problem(_names(missing), "a device with this serial number", f"only the serials {others}", fix)
+    if twice := [cameras[i] for i, devices in of.items() if len(devices) > 1]:
+        places = ", ".join(_place(d) for c in twice for d in of[c.id])
+        fix = "give each camera a serial number of its own (the bridge's EEPROM), or unplug one"
+        raise problem(_names(twice), "one device with this serial number", f"several, at {places}", fix)
+    if slow := [cameras[i] for i, devices in of.items() if (devices[0].speed or 0) < SUPER_SPEED]:
+        speeds = ", ".join(sorted({_SPEEDS.get(of[c.id][0].speed or 0, "an unknown speed") for c in slow}))
+        fix = "use a USB 3 port and cable, without a USB 2 hub in between"
+        raise problem(_names(slow), "a SuperSpeed link (5 Gbit/s)", speeds, fix)
+    return {camera: devices[0] for camera, devices in of.items()}
+
+
+def check_machine(
+    profile: RigProfile, seconds: float, out: Path, *, continuous: bool = False, emulated: bool = False
+) -> list[UserError]:
+    """What this machine lacks for recording `seconds` into the folder `out`; empty if nothing. Each says its fix.
+
+    Emulated cameras need no kernel memory for USB.
+    """
+    found = [] if emulated else [check_usb_memory(profile)]
+    found += [check_memory(profile, seconds, continuous), check_disk(profile, seconds, out)]
+    if continuous:
+        found.append(check_ring(profile))
+    return [p for p in found if p is not None]
+
+
+def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> UserError | None:
+    """The kernel limits the memory of all reads in flight, by default to 16 MiB; 0 is no limit."""
+    try:
+        limit_mb = int(limit_file.read_text())
+    except (OSError, ValueError):
+        return None  # a system without usbfs has no such limit
+    need_mb = math.ceil(len(profile.cameras) * profile.transfers * profile.transfer_bytes / (1 << 20))
+    if not limit_mb or limit_mb >= need_mb:
+        return None
+    power = 1 << (2 * need_mb - 1).bit_length()
+    fix = f"run: echo {power} | sudo tee {USBFS_LIMIT}"
+    return problem("usbfs_memory_mb", f"{need_mb} MiB for the reads in flight", f"{limit_mb} MiB", fix)
+
+
+def check_memory(profile: RigProfile, seconds: float, continuous: bool, meminfo: Path = MEMINFO) -> UserError | None:
+    """Rings, and for a clip with tags the frames without them, which are made before it is written."""
+    layout = make_layout(profile.layout, profile.width, profile.height)
+    kept_s = profile.ring_seconds if continuous else seconds
+    tick_bytes = layout.frame_bytes
+    if not continuous and layout.frame_bytes != layout.payload_bytes:
+        tick_bytes += layout.payload_bytes
+    flying = profile.transfers * profile.transfer_bytes
+    need = len(profile.cameras) * (kept_s * profile.fps * tick_bytes + 2 * flying) + _SPARE_BYTES
+    try:
+        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
+        free = int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError, IndexError):
+        return None
+    if free >= need:
+        return None
+    shorter = "ring_seconds in the rig profile" if continuous else "--seconds (or record with --continuous)"
+    fix = f"end other programs, or lower {shorter}"
+    return problem("memory", f"{need / 1e9:.1f} GB for the rings", f"{free / 1e9:.1f} GB free", fix)
+
+
+def check_disk(profile: RigProfile, seconds: float, out: Path) -> UserError | None:
+    """The packed streams of all cameras, and a little more."""
+    layout = make_layout(profile.layout, profile.width, profile.height)
+    need = len(profile.cameras) * seconds * profile.fps * layout.payload_bytes + (16 << 20)
+    folder = next(p for p in (out, *out.resolve().parents) if p.exists())
+    free = shutil.disk_usage(folder).free
+    if free >= need:
+        return None
+    fix = "free some space, choose another disk, or lower --seconds"
+    return problem(out, f"{need / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB", fix)
+
+
+def check_ring(profile: RigProfile) -> UserError | None:
+    """A ring that the reads in flight fill has no place for blocks that wait for the disk."""
+    layout = make_layout(profile.layout, profile.width, profile.height)
+    second = profile.fps * layout.frame_bytes
+    need_s = 2 * profile.transfers * profile.transfer_bytes / second
+    if profile.ring_seconds >= need_s:
+        return None
+    fix = "raise ring_seconds, or lower transfers or transfer_bytes"
+    expected = f"ring_seconds of {need_s:.3g} or more, twice the reads in flight"
+    return problem(f"rig {profile.name}", expected, f"{profile.ring_seconds:.3g}", fix)
+
+
+def _devices(vendor: int, product: int, backend: Any | None) -> list[usb.core.Device]:
+    try:
+        return list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product, backend=backend))
+    except usb.core.NoBackendError:
+        fix = "install it (Debian, Ubuntu: sudo apt install libusb-1.0-0)"
+        raise problem("pyusb", "the library libusb-1.0", "no such library", fix) from None
+
+
+def _serial(device: usb.core.Device) -> str:
+    """The serial number. pyusb raises ValueError where it is not allowed to read the device's strings."""
+    try:
+        return str(device.serial_number)
+    except (usb.core.USBError, ValueError) as e:
+        raise problem(_place(device), "a serial number", str(e), udev_fix(device.idVendor)) from None
+
+
+def _place(device: usb.core.Device) -> str:
+    return f"bus {device.bus} address {device.address}"
+
+
+def _names(cameras: list[CameraProfile]) -> str:
+    return "camera " + ", ".join(f"{c.id} (serial {c.serial})" for c in cameras)
