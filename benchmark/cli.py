@@ -43,10 +43,30 @@ COMMANDS: dict[str, Command] = {
         "estimate gain and dark maps from flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
+    "board-clip": Command(
+        "spike4dgs.generators.recorder.board_clip:board_clip",
+        "simulate a chessboard that moves before an array, to record and to calibrate with",
+        "board-clip --out runs/board --seconds 1",
+    ),
+    "calibrate-rig": Command(
+        "spike4dgs.generators.recorder.calibrate_rig:calibrate_rig",
+        "find an array's intrinsics and poses from clips of a moving chessboard",
+        "calibrate-rig captures/board --columns 8 --rows 5 --square-m 0.04 --out rig",
+    ),
     "train-spk2img": Command(
         "spike4dgs.baselines.spike_to_image.spk2img.train:train_spk2img",
         "train the network of the spk2img pictures on training variants of the worlds",
         "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
+    ),
+    "make-msdi-data": Command(
+        "spike4dgs.generators.msdi_data:make_msdi_data",
+        "render training data of MSDI: many variants of the worlds, seen by many rigs",
+        "make-msdi-data --variants 40 --out data/msdi",
+    ),
+    "train-msdi": Command(
+        "spike4dgs.method.msdi.train:train_msdi",
+        "train the network that finds points, poses and pictures from spikes",
+        "train-msdi --data data/msdi --out runs/msdi",
     ),
     "run-benchmark": Command(
         "spike4dgs.benchmark.run:run_benchmark",
@@ -67,6 +87,16 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.baselines.inspect:inspect",
         "show a scene or a raw spike stream: rates, bad pixels, pictures",
         "inspect recording.dat --width 400 --height 250 --fps 20000",
+    ),
+    "render": Command(
+        "spike4dgs.method.viewing.render_video:render",
+        "make a slow-motion video of a fitted model",
+        "render runs/small/models/tfp+4dgs/car-0-small.safetensors --path orbit --slow-motion 1000 --out car.mp4",
+    ),
+    "view": Command(
+        "spike4dgs.method.viewing.viewer:view",
+        "look at a fitted model in the browser",
+        "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "verify": Command(
         "spike4dgs.benchmark.verify:verify",
@@ -111,6 +141,11 @@ SPEED: dict[str, Command] = {
         "spike4dgs.method.speed:splat", "render and differentiate Gaussians, beside a torch reference", "speed splat"
     ),
     "ssim": Command("spike4dgs.method.speed:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
+    "render": Command(
+        "spike4dgs.method.viewing.speed_render:render",
+        "pictures of saved models, side by side",
+        "speed render runs/small/models/*/car-0-small.safetensors",
+    ),
     "simulate": Command(
         "spike4dgs.generators.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
     ),
