@@ -57,6 +57,7 @@ class Metric:
     images: Images = Images.EVERY
     weights: WeightFile | None = None  # a file that users bring; None: always computable
     aligned: bool = False  # the prediction is first multiplied by the scene's gain
+    blind: bool = False  # it does not look at the truth, so the truth has a score of its own
     tolerance: float = 1e-6  # how far the same files' values may lie apart on two machines
 
     def format(self, value: float | None) -> str:
@@ -230,6 +231,7 @@ _PERCEPTUAL = (
         "",
         2,
         takes="srgb8",
+        blind=True,
         tolerance=1e-4,
     ),
     Metric(
@@ -242,6 +244,7 @@ _PERCEPTUAL = (
         "",
         3,
         takes="srgb8",
+        blind=True,
         tolerance=1e-4,
     ),
     Metric(
@@ -254,6 +257,7 @@ _PERCEPTUAL = (
         "",
         4,
         takes="srgb8",
+        blind=True,
         weights=METAIQA,
         tolerance=1e-4,
     ),

@@ -37,7 +37,7 @@ from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
 from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.table_files import write_table
-from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes
+from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes, truth_scores
 from spike4dgs.benchmark.weights import WeightsError
 
 
@@ -240,7 +240,8 @@ def run_benchmark(
     write_pictures(opened, records, out)
     if paper:
         worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
-        write_table(out, build_table(paper, records, worlds))
+        truths = {s.id: truth_scores(s, select_metrics(metrics).metrics) for s in opened}
+        write_table(out, build_table(paper, records, worlds, truths))
         console.print(f"table {paper.number}: {out}/table.md, .csv, .tex, .json", highlight=False, markup=False)
     console.print(f"pictures: {out}/sheet_*.png and {out}/scatter.png", highlight=False, markup=False)
     refused = _submit(records, scenes, settings, leaderboard, replace)

@@ -79,16 +79,20 @@ def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]
 
 
 def _metric_blocks(table: Table, mark: Mark) -> list[tuple[str, list[str], list[list[str]]]]:
+    """One block for each metric: all scenes, and what the metric says of the ground truth where it can be asked."""
     blocks = []
     for m in table["metrics"]:
-        header, columns = ["method"], [[r["method"] for r in table["rows"]]]
+        asked = any(m["id"] in values for values in table["truth"].values())
+        last = ["ground truth"] if asked else []
+        header, columns = ["method"], [[r["method"] for r in table["rows"]] + last]
         for scene, world in table["scenes"].items():
             cells = [r["scenes"][scene]["values"][m["id"]] for r in table["rows"]]
+            truth = [METRICS[m["id"]].format(table["truth"][scene][m["id"]])] if asked else []
             header.append(world)
-            columns.append(_marked([c["value"] for c in cells], m["id"], mark))
+            columns.append(_marked([c["value"] for c in cells], m["id"], mark) + truth)
             if any(c["published"] is not None for c in cells):
                 header.append("published")
-                columns.append([METRICS[m["id"]].format(c["published"]) for c in cells])
+                columns.append([METRICS[m["id"]].format(c["published"]) for c in cells] + ["-"] * len(last))
         blocks.append((m["title"], header, [list(row) for row in zip(*columns, strict=True)]))
     return blocks
 

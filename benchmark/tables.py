@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.image_pair import ImagePair
+from spike4dgs.benchmark.measure import measure
 from spike4dgs.benchmark.metrics import METRICS, Metric
 from spike4dgs.benchmark.result import COSTS, Record
+from spike4dgs.benchmark.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
 IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
@@ -77,8 +80,35 @@ def table_columns(table: PublishedTable) -> tuple[str, ...]:
     return (*table.metrics, *(m for m in ALSO if m not in table.metrics))
 
 
-def build_table(table: PublishedTable, records: Sequence[Record], worlds: Mapping[str, str]) -> dict[str, Any]:
-    """A table's content: every cell a number or a reason, published values beside. `worlds`: scene id -> world."""
+def truth_scores(scene: Scene, metrics: Sequence[Metric]) -> dict[str, float | None]:
+    """What those of `metrics` that look at one image only say of the ground truth: means over a scene's targets.
+
+    The measure of such a metric on a scene: methods that score better than the truth did not come nearer to it.
+    """
+    found: dict[str, list[float | None]] = {m.id: [] for m in metrics if m.blind}
+    for target in scene.targets if found else ():
+        truth = scene.ground_truth(target)
+        pair = ImagePair(truth, truth, scene.moving(target), f"{scene.id}, {target.name}")
+        values = measure(pair, None, [METRICS[m] for m in found]).values
+        for metric, gathered in found.items():
+            gathered.append(values[metric])
+    means = {}
+    for metric, gathered in found.items():
+        known = [v for v in gathered if v is not None]
+        means[metric] = sum(known) / len(known) if known and len(known) == len(gathered) else None
+    return means
+
+
+def build_table(
+    table: PublishedTable,
+    records: Sequence[Record],
+    worlds: Mapping[str, str],
+    truths: Mapping[str, Mapping[str, float | None]] | None = None,
+) -> dict[str, Any]:
+    """A table's content: every cell a number or a reason, published values beside.
+
+    worlds: scene id -> world; truths: scene id -> what `truth_scores` says of it.
+    """
     rows = [_row(table, record, worlds) for record in records]
     for metric in table_columns(table):
         measured = [r["mean"][metric]["value"] for r in rows]
@@ -101,6 +131,7 @@ def build_table(table: PublishedTable, records: Sequence[Record], worlds: Mappin
         ],
         "agreement": {m: kendall_tau(rows, m) for m in table.metrics},
         "rows": rows,
+        "truth": {scene: dict(values) for scene, values in (truths or {}).items()},
         "harness": records[0]["harness"],
         "environment": records[0]["environment"],
     }

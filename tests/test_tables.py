@@ -7,15 +7,27 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.images import encode_srgb
+from spike4dgs.benchmark.iqa.brisque import brisque
 from spike4dgs.benchmark.metrics import METRICS
+from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.benchmark.table_files import to_csv, to_latex, to_markdown, write_table
-from spike4dgs.benchmark.tables import build_table, kendall_tau, published, ranks, table_columns, table_scenes
+from spike4dgs.benchmark.tables import (
+    build_table,
+    kendall_tau,
+    published,
+    ranks,
+    table_columns,
+    table_scenes,
+    truth_scores,
+)
 
 
 def test_published_numbers_are_the_papers() -> None:
@@ -135,6 +147,7 @@ def test_best_and_second_are_marked() -> None:
 
     table = {
         "table": 1,
+        "truth": {"s": {"niqe": 4.5}},
         "title": "T",
         "published_note": "n",
         "scenes": {"s": "car"},
@@ -149,8 +162,18 @@ def test_best_and_second_are_marked() -> None:
     assert shown["d"].startswith("| d | - | 6")
     psnr_block = to_markdown(table).split("## PSNR")[1].split("##")[0]
     assert "| b | **30.00** |" in psnr_block and "| c | <u>25.00</u> |" in psnr_block
+    niqe_block = to_markdown(table).split("## NIQE")[1]
+    assert "| ground truth | 4.500 |" in niqe_block and "ground truth" not in psnr_block
     latex = to_latex(table)
     assert r"b & \textbf{30.00}" in latex and r"c & \underline{25.00}" in latex and latex.count(r"\begin{tabular}") == 3
+
+
+def test_the_truth_has_scores_by_the_metrics_that_ask_for_none(small_scene: Path) -> None:
+    scene = open_scene(small_scene)
+    found = truth_scores(scene, [METRICS["psnr"], METRICS["brisque"]])
+    values = [brisque(encode_srgb(np.clip(scene.ground_truth(t), 0, 1)), "truth") for t in scene.targets]
+    assert found == {"brisque": pytest.approx(np.mean(values))}
+    assert truth_scores(scene, [METRICS["psnr"]]) == {}
 
 
 def test_missing_scenes_name_the_command_that_makes_them(tmp_path: Path) -> None:
