@@ -108,7 +108,7 @@ def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     residual = float(np.median(away))
     # Median absolute deviation -> standard deviation, as for normal scatter, of which medians use 64 % (pi / 2 more).
     error = 1.4826 * residual * math.sqrt(math.pi / 2) / (math.sqrt(len(x)) * float(np.std(x)))
-    return _Line(slope, error, height + base, residual, float(away.max()), len(arrival))
+    return _Line(slope, error, height + float(base), residual, float(away.max()), len(arrival))
 
 
 def _without_nan(value: Any) -> Any:
