@@ -64,8 +64,10 @@ class TrainSettings:
 
     # Losses on spikes.
     spike_ticks: int = 40  # ticks of a recorded window, as many as TFP's has
-    value_ticks: int = 40  # that a neuron fires for one spike value of SPSS; 1 makes it binary (see spike_variation)
-    phi_rate: float = 1e-3
+    neuron_ticks: int = (
+        256  # for which a neuron sees a rendered picture: SpikeNeRF's; closed form, so they cost nothing
+    )
+    phi_rate: float = 1e-2
     noise_rate: float = 1e-3
     noise_weight: float = 30.0  # of the noise embedding's mean square; with 0.1 it takes the pictures' edges: 7 dB lost
 

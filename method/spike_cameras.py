@@ -31,9 +31,9 @@ class SpikeCameras(nn.Module):
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
         for i, found in enumerate(scene.calibrations or ()):
-            known = np.isfinite(found.gain) & np.isfinite(found.dark)
-            white[i][known] = (found.radiance_gain * found.gain)[known]
-            dark[i][known] = found.dark[known]
+            light = found.radiance_gain * found.gain
+            known = np.isfinite(light) & np.isfinite(found.dark)
+            white[i][known], dark[i][known] = light[known], found.dark[known]
         # Not in checkpoints: a scene gives the same maps again.
         self.register_buffer("white", torch.from_numpy(white), persistent=False)
         self.register_buffer("dark", torch.from_numpy(dark), persistent=False)

@@ -2,8 +2,8 @@
 
 What is public. Spike4DGS's Table 4 compares "pixel loss in vanilla 4DGS, spike loss in SpikeNeRF, and the combination
 of the above" with its own, and does not write the spike loss down. SpikeNeRF's code does: the rendered intensity passes
-a sensor model with per-pixel maps and an integrate-and-fire neuron of 256 steps; the mean of its spikes is compared with
-the recorded mean spikes around the instant, by the mean of the squared difference after the exponent 1/2.2.
+a sensor model with per-pixel maps and an integrate-and-fire neuron of 256 steps; the mean of its spikes is compared
+with the recorded mean spikes around the instant, by the mean of the squared difference after the exponent 1/2.2.
 
 What is our reading. The same neuron and loss as in Dy-SpikeNeRF (`radiance_field.spiking`: subtractive reset, random
 charge at the start); the sensor model is `SpikeCameras`; the recorded window has `spike_ticks` ticks, as many as TFP's.
@@ -20,19 +20,18 @@ from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.spike_cameras import SpikeCameras, random_charge, recorded
 from spike4dgs.method.supervision_model import Render, Sample, Supervision
 
-NEURON_STEPS = 256  # published; the neuron is in closed form, so that their number costs nothing
-
 
 class SpikeRate(Supervision):
     """Mean squared difference of simulated and recorded mean spikes per tick, after the published gamma."""
 
     def __init__(self, settings: TrainSettings, scene: TrainingScene) -> None:
         super().__init__()
-        self.spike_ticks, self.scene, self.cameras = settings.spike_ticks, scene, SpikeCameras(scene)
+        self.settings, self.scene, self.cameras = settings, scene, SpikeCameras(scene)
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """The loss of one rendered sample."""
-        counts, ticks = recorded(self.scene, sample, self.spike_ticks)
+        s = self.settings
+        counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         current = self.cameras.rate(render(sample.t), sample.views)
-        rate = firing_rate(current, random_charge(current, sample.step), NEURON_STEPS)
+        rate = firing_rate(current, random_charge(current, sample.step), s.neuron_ticks)
         return spike_loss(rate, counts.to(rate) / ticks)

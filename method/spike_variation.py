@@ -8,11 +8,11 @@ What is public is the text of these equations. What it leaves open, and how it i
 
 - The neuron: subtractive reset, random charge at the start of each step (`spike_cameras.fire`).
 - "A single spike", the value (H, W, 1) that the neuron gives for one rendered picture, is its mean spikes over
-  `value_ticks` ticks. Taken for a single tick, a spike is 0 or 1, and no picture minimises the L1 distance of such a
+  `neuron_ticks` ticks, as in SpikeNeRF. With 1 it would be binary, and no picture minimises the L1 distance of a binary
   value to a mean: in expectation the straight-through gradient of |S - R| draws every rate to 1/2.
 - phi_s: one linear layer and a sigmoid, since what comes out are spikes. It begins as the sequence that an even stream
-  of spikes has, sorted: element k fires where the value exceeds (k + 1/2) / Gamma. Its average is then the value s
-  itself and its deviation sqrt(s (1 - s)), which are those of Gamma binary spikes. It is trained with the Gaussians.
+  of spikes has, sorted: element k fires where the value exceeds (k + 1/2) / Gamma. Average and deviation are then those
+  of Gamma binary spikes, but for the width of a sigmoid. It is trained with the Gaussians.
 - std: that of the population, which is 0 and not undefined for a window of one tick. Its slope is infinite where the
   variance is 0, so FLOOR is added to both variances.
 - Gamma = `spike_ticks`. At the clip's ends R's window is shorter; averages and deviations are compared all the same.
@@ -20,8 +20,8 @@ What is public is the text of these equations. What it leaves open, and how it i
 What to know of it. Spikes are 0 or 1, so that std R = sqrt(a (1 - a)) with a = avg R, exactly: the second term of eq.
 17 holds nothing that the first does not. It weights it, most where pixels are dark and nothing at a = 1/2.
 
-phi_s sees one number per pixel, and that number has value_ticks + 1 values. It is evaluated once for each of them, not
-for each pixel: 41 rows instead of 100,000 for 4 views of 200x125, with the same values and gradients.
+phi_s sees one number per pixel, and that number has neuron_ticks + 1 values. It is evaluated once for each of them, not
+for each pixel: 257 rows instead of 100,000 for 4 views of 200x125, with the same values and gradients.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ from spike4dgs.method.spike_cameras import SpikeCameras, fire, random_charge, re
 from spike4dgs.method.supervision_model import Render, Sample, Supervision
 
 FLOOR = 1e-6  # of variances: a deviation of 1/1000, where one spike in 40 ticks makes 0.16
-STEEPNESS = 3.0  # of phi_s at first, per step between two thresholds: average and slope as of a step within 4 %
+# Of phi_s at first, per step between two thresholds. Sigmoids lower the window's variance by 1 / (STEEPNESS Gamma),
+# which the second term takes for too much or too little light: with 3, at a rate of 0.3, for 0.02 spikes per tick.
+STEEPNESS = 8.0
 
 
 class SpikeVariation(Supervision):
@@ -53,8 +55,8 @@ class SpikeVariation(Supervision):
         s = self.settings
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         rate = self.cameras.rate(render(sample.t), sample.views)
-        spike = fire(rate, random_charge(rate, sample.step), s.value_ticks) / s.value_ticks  # [V, H, W]
-        average, deviation = window_moments(self.phi, spike, s.value_ticks)
+        spike = fire(rate, random_charge(rate, sample.step), s.neuron_ticks) / s.neuron_ticks  # [V, H, W]
+        average, deviation = window_moments(self.phi, spike, s.neuron_ticks)
         seen = counts.to(rate) / ticks
         spread = (seen * (1 - seen) + FLOOR).sqrt()  # of spikes that are 0 or 1
         return (average - seen).abs().mean() + (deviation - spread).abs().mean()
