@@ -108,7 +108,11 @@ def load_pretrained(network: Msdi, path: Path) -> Transfer:
 
     Raises UserError where the file is neither's, is damaged, or is of other sizes than the network.
     """
-    state = read_state(path, _FIX)
+    return transfer(network, read_state(path, _FIX), path)
+
+
+def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer:
+    """`load_pretrained` of a state dict; `path` is for the error."""
     source = source_of(state)
     if source is None:
         raise problem(path, "the tensors of Fast3R or DUSt3R", f"others, such as {min(state, default='none')}", _FIX)
@@ -124,5 +128,4 @@ def load_pretrained(network: Msdi, path: Path) -> Transfer:
     with torch.no_grad():
         for name, tensor in found.items():
             own[name].copy_(tensor)
-    taken = tuple(sorted(found))
-    return Transfer(source, taken, tuple(n for n in own if n not in found), left)
+    return Transfer(source, tuple(sorted(found)), tuple(n for n in own if n not in found), left)

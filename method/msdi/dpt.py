@@ -98,11 +98,17 @@ class Dpt(nn.Module):
 
 
 def unpack(out: Tensor) -> tuple[Tensor, Tensor]:
-    """[B, 4, H, W] -> points x / |x| * (exp|x| - 1) [B, H, W, 3] and confidence 1 + exp(c) [B, H, W], float32.
+    """[B, 4, H, W] -> points x / |x| * (exp|x| - 1) [B, H, W, 3] and confidence 1 + exp(c) [B, H, W].
 
-    Exponents are bounded by 30, so that no training step can make an infinity.
+    Exponents are bounded by 30, so that no training step can make an infinity. Half floats become float32 before.
     """
-    x = out[:, :3].float().permute(0, 2, 3, 1)
+    out = widened(out)
+    x = out[:, :3].permute(0, 2, 3, 1)
     length = x.norm(dim=-1, keepdim=True)
     reach = torch.expm1(length.clamp(max=_LARGEST))
-    return x / length.clamp(min=1e-8) * reach, 1 + out[:, 3].float().clamp(max=_LARGEST).exp()
+    return x / length.clamp(min=1e-8) * reach, 1 + out[:, 3].clamp(max=_LARGEST).exp()
+
+
+def widened(x: Tensor) -> Tensor:
+    """Half floats as float32; others as they are."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.msdi.config import MsdiConfig
-from spike4dgs.method.msdi.dpt import Dpt, unpack
+from spike4dgs.method.msdi.dpt import Dpt, unpack, widened
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
 from spike4dgs.method.msdi.transformer import NORM_EPS, Block, grid, initialize
 
@@ -171,15 +171,15 @@ class Msdi(nn.Module):
         return Estimate(
             points=around.cut(points).unflatten(0, split),
             confidence=around.cut(confidence).unflatten(0, split),
-            images=images.float().unflatten(0, split),
+            images=widened(images).unflatten(0, split),
         )
 
     def images(self, spikes: Tensor) -> Tensor:
         """The pictures alone, of `spikes` [N, T, H, W]: spikes per tick [N, H, W]; raises as `forward`."""
         _check_shapes((1, *spikes.shape), None, self.config.ticks)
-        around = margins(*spikes.shape[-2:], self.config.patch)
+        around = margins(spikes.shape[2], spikes.shape[3], self.config.patch)
         padded = around.pad(_clean(spikes))
-        return around.cut(self.generator(self.extractor(padded), padded)).float()
+        return widened(around.cut(self.generator(self.extractor(padded), padded)))
 
 
 def _check_shapes(spikes: Sequence[int], intrinsics: Sequence[int] | None, ticks: int) -> None:
@@ -209,6 +209,6 @@ def ray_map(intrinsics: Tensor | None, count: int, height: int, width: int, like
         longer = float(max(height, width))
         rays = torch.stack([(u - width / 2) / longer, (v - height / 2) / longer, torch.zeros_like(u)])
         return rays.to(like.dtype).expand(count, -1, -1, -1)
-    K = intrinsics.reshape(count, 3, 3).to(like.device, torch.float32)[:, :, :, None, None]
+    K = intrinsics.reshape(count, 3, 3).to(like.device)[:, :, :, None, None]
     x, y = (u - K[:, 0, 2]) / K[:, 0, 0], (v - K[:, 1, 2]) / K[:, 1, 1]
     return torch.stack([x, y, torch.ones_like(x)], dim=1).to(like.dtype)

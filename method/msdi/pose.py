@@ -153,7 +153,7 @@ def solve_pose(
         good = inliers[:, 0]
         for _ in range(2):
             turn, shift = cv2.solvePnPRefineLM(points[good], pixels[good], K, None, turn, shift)
-            R, t = cv2.Rodrigues(turn)[0], shift[:, 0]
+            R, t = np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.asarray(shift[:, 0], np.float64)
             good = np.flatnonzero(_inliers(R, t, points, pixels, K, reach_px))
             if len(good) < LEAST_POINTS:
                 return None
@@ -161,7 +161,7 @@ def solve_pose(
         return None
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
         return None
-    return np.asarray(R, np.float64), np.asarray(size * t - R @ middle, np.float64)
+    return R, np.asarray(size * t - R @ middle, np.float64)
 
 
 def _inliers(
