@@ -24,7 +24,7 @@ from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite
 from spike4dgs.method.splat.vector_ir import host_lanes
 
 Array = np.ndarray
-_busy = threading.Lock()  # the scratch memory is shared by all renders of the process
+busy = threading.Lock()  # the scratch memory is shared by all renders of the process
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,22 @@ def _thread_memory(thread: int) -> tuple[Array, ...]:
     return np.empty(rows), lanes, aligned((planes,), np.float32), *block_list, ends, digits
 
 
-def _chunking(channels: int) -> tuple[int, int]:
+def camera_entries(w2c: Tensor, K: Tensor) -> Array:
+    """A camera [16] as `project_kernels.camera_constants` takes it, from [4, 4] and [3, 3]."""
+    pose, k = w2c.detach().double().numpy(), K.detach().double().numpy()
+    return np.concatenate([pose[:3, :3].reshape(-1), pose[:3, 3], k[[0, 1, 0, 1], [0, 1, 2, 2]]])
+
+
+def chunking(channels: int) -> tuple[int, int]:
     """(channels per kernel pass, passes): kernels exist for 1, 2 and 4 channels."""
     per_pass = channels if channels <= 2 else 4
     return per_pass, -(-channels // per_pass)
 
 
-def _pack_colors(colors: Array, depths: Array | None) -> Array:
+def pack_colors(colors: Array, depths: Array | None) -> Array:
     """[N, F] and depths [N] or None -> [chunks, N * channels] float32, padded with zeros."""
     layers = colors.shape[1] + (depths is not None)
-    per_pass, passes = _chunking(layers)
+    per_pass, passes = chunking(layers)
     if depths is None and passes == 1 and per_pass == layers and colors.dtype == np.float32:
         return np.ascontiguousarray(colors).reshape(1, -1)
     packed = np.zeros((passes, len(colors), per_pass), np.float32)
@@ -88,38 +94,91 @@ def _pack_colors(colors: Array, depths: Array | None) -> Array:
     return packed.reshape(passes, -1)
 
 
-def _render_view(
-    geometry: tuple[Array, ...], colors: Array, camera: Array, s: Settings, centers: Array, radii: Array
-) -> Frame:
-    """Draw one view; fills centers [N, 2] and radii [N]."""
-    n, threads = len(colors), get_threads()
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """N Gaussians in one view: where they are drawn, and which tiles they touch. P: Gaussian-tile pairs."""
+
+    camera: Array  # [16] float64, see camera_constants
+    records: Array  # [N, 8] float64
+    keys: Array  # [N] uint32
+    depths: Array  # [N] float32
+    tiles: Array  # [N, 4] int32
+    slots: Array  # [N + 1] int32
+    pairs: Array  # [P] uint64
+    offsets: Array  # [tiles + 1] int64
+
+
+def project_view(geometry: tuple[Array, ...], camera: Array, s: Settings, centers: Array, radii: Array) -> Projection:
+    """Project into one view and list the tiles; fills centers [N, 2] and radii [N]. Raises UserError for NaN."""
+    n, threads = len(geometry[0]), get_threads()
     across, down = -(-s.width // TILE_WIDTH), -(-s.height // TILE_HEIGHT)
     blocks = -(-n // project_kernels.BLOCK)
     records, keys, depths = aligned((n, 8), np.float64), np.empty(n, np.uint32), np.empty(n, np.float32)
     tiles, slots = np.empty((n, 4), np.int32), np.zeros(n + 1, np.int32)
     histogram, invalid = np.empty((blocks, 1 + across * down), np.int32), np.empty(blocks, np.int64)
     offsets = np.empty(across * down + 1, np.int64)
-    memory = [_thread_memory(t) for t in range(threads)]
     arguments = (*geometry, camera, s.width, s.height, s.near, s.eps2d, s.antialiased)
     outputs = (records, keys, depths, centers, radii, tiles, histogram, invalid)
     announce_compilation(project_kernels.project_forward, "CPU splatting")
-    run(project_kernels.project_forward, (*arguments, *outputs), [(m[0],) for m in memory])
+    run(project_kernels.project_forward, (*arguments, *outputs), [(_thread_memory(t)[0],) for t in range(threads)])
     if n and invalid.max() >= 0:
         raise not_finite("geometry", int(invalid.max()))
     pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
     run(tile_kernels.fill_tiles, (keys, tiles, across, histogram, slots, pairs), [()] * threads)
-    packed = _pack_colors(colors, depths if s.depth else None)
-    per_pass, passes = _chunking(colors.shape[1] + s.depth)
-    order = np.zeros(len(pairs) + AHEAD, np.int32)
-    image = np.empty((passes * per_pass, s.height, s.width), np.float32)
-    alpha, processed = np.empty((s.height, s.width), np.float32), np.empty((passes, across * down), np.int64)
-    forward, _ = raster_kernels(host_lanes(), per_pass)
-    longest = int(np.diff(offsets).max())
-    arguments = (records.reshape(-1), packed, pairs, order, offsets, s.width, s.height, image, alpha, processed)
-    run(forward, arguments, [(*m[2:8], np.empty(longest, np.uint64)) for m in memory])
-    return Frame(
-        camera, records.reshape(-1), keys, tiles, slots, order, offsets, packed, processed, image, alpha
-    )  # fmt: skip
+    return Projection(camera, records, keys, depths, tiles, slots, pairs, offsets)
+
+
+def composite_view(p: Projection, colors: Array, channels: int, s: Settings) -> Frame:
+    """Draw one view's lists, nearest first. `colors` as `pack_colors` gives them; `channels` in one kernel pass."""
+    passes, tiles = len(colors), len(p.offsets) - 1
+    order = np.zeros(len(p.pairs) + AHEAD, np.int32)
+    image = np.empty((passes * channels, s.height, s.width), np.float32)
+    alpha, processed = np.empty((s.height, s.width), np.float32), np.empty((passes, tiles), np.int64)
+    forward, _ = raster_kernels(host_lanes(), channels)
+    longest = int(np.diff(p.offsets).max())
+    records = p.records.reshape(-1)
+    arguments = (records, colors, p.pairs, order, p.offsets, s.width, s.height, image, alpha, processed)
+    memory = [_thread_memory(t)[2:8] for t in range(get_threads())]
+    run(forward, arguments, [(*m, np.empty(longest, np.uint64)) for m in memory])
+    lists = (p.camera, records, p.keys, p.tiles, p.slots, order, p.offsets)
+    return Frame(*lists, colors, processed, image, alpha)
+
+
+def record_sums(frame: Frame, s: Settings, d_image: Array, d_alpha: Array, channels: int, count: int) -> Array:
+    """The gradient records [passes, count, record width] of a frame's Gaussian-tile pairs."""
+    sums = aligned((len(frame.colors), count * record_width(channels)), np.float32)
+    _, backward = raster_kernels(host_lanes(), channels)
+    lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
+    pictures = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
+    run(backward, (*lists, *pictures, sums), [_thread_memory(t)[2:7] for t in range(get_threads())])
+    return sums.reshape(len(frame.colors), count, record_width(channels))
+
+
+def chain(
+    frame: Frame | Projection, geometry: tuple[Array, ...], s: Settings, sums: Array, outputs: tuple[Array, ...],
+    d_pose: Array,
+) -> None:  # fmt: skip
+    """Add what the records say to outputs (means, quats, scales, opacities, colors, centers); d_pose [4, 4] is set."""
+    blocks = -(-len(frame.keys) // project_kernels.BLOCK) if d_pose.size else 0
+    block_pose = np.empty((blocks, 12))
+    depth_channel = outputs[4].shape[1] if s.depth else -1
+    arguments = (*geometry, frame.camera, s.width, s.height, s.eps2d, s.antialiased, depth_channel)
+    run(
+        project_gradient.project_backward,
+        (*arguments, frame.keys, frame.slots, sums, *outputs, block_pose),
+        [_thread_memory(t)[:2] for t in range(get_threads())],
+    )
+    if d_pose.size:
+        d_pose[:3] = block_pose.sum(0).reshape(3, 4)
+
+
+def _render_view(
+    geometry: tuple[Array, ...], colors: Array, camera: Array, s: Settings, centers: Array, radii: Array
+) -> Frame:
+    """Draw one view; fills centers [N, 2] and radii [N]."""
+    projection = project_view(geometry, camera, s, centers, radii)
+    packed = pack_colors(colors, projection.depths if s.depth else None)
+    return composite_view(projection, packed, chunking(colors.shape[1] + s.depth)[0], s)
 
 
 def _differentiate_view(
@@ -127,25 +186,9 @@ def _differentiate_view(
     d_pose: Array,
 ) -> None:  # fmt: skip
     """Add one view's gradients to outputs (means, quats, scales, opacities, colors, centers); d_pose [4, 4] is set."""
-    n, channels = len(frame.keys), outputs[4].shape[1]
-    per_pass, passes = _chunking(channels + s.depth)
-    sums = aligned((passes, int(frame.slots[n]) * record_width(per_pass)), np.float32)
-    memory = [_thread_memory(t) for t in range(get_threads())]
-    _, backward = raster_kernels(host_lanes(), per_pass)
-    lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
-    pictures = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
-    run(backward, (*lists, *pictures, sums), [m[2:7] for m in memory])
-    blocks = -(-n // project_kernels.BLOCK) if d_pose.size else 0
-    block_pose = np.empty((blocks, 12))
-    arguments = (*geometry, frame.camera, s.width, s.height, s.eps2d, s.antialiased, channels if s.depth else -1)
-    record_sums = sums.reshape(passes, -1, record_width(per_pass))
-    run(
-        project_gradient.project_backward,
-        (*arguments, frame.keys, frame.slots, record_sums, *outputs, block_pose),
-        [m[:2] for m in memory],
-    )
-    if d_pose.size:
-        d_pose[:3] = block_pose.sum(0).reshape(3, 4)
+    channels = chunking(outputs[4].shape[1] + s.depth)[0]
+    sums = record_sums(frame, s, d_image, d_alpha, channels, int(frame.slots[len(frame.keys)]))
+    chain(frame, geometry, s, sums, outputs, d_pose)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -157,12 +200,10 @@ class _Rasterize(torch.autograd.Function):
         probe: Tensor, K: Tensor, settings: Settings, radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         geometry = tuple(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities))
-        poses, intrinsics = w2c.detach().double().numpy(), K.detach().double().numpy()
         frames = []
-        with _busy:
-            for c in range(len(poses)):
-                K_entries = intrinsics[c, [0, 1, 0, 1], [0, 1, 2, 2]]
-                camera = np.concatenate([poses[c, :3, :3].reshape(-1), poses[c, :3, 3], K_entries])
+        with busy:
+            for c in range(len(w2c)):
+                camera = camera_entries(w2c[c], K[c])
                 centers, reach = probe.detach()[c].numpy(), radii[c].numpy()
                 frames.append(_render_view(geometry, colors.detach().numpy(), camera, settings, centers, reach))
         ctx.frames, ctx.geometry, ctx.settings = frames, geometry, settings
@@ -178,7 +219,7 @@ class _Rasterize(torch.autograd.Function):
         outputs = [np.zeros(a.shape, dtype) for a in ctx.geometry] + [np.zeros((n, ctx.channels), np.float32)]
         d_centers = np.zeros((len(ctx.frames), n, 2), dtype)
         d_w2c = np.zeros((len(ctx.frames), 4, 4) if ctx.needs_input_grad[5] else (len(ctx.frames), 0))
-        with _busy:
+        with busy:
             for c, frame in enumerate(ctx.frames):
                 layers = np.zeros(frame.image.shape, np.float32)
                 layers[: d_image.shape[1]] = d_image[c].numpy()
