@@ -16,6 +16,7 @@ from spike4dgs.method.msdi.dpt import Fusion, unpack
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
 from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import margins, ray_map, view_numbers
+from spike4dgs.method.msdi.shrink import shrink, shrink_intrinsics
 
 
 @pytest.fixture(autouse=True)
@@ -327,3 +328,35 @@ def test_training_fits_one_sample() -> None:
         sum(parts).backward()  # type: ignore[union-attr]
         optimizer.step()
     assert losses[-1][0] < losses[0][0] - 0.4 and losses[-1][1] < 0.5 * losses[0][1]
+
+
+@pytest.mark.parametrize(("factor", "size"), [(2, (6, 8)), (3, (7, 5)), (4, (5, 9))])
+def test_shrunk_stream_is_that_of_larger_pixels(factor: int, size: tuple[int, int]) -> None:
+    g = torch.Generator().manual_seed(0)
+    x = (torch.rand(2, 1, 30, *size, generator=g) < torch.rand(2, 1, 1, *size, generator=g)).float()
+    out = shrink(x, factor)
+    rows, columns = (-(-n // factor) for n in size)
+    assert out.shape == (2, 1, 30, rows, columns) and set(out.unique().tolist()) <= {0.0, 1.0}
+    for sample, row, column in np.ndindex(2, rows, columns):
+        block = x[sample, 0, :, factor * row : factor * (row + 1), factor * column : factor * (column + 1)]
+        threshold = block[0].numel()
+        charge = threshold / 2
+        for tick in range(30):
+            charge += float(block[tick].sum())
+            fired = charge >= threshold
+            charge -= threshold * fired
+            assert out[sample, 0, tick, row, column] == fired
+        assert abs(float(out[sample, 0, :, row, column].sum()) - 30 * float(block.mean())) <= 0.5 + 1e-5
+
+
+def test_shrinking_keeps_dark_and_saturated_and_moves_the_rays_with_the_blocks() -> None:
+    assert torch.equal(shrink(torch.zeros(1, 9, 5, 7), 2), torch.zeros(1, 9, 3, 4))
+    assert torch.equal(shrink(torch.ones(1, 9, 5, 7), 2), torch.ones(1, 9, 3, 4))
+    x = spikes(2, 9, 5, 7)
+    assert torch.equal(shrink(x.bool(), 1), x)
+    K = torch.tensor([[40.0, 0, 10], [0, 44, 6], [0, 0, 1]])
+    fine, coarse = ray_map(K[None], 1, 12, 20, x), ray_map(shrink_intrinsics(K, 4)[None], 1, 3, 5, x)
+    blocks = torch.nn.functional.avg_pool2d(fine, 4)  # the middle of a block of pixels
+    assert torch.allclose(coarse, blocks, atol=1e-6)
+    with pytest.raises(UserError, match="a factor of 1 or more, found 0"):
+        shrink(x, 0)
