@@ -21,7 +21,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WIDTH, HEIGHT = 900, 540
 
 
-def wait_for(what: str, check: Callable[[], Any], seconds: float = 120.0) -> Any:
+def wait_for(what: str, check: Callable[[], Any], seconds: float = 180.0) -> Any:
     """The first true value of `check`."""
     end = time.monotonic() + seconds
     while not (found := check()):
@@ -73,9 +73,10 @@ def browser(profile: Path) -> Iterator[Page]:
     from websockets.sync.client import connect
 
     flags = ("--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--mute-audio")
+    quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
     software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
     place = (f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0")
-    command = [binary, *flags, *software, *place, "about:blank"]
+    command = [binary, *flags, *quiet, *software, *place, "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port_file = profile / "DevToolsActivePort"
@@ -88,7 +89,11 @@ def browser(profile: Path) -> Iterator[Page]:
 
         address = wait_for("page", page)[0]["webSocketDebuggerUrl"]
         with connect(address, max_size=None) as socket:
-            yield Page(socket)
+            shown = Page(socket)
+            # --window-size counts the window's frame too.
+            size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+            shown.call("Emulation.setDeviceMetricsOverride", **size)
+            yield shown
     finally:
         process.terminate()
         process.wait(timeout=30)

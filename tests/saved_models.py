@@ -68,7 +68,7 @@ def points(n: int = 120) -> Gaussians:
 def gaussian_model(motion: str) -> FittedModel:
     """A model of the trainer with any motion."""
     spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), SETTINGS)
-    made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.4)
+    made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.2)
     footage = Footage(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
     gaussians = made.attach(points(), footage)
     rng = seeded(4, 0)

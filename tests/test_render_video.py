@@ -190,7 +190,7 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
         model(name).save(tmp_path / name, provenance(method={"name": name}))
     files = [str(tmp_path / name) for name in names]
     assert load_speed("render")([*files, "--times", "2", "--csv", str(tmp_path / "t.csv")]) == 0
-    rows = list(csv.DictReader((tmp_path / "t.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
     assert [r["model"] for r in rows] == [f"{name} on toy" for name in names]
     assert all(r["pixels"] == "40x24" and float(r["frames/s"]) > 0 for r in rows)
     assert [r["Gaussians"] for r in rows] == ["120", "120", ""], "a radiance field has none"

@@ -122,7 +122,7 @@ class Viewer:
             while not self._ended.is_set():
                 if self.playing.value:
                     share = time.monotonic() / LOOP_S % 1.0
-                    self.time.value = share * self.stage.saved.provenance.duration_us
+                    self.time.value = share * self.time.max
                     self.redraw()
                 windows = list(self._windows.values())
                 stale = [w for w in windows if w.stale]
