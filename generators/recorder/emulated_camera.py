@@ -166,8 +166,9 @@ class EmulatedCamera:
         """Lose the frames that found no room, when a read is submitted behind others for `asked` bytes in all."""
         if self._memory is None or self._rate is None or self._begun is None:
             return
-        plan = self._plan(asked + self._memory)
-        first = -(-plan.after // self._frame)
+        room = max(asked + self._memory, -self._at % self._frame)  # a frame that has begun is sent to its end
+        plan = self._plan(room + 1)  # one byte more, so that a hole that is just there already counts
+        first = plan.after // self._frame
         lost = (self._produced() // self._frame - first) * self._frame
         if plan.status == OK and lost > 0:
             hole = Fault(self.profile.id, LOST, first, lost=lost)
@@ -213,7 +214,7 @@ class EmulatedCamera:
     def _copy(self, into: UInt8, pieces: Iterable[tuple[int, int]]) -> int:
         n = 0
         for a, b in pieces:
-            if self._wire is None:
+            if self._wire is None and a < b:
                 into[n : n + b - a] = self._bytes(a, b)
                 n += b - a
                 continue
