@@ -1,6 +1,6 @@
 """Rigs that resemble a world's own: another standpoint, another lens, other distances, and cameras a little off place.
 
-A network that learns from one rig learns that rig by heart. Nothing here ever returns the world's own rig.
+A network that learns from one rig learns that rig by heart; so the worlds' own rigs are not among what it sees.
 """
 
 from __future__ import annotations

@@ -41,16 +41,19 @@ class Pixels:
 
 def make_spikes(pixels: Pixels, ticks: int, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Spikes [ticks, ...] of 0 and 1, `ticks` odd; the instant is the start of the middle tick, number ticks // 2."""
-    shape = pixels.gain.shape
+    return fire(pixels, ticks, rng.random(pixels.gain.shape, np.float32), rng)
+
+
+def fire(pixels: Pixels, ticks: int, charge: Float32, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """`make_spikes` from charges [...] in [0, 1) before the window; only the shot noise is drawn."""
     sd = pixels.photons**-0.5
     deviates = np.clip(rng.standard_normal(_DEVIATES, np.float32), -_MOST_SD, _MOST_SD) * np.float32(sd)
-    charge = rng.random(shape, np.float32).ravel()
     starts = rng.integers(0, _DEVIATES, charge.size, np.uint16)
     spikes = np.empty((ticks, charge.size), np.uint8)
     rates = np.ascontiguousarray(pixels.rates.reshape(len(pixels.rates), -1))
-    maps = (np.ascontiguousarray(m).ravel() for m in (pixels.gain, pixels.dark))
-    _integrate(rates, *maps, charge, deviates, starts, 1 + _MOST_SD * sd, REACH - ticks // 2, spikes)
-    return spikes.reshape(ticks, *shape)
+    flat = [np.ascontiguousarray(a).ravel() for a in (pixels.gain, pixels.dark, charge)]
+    _integrate(rates, *flat, deviates, starts, 1 + _MOST_SD * sd, REACH - ticks // 2, spikes)
+    return spikes.reshape(ticks, *charge.shape)
 
 
 @kernel
