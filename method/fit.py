@@ -189,7 +189,7 @@ def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, super
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
     gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
-    return FittedModel(gaussians, motion, job.scene.duration_us, job.device, spec)
+    return FittedModel(gaussians, trainer.still, motion, job.scene.duration_us, job.device, spec)
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:

@@ -18,6 +18,7 @@ from spike4dgs.method.model_file import ModelFile, group, write_model
 from spike4dgs.method.motion import MOTIONS, Extent, Motion
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat.backdrop import join
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +44,12 @@ class MotionSpec:
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """Gaussians and how they move."""
+    """Gaussians and how they move, and others that do not."""
 
     KIND: ClassVar = "gaussians"
 
     gaussians: Gaussians
+    still: Gaussians  # none unless the fit froze some
     motion: Motion
     duration_us: float
     device: str
@@ -56,7 +58,8 @@ class FittedModel:
     @property
     def size_bytes(self) -> int:
         """Bytes of the Gaussians and of the motion model."""
-        return count_bytes([*self.gaussians.tensors().values(), *self.motion.state_dict().values()])
+        tensors = [*self.gaussians.tensors().values(), *self.still.tensors().values()]
+        return count_bytes([*tensors, *self.motion.state_dict().values()])
 
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
@@ -67,7 +70,10 @@ class FittedModel:
 
     def splats(self, t_us: float) -> Splats:
         """What is drawn at `t_us`."""
-        return self.motion.splats(self.gaussians, min(max(t_us / self.duration_us, 0.0), 1.0))
+        moving = self.motion.splats(self.gaussians, min(max(t_us / self.duration_us, 0.0), 1.0))
+        if not len(self.still):
+            return moving
+        return join(self.still.splats(), moving)
 
     def picture(self, image: Tensor, views: Views) -> Tensor:
         """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
@@ -75,7 +81,7 @@ class FittedModel:
 
     def save(self, path: Path, provenance: Provenance) -> None:
         """Write the model to one file; see `saved_model.load_model`."""
-        tensors = group(gaussians=self.gaussians.tensors(), motion=self.motion.state_dict())
+        tensors = group(gaussians=self.gaussians.tensors(), still=self.still.tensors(), motion=self.motion.state_dict())
         write_model(path, ModelFile(self.KIND, {"motion": self.spec.as_dict()}, tensors, provenance))
 
     @classmethod
@@ -84,8 +90,11 @@ class FittedModel:
         spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
         motion = MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator())
         motion.load_state_dict(file.part("motion"))
-        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
-        return cls(gaussians, motion.to(device), file.provenance.duration_us, device, spec)
+        gaussians, still = (
+            Gaussians.from_tensors({k: v.to(device) for k, v in file.part(part).items()})
+            for part in ("gaussians", "still")
+        )
+        return cls(gaussians, still, motion.to(device), file.provenance.duration_us, device, spec)
 
 
 def count_bytes(tensors: Iterable[Tensor]) -> int:

@@ -12,7 +12,7 @@ from spike4dgs.method.hexplane import HexPlaneMotion, HexPlaneShape, plane_tv, t
 from spike4dgs.method.motion_model import Extent, Motion
 from spike4dgs.method.optimizer import Decay
 from spike4dgs.method.settings import TrainSettings
-from spike4dgs.method.spacetime import Spacetime, SpacetimeLite
+from spike4dgs.method.spacetime import Paths, Spacetime, SpacetimeLite
 from spike4dgs.method.splat import Splats
 
 
@@ -74,4 +74,5 @@ MOTIONS: dict[str, Callable[[Extent, TrainSettings, torch.Generator], Motion]] =
     "hexplane": HexPlane4DGS,
     "spacetime": Spacetime,
     "spacetime-lite": SpacetimeLite,
+    "paths": Paths,
 }

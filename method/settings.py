@@ -26,6 +26,9 @@ class TrainSettings:
     coarse_share: float = 0.2  # middle share of the clip that the coarse stage of a moving scene sees
     flat_field: bool = False  # correct the pictures by each camera's calibrated gain n(x, y) and dark rate, if known
 
+    # Model only what moves.
+    freeze_still: bool = False  # after the static stage, Gaussians where nothing changes become a backdrop
+
     # Loss.
     ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs
 
@@ -74,7 +77,7 @@ class TrainSettings:
     # Spacetime Gaussians. Published rates in brackets, for 30,000 steps.
     static_life: float = 4.0  # of the clip: a Gaussian that fades by 1 % towards the clip's ends [1]
     moving_life: float = 0.3
-    moving_change: float = 0.03  # standard deviation over time, in white, above which pixels count as moving
+    moving_change: float = 0.03  # standard deviation over time, in white, above which pixels count as moving (TFP's)
     moving_copies: int = 3  # times at which a moving point is laid down
     guided_rounds: int = 2  # of guided sampling, after the second and the following refinements
     times_rate: float = 1e-3  # [1e-4]

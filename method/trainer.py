@@ -22,8 +22,10 @@ from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Edit, Gaussians
 from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Views, render
+from spike4dgs.method.splat.backdrop import Backdrop
 from spike4dgs.method.supervision_model import Sample, Supervision
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
@@ -105,6 +107,8 @@ class Trainer:
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
         self.gaussians = gaussians.trainable()
+        self.still = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # frozen: the backdrop
+        self.backdrop: Backdrop | None = None
         self._begin(self.plan[0])
 
     @property
@@ -129,6 +133,15 @@ class Trainer:
         self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
         self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
 
+    def _freeze(self) -> None:
+        """Make a backdrop of the Gaussians at whose places no view sees a change."""
+        moves = moving(self.gaussians.means.detach(), self.footage) > self.settings.moving_change
+        self._set_still(self.gaussians.rows(~moves))
+        self.gaussians = self.gaussians.rows(moves).trainable()
+
+    def _set_still(self, still: Gaussians) -> None:
+        self.still, self.backdrop = still, Backdrop(still.splats(), self.footage.views)
+
     def sample(self) -> Sample:
         """The current step's views and time."""
         footage, count = self.footage, len(self.footage.views)
@@ -145,6 +158,8 @@ class Trainer:
         """One step; returns the loss."""
         stage, sample = self.stage, self.sample()
         if self.step == stage.first and self.step:
+            if stage.deforms and self.settings.freeze_still:
+                self._freeze()
             self._begin(stage)
         chosen = list(sample.views)
         views = Views(self.footage.views.w2c[chosen], self.footage.views.K[chosen], *self._size())
@@ -152,7 +167,7 @@ class Trainer:
 
         def draw(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, t) if stage.deforms else self.gaussians.splats()
-            outputs.append(render(splats, views))
+            outputs.append(self.backdrop.render(splats, chosen) if self.backdrop else render(splats, views))
             image = outputs[-1].image
             return self.motion.picture(image, views) if stage.deforms else image[..., 0]
 
@@ -175,7 +190,7 @@ class Trainer:
         if done % s.refine_every or done > s.refine_until * stage.steps:
             return
         width, height = self._size()
-        limit = round(s.max_per_pixel * width * height)
+        limit = round(s.max_per_pixel * width * height) - len(self.still)
         rng = seeded(self.seed, self.step)
         for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
@@ -211,6 +226,7 @@ class Trainer:
         """Everything that later steps depend on."""
         parts = {
             "gaussians": self.gaussians.tensors(),
+            "still": self.still.tensors(),
             "motion": self.motion.state_dict(),
             "supervision": self.supervision.state_dict(),
             "adam": export_state(self.adam),
@@ -221,9 +237,13 @@ class Trainer:
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same fit."""
         device = self.gaussians.means.device
-        on = {part: {k: v.to(device) for k, v in saved.part(part).items()} for part in ("gaussians", "pressure")}
+        on = {
+            part: {k: v.to(device) for k, v in saved.part(part).items()} for part in ("gaussians", "still", "pressure")
+        }
         self.step = saved.step
         self.gaussians = Gaussians.from_tensors(on["gaussians"]).trainable()
+        if len(on["still"]["means"]):
+            self._set_still(Gaussians.from_tensors(on["still"]))
         self.motion.load_state_dict(saved.part("motion"))
         self.supervision.load_state_dict(saved.part("supervision"))
         # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.

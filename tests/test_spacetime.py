@@ -17,8 +17,9 @@ from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Gaussians, concatenate, densify, prune, relocate
 from spike4dgs.method.motion import MOTIONS, Extent
 from spike4dgs.method.optimizer import apply_edit, make_adam
+from spike4dgs.method.seen import look_up, moving, project
 from spike4dgs.method.settings import TrainSettings
-from spike4dgs.method.spacetime import Spacetime, SpacetimeLite, look_up, move_to, moving, project
+from spike4dgs.method.spacetime import Spacetime, SpacetimeLite, move_to
 from spike4dgs.method.spacetime_decoder import Decoder, rays
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.splat.reference import rotation_matrices

@@ -16,6 +16,7 @@ from spike4dgs.method.fit import Parts, RecipeMethod, Start, choose_ticks, film,
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.supervision import SUPERVISIONS
 from spike4dgs.method.trainer import Trainer, choose_time, seeded, stages
@@ -102,6 +103,25 @@ def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel
     return Trainer(footage, model.attach(first, footage), model, loss, s, scale=extent.scale, seed=3)
 
 
+@pytest.mark.parametrize("motion", ["paths", "hexplane"])
+def test_what_never_changes_is_frozen_after_the_static_stage(motion: str) -> None:
+    """Frozen Gaussians lie where the views see no change, and nothing touches them again."""
+    fit = trainer(24, motion=motion, freeze_still=True)
+    while fit.step < 8:
+        fit.train_step()
+    assert len(fit.still) == 0
+    fit.train_step()
+    frozen = {k: v.clone() for k, v in fit.still.tensors().items()}
+    assert len(fit.still) > 50 and len(fit.gaussians) > 50
+    limit = fit.settings.moving_change
+    assert moving(fit.still.means, fit.footage).max() <= limit < moving(fit.gaussians.means.detach(), fit.footage).max()
+    before = fit.gaussians.colors.detach().clone()
+    while fit.step < 10:
+        fit.train_step()
+    assert not torch.equal(before, fit.gaussians.colors)
+    assert all(torch.equal(v, fit.still.tensors()[k]) for k, v in frozen.items())
+
+
 class Killed(Exception):
     pass
 
@@ -114,6 +134,7 @@ PARTS_WITH_STATE = {
     "hexplane": {},
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
+    "paths": {"motion": "paths", "freeze_still": True, "steps": 24},  # a backdrop from step 8 on
 }
 
 
@@ -126,7 +147,11 @@ def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize(
     ("parts", "step"),
-    [("hexplane", s) for s in range(1, 12)] + [(p, s) for p in ("spacetime", "spike-render") for s in (3, 6, 9)],
+    [
+        *(("hexplane", s) for s in range(1, 12)),
+        *((p, s) for p in ("spacetime", "spike-render") for s in (3, 6, 9)),
+        *(("paths", s) for s in (7, 8, 9, 15)),
+    ],
 )
 def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path):
     path = tmp_path / "fit.safetensors"
@@ -188,8 +213,8 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
     [
         ({"images": "none"}, "expected images among short, found 'none'"),
         ({"initialization": "colmap"}, "initialization among true"),
-        ({"motion": "wobble"}, "motion among hexplane, spacetime, spacetime-lite, static"),
-        ({"supervision": "spike"}, "supervision among pixel, spike-render"),
+        ({"motion": "wobble"}, "motion among hexplane, paths, spacetime, spacetime-lite, static"),
+        ({"supervision": "spikes"}, r"supervision among pixel, pixel\+spike, spike"),
     ],
 )
 def test_unknown_part_is_named(change, message):

@@ -53,8 +53,7 @@ class Backdrop:
         """
         views = Views(self.views.w2c[list(chosen)], self.views.K[list(chosen)], self.views.width, self.views.height)
         if splats.means.device.type != "cpu":
-            both = [torch.cat(pair) for pair in zip(_tensors(self.splats), _tensors(splats), strict=True)]
-            out = api.render(Splats(*both), views)
+            out = api.render(join(self.splats, splats), views)
             return replace(out, radii=out.radii[:, len(self) :])
         if not torch.isfinite(splats.colors.detach().sum()):
             cpu.require_finite(splats)
@@ -80,6 +79,11 @@ class Backdrop:
             frame = cpu.composite_view(p, colors, cpu.chunking(self.splats.colors.shape[1])[0], s)
             self._still[view] = _Still(p, colors, frame.image, frame.alpha)
         return self._still[view]
+
+
+def join(a: Splats, b: Splats) -> Splats:
+    """The Gaussians of `a` followed by those of `b`."""
+    return Splats(*(torch.cat(pair) for pair in zip(_tensors(a), _tensors(b), strict=True)))
 
 
 def _tensors(splats: Splats) -> tuple[Tensor, ...]:
