@@ -31,6 +31,7 @@ from spike4dgs.benchmark.poses import align_cameras
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Start
+from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -38,8 +39,7 @@ Float64 = NDArray[np.float64]
 VARIABLE = "SPIKE4DGS_DUST3R"
 WEIGHTS = "model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence CC BY-NC-SA 4.0)"
 LONG_SIDE = 512  # px, the size that the weights were trained at
-RANSAC_PX, RANSAC_ROUNDS = 5.0, 100  # of the network's picture; DUSt3R takes 10 rounds
-FOCAL_ROUNDS = 10
+RANSAC_PX = 5.0  # of the network's picture
 LEAST_CONFIDENCE = 0.5  # quantile below which points of a view are left out
 MAX_POINTS = 10_000  # first Gaussians: about 0.4 per pixel of a view of 200x125
 
@@ -137,13 +137,18 @@ def place(
     first = pairs[0].points[0]
     scales = [_scale(first[sure], p.points[0][sure]) for p in pairs]
     shared = np.median([s * p.points[0] for s, p in zip(scales, pairs, strict=True)], axis=0)
-    focal = None if calibrated else focal_from_points(shared[sure], _pixels(sure) - [views[0].cx, views[0].cy])
+    focal = None
+    if not calibrated:
+        focal = focal_from_points(shared[sure], _pixels(sure) - [views[0].cx, views[0].cy])
+        if focal is None:
+            fix = "use rig or colmap"
+            raise problem(f"DUSt3R on {scene.id}", "points that give a focal length", "none before the camera", fix)
     known = [v if focal is None else replace(v, fx=focal, fy=focal, cx=v.width / 2, cy=v.height / 2) for v in views]
     placed, clouds = [replace(known[0], R=np.eye(3), t=np.zeros(3))], [(shared[sure], shown[0][sure])]
     for view, pair, scale, picture in zip(known[1:], pairs, scales, shown[1:], strict=True):
         chosen = pair.confidence[1] >= np.quantile(pair.confidence[1], LEAST_CONFIDENCE)
         points = scale * pair.points[1][chosen]
-        pose = solve_pose(points, _pixels(chosen), view.K, seed)
+        pose = solve_pose(points, _pixels(chosen), view.K, seed, reach_px=RANSAC_PX)
         if pose is None:
             fix = "use rig or colmap"
             raise problem(f"DUSt3R on {scene.id}", f"a pose for {view.id}", "no consistent points", fix)
@@ -178,36 +183,3 @@ def _at_size(view: Camera, camera: Camera) -> Camera:
 
 def _decode_srgb(x: Float32) -> Float32:
     return np.asarray(np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4), np.float32)
-
-
-def focal_from_points(points: Float64, offsets: Float64) -> float:
-    """The focal length f in px that makes sum |p - f q| smallest, q = (x / z, y / z) of points [N, 3] (Weiszfeld).
-
-    `offsets` p [N, 2] are pixels relative to the principal point. Each round solves the least squares that the last
-    one's residuals weigh; points that do not lie before the camera are left out.
-    """
-    ahead = points[:, 2] > 1e-9
-    q, p = points[ahead, :2] / points[ahead, 2:], offsets[ahead]
-    qp, qq = np.sum(q * p, axis=1), np.sum(q * q, axis=1)
-    focal = qp.sum() / qq.sum()
-    for _ in range(FOCAL_ROUNDS):
-        weights = 1 / np.maximum(np.linalg.norm(p - focal * q, axis=1), 1e-8)
-        focal = (weights * qp).sum() / (weights * qq).sum()
-    return float(focal)
-
-
-def solve_pose(points: Float64, pixels: Float64, K: Float64, seed: int) -> tuple[Float64, Float64] | None:
-    """World-to-camera (R, t) from points [N, 3] and their pixels [N, 2]; None where RANSAC finds no pose.
-
-    SQPnP within RANSAC, then Levenberg-Marquardt on the inliers. The same seed gives the same pose.
-    """
-    cv2.setRNGSeed(seed)
-    points, pixels = (np.ascontiguousarray(x, dtype=np.float64) for x in (points, pixels))
-    found, turn, shift, inliers = cv2.solvePnPRansac(
-        points, pixels, K, None, iterationsCount=RANSAC_ROUNDS, reprojectionError=RANSAC_PX, flags=cv2.SOLVEPNP_SQPNP
-    )
-    if not found or inliers is None or len(inliers) < 6:
-        return None
-    good = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[good], pixels[good], K, None, turn, shift)
-    return np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.asarray(shift[:, 0], np.float64)

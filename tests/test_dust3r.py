@@ -13,11 +13,14 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines import dust3r as module
 from spike4dgs.baselines.colmap import clip_means
-from spike4dgs.baselines.dust3r import Pair, dust3r, focal_from_points, place, predictor, resized, solve_pose
-from spike4dgs.baselines.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r, rotate, unpack
+from spike4dgs.baselines.dust3r import Pair, dust3r, place, predictor, resized
+from spike4dgs.baselines.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.poses import angle_deg, pose_errors
 from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.method.msdi.dpt import unpack
+from spike4dgs.method.msdi.pose import solve_pose
+from spike4dgs.method.msdi.transformer import rotate
 
 TINY = Dust3rShape(2, 32, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
 WORLD = ToyWorld(width=100, height=62, n_ticks=40, travel=0.0, seed=2)
@@ -157,24 +160,15 @@ def test_pnp_finds_the_pose(outliers: float) -> None:
     points = camera.unproject(uv, z)
     wrong = rng.random(300) < outliers
     uv[wrong] += rng.uniform(20, 60, (int(wrong.sum()), 2))
-    pose = solve_pose(points, uv, camera.K, 0)
+    pose = solve_pose(points, uv, camera.K, 0, reach_px=5.0)
     assert pose is not None
     assert np.radians(float(angle_deg(pose[0] @ camera.R.T))) < 1e-4 and np.abs(pose[1] - camera.t).max() < 1e-4
 
 
 def test_pnp_without_a_pose_says_so() -> None:
     rng = np.random.default_rng(0)
-    assert solve_pose(rng.normal(size=(40, 3)), rng.uniform(0, 5000, (40, 2)), WORLD.cameras[0].K, 0) is None
-
-
-def test_focal_length_of_points_with_outliers() -> None:
-    rng = np.random.default_rng(1)
-    points = np.column_stack([rng.uniform(-1, 1, (400, 2)), rng.uniform(2, 4, 400)])
-    offsets = 123.0 * points[:, :2] / points[:, 2:]
-    assert abs(focal_from_points(points, offsets) - 123) < 1e-6
-    offsets[:80] += rng.normal(0, 40, (80, 2))
-    points[80] = [0.1, 0.2, -1.0]  # behind the camera
-    assert abs(focal_from_points(points, offsets) - 123) < 2.0
+    points, pixels = rng.normal(size=(40, 3)), rng.uniform(0, 5000, (40, 2))
+    assert solve_pose(points, pixels, WORLD.cameras[0].K, 0, reach_px=5.0) is None
 
 
 def test_resized_view_sees_the_same_scene() -> None:
