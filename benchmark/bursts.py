@@ -159,12 +159,14 @@ def write_bursts(path: Path, facts: BurstFacts, arrays: Mapping[str, NDArray[Any
         if name.startswith(("still", "values")) and name != "still_depth" and not np.isfinite(array).all():
             found = f"{np.count_nonzero(~np.isfinite(array))} that are not in {name}"
             raise problem(path, "finite radiances", found, "correct the world or the renderer")
+    # safetensors writes an array's memory as it lies, whatever its strides
+    plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
+    for name in sorted(plain):
+        digest.update(name.encode() + plain[name].tobytes())
     meta = json.dumps({**asdict(facts), "sha256": digest.hexdigest()}, sort_keys=True)
     with atomic_path(path) as part:
-        safetensors.numpy.save_file(dict(arrays), part, metadata={_SCHEMA: meta})
+        safetensors.numpy.save_file(plain, part, metadata={_SCHEMA: meta})
 
 
 def stack_bursts(rigs: Sequence[Sequence[Burst]], stills: Sequence[tuple[Float32, Float32]]) -> Arrays:
