@@ -14,8 +14,9 @@ our own, which the emulator follows: row r of frame n ends in the 16-bit little-
 Every row so tells its number and, given a neighbour, the frame's: both bytes of the word grow by one from row to row,
 which no picture does. Two rows give n modulo 2^32 (59 hours at 20 kHz), all others confirm it. As 40503 is odd, rows of
 frames n and n + m disagree with each other for every m that is no multiple of 2^16: a frame that begins with one and
-ends with the other is found out, except where they meet within the first row, whose tag comes after its pixels (the
-tick is right even then). A camera with other tags needs another class here.
+ends with the other is found out, except where they meet within the first row, whose tag comes after its pixels, or,
+in the dark and where that tag is zero (n a multiple of 2^16), within the second; the tick is right even then. A camera
+with other tags needs another class here.
 
 `line-tagged` is the published format of the 1000x1000 camera: a block's last word holds 4 pixels (bits 0..3), the line
 1..H/2 (bits 4..13) and the channel (14..15). Blocks come as (H/2, 0), (H/2, 1), (H/2 - 1, 0) ... (1, 1), then (1, 2),
