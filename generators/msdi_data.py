@@ -6,9 +6,10 @@ The shards' format is that of `benchmark.bursts`. A shard is a function of its s
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -27,6 +28,10 @@ from spike4dgs.benchmark.bursts import (
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, RADIANCE_GAIN
+
+if TYPE_CHECKING:
+    from spike4dgs.generators.burst_render import BurstRenderer
+    from spike4dgs.generators.worlds import WorldScene
 
 DURATION_S = 0.1  # of the clips that the instants are drawn from
 VIEWS = 9
@@ -68,7 +73,7 @@ class MakeBursts:
             stills.append((renderer.still, renderer.still_depth))
         return facts, stack_bursts(rigs, stills)
 
-    def _renderer(self, world, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+    def _renderer(self, world: WorldScene, rng: np.random.Generator) -> BurstRenderer:
         """A renderer for a rig with a free view; the more tries it takes, the closer to the world's own rig."""
         from spike4dgs.generators.burst_render import BurstRenderer
         from spike4dgs.generators.rig_jitter import jittered_cameras
@@ -120,7 +125,7 @@ def make_msdi_data(
         instants: Instants of each rig.
         width: Width of the pictures in pixels.
         height: Height of the pictures in pixels.
-        spp: Samples per pixel, a power of two.
+        spp: Samples per pixel of what moves, a power of two; what stands still gets twice as many.
         seed: Seed of everything random.
         workers: Processes that render; one uses all cores.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
@@ -148,7 +153,7 @@ def make_msdi_data(
     return 0
 
 
-def _write_all(made, count: int, out: Path) -> None:  # type: ignore[no-untyped-def]
+def _write_all(made: Iterator[tuple[BurstFacts, Arrays]], count: int, out: Path) -> None:
     start = time.perf_counter()
     for done, (facts, arrays) in enumerate(made, start=1):
         path = burst_path(out, facts.world, facts.variant)
