@@ -64,7 +64,7 @@ def camera_of(scene: Scene, *faults: Fault, layout: str = "plain", **options: ob
 # What a camera sends.
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     layout=st.sampled_from(["plain", "tagged-rows", "line-tagged"]),
     sizes=st.lists(st.integers(1, 5000), min_size=1, max_size=8),
@@ -166,7 +166,7 @@ def test_a_camera_without_reads_in_flight_loses_whole_frames(two: Scene, monkeyp
     assert frames.counts(raw).tolist() == [*range(8), 20, 21, 22, 23]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     steps=st.lists(st.tuples(st.integers(0, 400), st.integers(1, 700)), min_size=1, max_size=12),
     memory=st.integers(0, 700),

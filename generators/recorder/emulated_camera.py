@@ -214,16 +214,18 @@ class EmulatedCamera:
     def _copy(self, into: UInt8, pieces: Iterable[tuple[int, int]]) -> int:
         n = 0
         for a, b in pieces:
-            if self._wire is None and a < b:
-                into[n : n + b - a] = self._bytes(a, b)
-                n += b - a
-                continue
-            while a < b:  # the stream begins anew at its end
-                i = a % len(self._wire)
-                m = min(b - a, len(self._wire) - i)
-                into[n : n + m] = self._wire[i : i + m]
-                n, a = n + m, a + m
+            while a < b:
+                part = self._some(a, b)
+                into[n : n + len(part)] = part
+                n, a = n + len(part), a + len(part)
         return n
+
+    def _some(self, a: int, b: int) -> UInt8:
+        """Bytes from position a on, no more than b - a; a view where frames are sent as they are stored."""
+        if self._wire is None:
+            return self._bytes(a, b)
+        i = a % len(self._wire)  # the stream begins anew at its end
+        return self._wire[i : i + b - a]
 
     def _bytes(self, a: int, b: int) -> UInt8:
         first, last = a // self._frame, -(-b // self._frame)
