@@ -1,6 +1,7 @@
 """The recipes of this package: `METHODS` is what the entry point `spike4dgs.methods` names.
 
-The rows of the paper's tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf.
+The rows of the paper's main tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf. Those of
+its ablations are named IMAGES + INITIALIZATION + 4dgs + SUPERVISION, without `rig` and `pixel`.
 """
 
 from __future__ import annotations
@@ -47,14 +48,24 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
 )
 
+# Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
+SUPERVISED = tuple(
+    Recipe(f"tfp+4dgs+{name}", "tfp", "rig", "hexplane", name) for name in ("spike", "pixel+spike", "spss")
+)
+
 # The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one.
 POSED = (
     Recipe("tfp+colmap+4dgs", "tfp", "colmap", "hexplane", "pixel"),
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
+    # Tables 3 and 7, as far as they do without MSDI.
+    Recipe("tfi+colmap+4dgs", "tfi", "colmap", "hexplane", "pixel"),
+    Recipe("tfi+dust3r+4dgs", "tfi", "dust3r", "hexplane", "pixel"),
+    Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
+    Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
 
 METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in RECIPES},
+    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *SUPERVISED)},
     **{recipe.name: PosedRecipe(recipe, PARTS) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

@@ -159,6 +159,27 @@ def write_scatter(path: Path, records: Sequence[Record]) -> None:
     _save(figure, path)
 
 
+def write_views(path: Path, table: Mapping[str, Any]) -> None:
+    """Write a PNG of a table whose columns are splits `views-N`: each metric against N, measured above published."""
+    metrics, scenes = [m["id"] for m in table["metrics"]], table["scenes"]
+    figure = _figure((3.4 * len(metrics), 6.4))
+    axes = figure.subplots(2, len(metrics), squeeze=False)
+    for row, kind in zip(axes, ("value", "published"), strict=True):
+        for ax, metric in zip(row, metrics, strict=True):
+            for i, method in enumerate(table["rows"]):
+                cells = {int(s.split("-")[-1]): method["scenes"][k]["values"][metric][kind] for k, s in scenes.items()}
+                known = {n: v for n, v in cells.items() if v is not None}
+                if known:
+                    ax.plot(known.keys(), known.values(), "o-", color=f"C{i % 10}", label=method["method"])
+            ax.set_title(f"{METRICS[metric].title}, {'measured' if kind == 'value' else 'published'}", fontsize=9)
+            ax.set_xlabel("training views")
+            ax.set_visible(bool(ax.lines))
+    handles = {label: h for ax in axes.flat for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if handles:
+        figure.legend(handles.values(), handles.keys(), loc="outside right upper", fontsize=8)
+    _save(figure, path)
+
+
 def _figure(size: tuple[float, float], layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -7,7 +7,7 @@ OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
 OUT/work/KEY/                   the checkpoint of an unfinished fit
 OUT/sheet_SCENE.png, OUT/scatter.png, OUT/leaderboard/
 
-A run on another split than the default one keeps all this in OUT/SPLIT/.
+A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from spike4dgs.benchmark.cell import Job, is_done, run_job
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_text, writing
+from spike4dgs.benchmark.paper_table import write_paper_table
 from spike4dgs.benchmark.recipes import Budget, Method, find_methods, make_budget
 from spike4dgs.benchmark.refinement import SUFFIX
 from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
@@ -36,8 +37,7 @@ from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
 from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.table_files import write_table
-from spike4dgs.benchmark.tables import IMAGE_TABLE, build_table, published, table_scenes, truth_scores
+from spike4dgs.benchmark.tables import IMAGE_TABLE, published, table_scenes
 from spike4dgs.benchmark.weights import WeightsError
 
 
@@ -202,7 +202,8 @@ def run_benchmark(
 
     Args:
         scenes: Scene folders.
-        table: Instead of scenes, a table of the paper: 1 (outdoor worlds), 2 (objects), 6 (pictures from spikes).
+        table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
+            (number of views; drawn as views.png), 6 (pictures from spikes), 7 (MSDI without SPSS).
         data: Folder of the table's scenes.
         profile: Profile of the table's scenes.
         methods: Methods by name; all that are installed, or all rows of the table, if left out.
@@ -230,26 +231,34 @@ def run_benchmark(
     if not known:
         raise problem("--methods", "an installed method", "none", "install a package that registers one")
     chosen = [known[name] for name in dict.fromkeys(methods or known)]
-    opened = open_scenes(scenes, allow_gaps, split)
-    if split and not all(s.is_default_split for s in opened):
-        out = out / split
-    settings = Settings(out, seed, choose_device(device), make_budget(budget), metrics)
-    console = make_console()
-    records = run_matrix(opened, chosen, settings, console)
-    console.print(results_table(records))
-    write_pictures(opened, records, out)
+    console, place = make_console(), (seed, choose_device(device), make_budget(budget), metrics)
+    splits = paper.splits if paper and paper.splits and split is None else (split,)
+    runs, refused = [], False
+    for name in splits:
+        opened = open_scenes(scenes, allow_gaps, name)
+        folder = out / name if name and not all(s.is_default_split for s in opened) else out
+        settings = Settings(folder, *place)
+        records = run_matrix(opened, chosen, settings, console)
+        console.print(results_table(records))
+        write_pictures(opened, records, folder)
+        _say(console, f"pictures: {folder}/sheet_*.png and {folder}/scatter.png")
+        refused |= _submit(records, scenes, settings, leaderboard, replace)
+        runs.append((opened, records))
     if paper:
+        folder = out if len(runs) > 1 else folder
         worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
-        truths = {s.id: truth_scores(s, select_metrics(metrics).metrics) for s in opened}
-        write_table(out, build_table(paper, records, worlds, truths))
-        console.print(f"table {paper.number}: {out}/table.md, .csv, .tex, .json", highlight=False, markup=False)
-    console.print(f"pictures: {out}/sheet_*.png and {out}/scatter.png", highlight=False, markup=False)
-    refused = _submit(records, scenes, settings, leaderboard, replace)
-    cells = [(f"{r['method']['name']} on {s}", c["status"]) for r in records for s, c in r["scenes"].items()]
+        write_paper_table(paper, runs, worlds, select_metrics(metrics).metrics, folder)
+        _say(console, f"table {paper.number}: {folder}/table.md, .csv, .tex, .json")
+    every = [r for _, records in runs for r in records]
+    cells = [(f"{r['method']['name']} on {s}", c["status"]) for r in every for s, c in r["scenes"].items()]
     failed = [name for name, status in cells if status == "failed"]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed or refused else 0
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False)
 
 
 def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path) -> int:

@@ -23,12 +23,17 @@ from spike4dgs.benchmark.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
 IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
+MEAN = "mean"  # column of rows that are published without their scenes
 ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics
 
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A table of the paper. `rows`: method -> world -> values, one for each of `metrics`."""
+    """A table of the paper. `rows`: method -> column -> values, one for each of `metrics`.
+
+    Columns are worlds, or, where the table compares numbers of views, `splits` of its worlds. A row that is published
+    as a mean over the worlds has the one column MEAN; a row that we add has none.
+    """
 
     number: int
     title: str
@@ -38,32 +43,36 @@ class PublishedTable:
     metrics: tuple[str, ...]  # ids in our metric table
     names: tuple[str, ...]  # what the paper calls them
     rows: Mapping[str, Mapping[str, tuple[float, ...]]]
+    splits: tuple[str, ...] = ()
 
-    def value(self, method: str, world: str, metric: str) -> float | None:
+    def value(self, method: str, column: str, metric: str) -> float | None:
         """A published value; None where there is none."""
-        values = self.rows.get(method, {}).get(world)
+        values = self.rows.get(method, {}).get(column)
         return values[self.metrics.index(metric)] if values and metric in self.metrics else None
 
     def mean(self, method: str, metric: str) -> float | None:
-        """The mean over the table's worlds."""
-        values = [self.value(method, world, metric) for world in self.worlds]
+        """The mean over the table's columns, or what is published as such."""
+        if (published_mean := self.value(method, MEAN, metric)) is not None:
+            return published_mean
+        values = [self.value(method, column, metric) for column in self.splits or self.worlds]
         known = [v for v in values if v is not None]
         return sum(known) / len(known) if len(known) == len(values) else None
 
 
 @cache
 def published(number: int) -> PublishedTable:
-    """Table 1 (outdoor) or 2 (objects) as published. Raises UserError for another number."""
+    """A table as published. Raises UserError for a number that is none of those in `published_tables.json`."""
     text = (package_files("spike4dgs.benchmark") / "published_tables.json").read_text(encoding="utf-8")
     tables = json.loads(text)
     if str(number) not in tables:
-        raise problem("--table", "1 (outdoor scenes), 2 (objects) or 6 (images)", str(number), "choose one of them")
+        known = [f"{n} ({tables[n]['title'].lower()})" for n in tables if n.isdecimal()]
+        expected = ", ".join([*known, f"{IMAGE_TABLE} (pictures from spikes)"])
+        raise problem("--table", expected, str(number), "choose one of them")
     table = tables[str(number)]
     ids, names = zip(*table["metrics"], strict=True)
     rows = {m: {w: tuple(v) for w, v in r.items()} for m, r in table["rows"].items()}
-    return PublishedTable(
-        number, table["title"], tables["source"], table["note"], tuple(table["worlds"]), ids, names, rows
-    )
+    worlds, splits = tuple(table["worlds"]), tuple(table.get("splits", ()))
+    return PublishedTable(number, table["title"], tables["source"], table["note"], worlds, ids, names, rows, splits)
 
 
 def table_scenes(table: PublishedTable, data: Path, profile: str) -> tuple[Path, ...]:
@@ -107,7 +116,7 @@ def build_table(
 ) -> dict[str, Any]:
     """A table's content: every cell a number or a reason, published values beside.
 
-    worlds: scene id -> world; truths: scene id -> what `truth_scores` says of it.
+    worlds: scene id -> column; truths: scene id -> what `truth_scores` says of it.
     """
     rows = [_row(table, record, worlds) for record in records]
     for metric in table_columns(table):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spike4dgs.baselines.recipes import METHODS, PARTS, POSED, RECIPES
+from spike4dgs.baselines.recipes import METHODS, PARTS, POSED, RECIPES, SUPERVISED
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.recipes import Budget, Recipe, find_methods, get_method
@@ -18,8 +18,18 @@ from spike4dgs.method.fit import RecipeMethod
 
 TINY = Budget(scale=0.01)
 # One of each kind of fit that needs no weights and no features in the pictures.
-FITTED = ["nearest-view", "tfp+static", "tfi+4dgs", "tfp+stg", "tfp+d3dgs", "dy-spikegs", "dy-spikenerf"]
-EXTRA = ["nearest-view", "tfp+colmap+4dgs", "tfp+dust3r+4dgs", "tfp+static"]  # beside the rows of the paper's tables
+FITTED = [
+    "nearest-view",
+    "tfp+static",
+    "tfi+4dgs",
+    "tfp+stg",
+    "tfp+d3dgs",
+    "dy-spikegs",
+    "dy-spikenerf",
+    "tfp+4dgs+spss",
+]
+# Beside the rows of the paper's main tables.
+EXTRA = ["nearest-view", "tfp+static", *(recipe.name for recipe in (*SUPERVISED, *POSED))]
 
 
 def quiet(done: int, total: int, note: str = "") -> None:
@@ -37,13 +47,16 @@ def test_every_row_of_the_papers_tables_is_a_method() -> None:
         assert set(published(number).rows) - {"spike4dgs"} == set(METHODS) - set(EXTRA)
 
 
-@pytest.mark.parametrize("recipe", [*RECIPES, *POSED], ids=lambda r: r.name)
+@pytest.mark.parametrize("recipe", [*RECIPES, *SUPERVISED, *POSED], ids=lambda r: r.name)
 def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
-    images, motions = recipe.name.split("+")[0], {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
+    motions = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane", "static": "static"}
     if not recipe.name.startswith("dy-"):
-        assert recipe.images == images
-        assert recipe.motion == motions.get(recipe.name.split("+")[-1], "static")
-    assert recipe.initialization == (recipe.name.split("+")[1] if recipe in POSED else "rig")
+        images, *middle = recipe.name.split("+")
+        at = next(i for i, part in enumerate(middle) if part in motions)
+        assert (recipe.images, recipe.motion) == (images, motions[middle[at]])
+        assert recipe.initialization == ("+".join(middle[:at]) or "rig")
+        assert recipe.supervision == ("+".join(middle[at + 1 :]) or "pixel")
+    assert (recipe.initialization != "rig") == (recipe in POSED)
     assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
     assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
 
@@ -151,7 +164,7 @@ def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path
 
 
 def test_recipes_that_are_compared_differ_in_one_part() -> None:
-    recipes = {r.name: r.as_dict() for r in (*RECIPES, *POSED)}
+    recipes = {r.name: r.as_dict() for r in (*RECIPES, *SUPERVISED, *POSED)}
 
     def differ(a: str, b: str) -> set[str]:
         return {k for k in recipes[a] if recipes[a][k] != recipes[b][k]} - {"name"}
@@ -160,7 +173,11 @@ def test_recipes_that_are_compared_differ_in_one_part() -> None:
         assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"} == differ(f"tfi+{motion}", f"spk2img+{motion}")
     for images in ("tfi", "tfp", "spk2img"):
         assert differ(f"{images}+d3dgs", f"{images}+4dgs") == {"motion"} == differ(f"{images}+stg", f"{images}+4dgs")
-    assert differ("tfp+4dgs", "dy-spikegs") == {"supervision"}
+    for name in ("dy-spikegs", *(r.name for r in SUPERVISED)):
+        assert differ("tfp+4dgs", name) == {"supervision"}
+    for start in ("colmap", "dust3r"):
+        assert differ(f"tfi+{start}+4dgs", f"tfi+{start}+4dgs+spss") == {"supervision"}
+        assert differ("tfi+4dgs", f"tfi+{start}+4dgs") == {"initialization"}
     assert differ("tfp+4dgs", "tfp+colmap+4dgs") == {"initialization"} == differ("tfp+4dgs", "tfp+dust3r+4dgs")
     assert differ("tfp+4dgs", "tfp+static") == {"motion", "settings"}
     static, moving = (METHODS[name].settings for name in ("tfp+static", "tfp+4dgs"))
