@@ -43,6 +43,11 @@ COMMANDS: dict[str, Command] = {
         "estimate gain and dark maps from flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
+    "record": Command(
+        "spike4dgs.generators.recorder.record:record",
+        "record the cameras of an array over USB, or emulated ones, as a scene folder",
+        "record rig.toml --seconds 0.5 --out captures/first",
+    ),
     "board-clip": Command(
         "spike4dgs.generators.recorder.board_clip:board_clip",
         "simulate a chessboard that moves before an array, to record and to calibrate with",
@@ -149,6 +154,11 @@ SPEED: dict[str, Command] = {
     "simulate": Command(
         "spike4dgs.generators.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
     ),
+    "record": Command(
+        "spike4dgs.generators.recorder.speed:record",
+        "record emulated cameras into memory and to disk, queued beside single reads",
+        "speed record",
+    ),
     "decode": Command(
         "spike4dgs.benchmark.speed_decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
     ),
@@ -176,7 +186,8 @@ def load_speed(name: str) -> Callable[..., Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
-    0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 130: interrupted.
+    0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 3: a recording lost data;
+    130: interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:

@@ -61,6 +61,7 @@ class FakeCamera:
     stream: UInt8  # [bytes]
     faults: Mapping[int, str] = field(default_factory=dict)
     bytes_per_s: float = 50e6
+    limit: int | None = None  # stream byte that it does not pass for now
     depth: int = 3
     restartable: bool = True
     log: list[str] = field(default_factory=list)
@@ -102,7 +103,8 @@ class FakeCamera:
         n = min(ahead) - self.position if ahead else n
         if not ahead and n < len(buffer) and self.position == len(self.stream):
             return None
-        if (time.monotonic() - self.begun) * self.bytes_per_s < self.position + n:
+        sent = (time.monotonic() - self.begun) * self.bytes_per_s
+        if self.position + n > (sent if self.limit is None else min(sent, self.limit)):
             return None
         buffer[:n] = self.stream[self.position : self.position + n]
         self.position += n

@@ -37,6 +37,7 @@ def test_clocks_are_found_exactly_where_nothing_is_late() -> None:
     assert b.offset_us - a.offset_us == pytest.approx(120, abs=0.01)
     assert found.worst_pair == ("a", "b")
     assert found.worst_pair_us == pytest.approx(120 + 37e-6 * 500_000, abs=0.01), "apart the most at the end"
+    assert found.t0_ns == pytest.approx(7e15 + 60e3, abs=100)
     assert a.residual_us < 0.01 and a.reads == 500 and not b.suspect
 
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
-from spike4dgs.generators.recorder.cutting import Cutter, First, agree, first_frame
+from spike4dgs.generators.recorder.cutting import Cutter, First, agree, first_frame, joined
 from spike4dgs.generators.recorder.gaps import INTERRUPTED
 from spike4dgs.generators.recorder.layouts import COUNTER, Layout, make_layout
 from spike4dgs.generators.recorder.profile import PRIMARY, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.rates import Rate, Rates
 from spike4dgs.generators.recorder.reader import Reader
-from spike4dgs.generators.recorder.reads import OK
+from spike4dgs.generators.recorder.reads import OK, TIME_OUT
 from spike4dgs.generators.recorder.ring import Ring
 from spike4dgs.generators.recorder.ticks import Run
 from spike4dgs.generators.recorder.transport import Link
@@ -146,6 +146,8 @@ class _Capture:
         self.interrupted = self.stop.is_set() and any(r.alive for r in self.readers.values())
         self._halt()
         self._agree(last=True)
+        while self.sink is not None and self._write(self.sink):
+            pass
 
     def drain(self) -> None:
         """Stop the cameras, the primary first, and drop what they still send."""
@@ -155,10 +157,8 @@ class _Capture:
                 link.drain()
 
     def clip(self) -> Clip:
-        """Everything that is left becomes frames; gaps and statistics."""
-        while self.sink is not None and self._write(self.sink):
-            pass
-        # Continuous mode has nothing left to pop; else every block still waits.
+        """Frames, gaps and statistics of every camera."""
+        # Continuous mode has popped every block; else all of them still wait.
         runs = {c: self.cutters[c].cut(ring.blocks()) for c, ring in self.rings.items()}
         n_ticks = self.n_ticks
         if self.interrupted:
@@ -249,7 +249,9 @@ class _Capture:
         reader, ring, cutter = self.readers[camera], self.rings[camera], self.cutters[camera]
         end = reader.end or OK
         gaps = cutter.finish(n_ticks, INTERRUPTED if end == OK else end)
-        frames, ticks = _joined(runs, n_ticks, self.layout.frame_bytes)
+        if end == TIME_OUT and not gaps:  # it fell silent after the last tick that was needed
+            end = OK
+        frames, ticks = joined(runs, n_ticks, self.layout.frame_bytes)
         idle = reader.idle
         stats = CameraStats(
             bytes=ring.position - (reader.origin or 0),
@@ -270,16 +272,6 @@ class _Capture:
     def _raise_error(reader: Reader) -> None:
         if reader.error is not None:
             raise reader.error
-
-
-def _joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
-    """Frames [n, frame_bytes] of all runs within the clip, not copied where there is one run, and their ticks [n]."""
-    cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
-    ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
-    if len(cut) == 1:
-        return cut[0][1], ticks[0]
-    empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
-    return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
 
 
 def _nothing() -> UserError:

@@ -108,6 +108,16 @@ def agree(counters: Sequence[int], most: int) -> int | None:
     return (first + max(ahead)) % COUNTER if max(ahead) - min(ahead) <= most else None
 
 
+def joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
+    """Frames [n, frame_bytes] of all runs within the clip, not copied where there is one run, and their ticks [n]."""
+    cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
+    ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
+    if len(cut) == 1:
+        return cut[0][1], ticks[0]
+    empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
+    return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
+
+
 def _address(block: Block) -> int:
     return block.data.ctypes.data if block.data is not None else -1
 

@@ -112,7 +112,7 @@ class Reader:
                 starved = not transfers.in_flight
                 self.idle.ended(done.arrival_ns)
                 self.end = self._put(done)
-            if self.end is None and self._silent():
+            if self.end is None and (done is None or not done.bytes) and self._silent():
                 self.end = TIME_OUT
             if self.end is not None:
                 break

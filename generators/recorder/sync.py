@@ -48,6 +48,7 @@ class SyncReport:
     cameras: tuple[ArrivalFit, ...]
     worst_pair: tuple[str, str] | None
     worst_pair_us: float
+    t0_ns: int | None  # CLOCK_MONOTONIC at tick 0, the median of the cameras
 
     def as_dict(self) -> dict[str, Any]:
         """For scene.json; what is not known is null."""
@@ -79,7 +80,7 @@ def fit_arrival(clip: Clip, fps: float) -> SyncReport:
         far = max(abs(start), abs(end)) * 1e-3
         if pair is None or far > worst:
             worst, pair = far, (a, b)
-    return SyncReport(clip.sync, fits, pair, worst)
+    return SyncReport(clip.sync, fits, pair, worst, round(middle) if known else None)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class _Line:
 def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     """The median of all slopes between two of the points (tick, ns) [m, 2], and the median height."""
     if len(arrival) < 3 or np.ptp(arrival[:, 0]) == 0:
-        return _Line(*[math.nan] * 5, len(arrival))
+        return _Line(math.nan, math.nan, math.nan, math.nan, math.nan, len(arrival))
     used = arrival[np.linspace(0, len(arrival) - 1, min(len(arrival), _MOST_READS)).astype(int)]
     base = used[0, 1]  # CLOCK_MONOTONIC in ns needs more digits than the differences
     x, y = used[:, 0], used[:, 1] - base
