@@ -107,8 +107,9 @@ def check_ticks(ticks: int) -> None:
 
 def chosen(burst: Burst, views: NDArray[np.int64]) -> Burst:
     """Some views of a burst, in this order."""
-    per_view = (burst.depth, burst.moving, burst.w2c, burst.K, burst.gain, burst.dark)
-    return Burst(burst.keys[:, views], *(a[views] for a in per_view))
+    b = burst
+    pictures = b.keys[:, views], b.depth[views], b.moving[views]
+    return Burst(*pictures, w2c=b.w2c[views], K=b.K[views], gain=b.gain[views], dark=b.dark[views])
 
 
 def varied(burst: Burst, rng: np.random.Generator) -> Burst:
@@ -117,8 +118,8 @@ def varied(burst: Burst, rng: np.random.Generator) -> Burst:
     backwards, mirror = rng.random(2) < 0.5
     keys = burst.keys[::-1] if backwards else burst.keys
     order, flips = rng.permutation(len(burst.gain)), [slice(None, None, s) for s in rng.choice([-1, 1], 2)]
-    maps = {"gain": burst.gain[order][:, *flips], "dark": burst.dark[order][:, *flips]}
-    found = replace(burst, keys=keys * brightness, **maps)
+    gain, dark = (maps[order][:, *flips] for maps in (burst.gain, burst.dark))
+    found = replace(burst, keys=keys * brightness, gain=gain, dark=dark)
     return mirrored(found) if mirror else found
 
 

@@ -51,8 +51,9 @@ def fire(pixels: Pixels, ticks: int, charge: Float32, rng: np.random.Generator) 
     starts = rng.integers(0, _DEVIATES, charge.size, np.uint16)
     spikes = np.empty((ticks, charge.size), np.uint8)
     rates = np.ascontiguousarray(pixels.rates.reshape(len(pixels.rates), -1))
-    flat = [np.ascontiguousarray(a).ravel() for a in (pixels.gain, pixels.dark, charge)]
-    _integrate(rates, *flat, deviates, starts, 1 + _MOST_SD * sd, REACH - ticks // 2, spikes)
+    gain, dark, charge_before = (np.ascontiguousarray(a).ravel() for a in (pixels.gain, pixels.dark, charge))
+    first = REACH - ticks // 2
+    _integrate(rates, gain, dark, charge_before, deviates, starts, 1 + _MOST_SD * sd, first, spikes)
     return spikes.reshape(ticks, *charge.shape)
 
 
