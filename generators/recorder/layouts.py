@@ -230,7 +230,7 @@ def _orient_bits(packed: UInt8, width: int, height: int, flip: bool, mirror: boo
 @kernel
 def _word(data: UInt8, at: int) -> int:
     """The little-endian word at data[at]; signed, because numba would make the shift of a byte unsigned."""
-    return np.int64(data[at]) | np.int64(data[at + 1]) << 8
+    return np.int64(data[at]) | np.int64(data[at + 1]) << 8  # type: ignore[return-value]
 
 
 @kernel
