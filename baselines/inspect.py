@@ -101,7 +101,7 @@ def write_picture(path: Path, report: StreamReport, stream: SpikeStream) -> None
     gain = float(np.percentile(report.rate, 99)) or 1.0  # shown as white; the scale of a raw recording is unknown
     aspect = stream.height / stream.width
     heights = [6 * aspect + 0.6] * 2 + [2.4] * bool(stream.gaps)  # inches
-    mosaic = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]
+    mosaic: list[Any] = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]
     figure, axes = plt.subplot_mosaic(mosaic, figsize=(12, sum(heights)), height_ratios=heights, layout="constrained")
     for name in ("tfp", "tfi"):
         axes[name].imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
