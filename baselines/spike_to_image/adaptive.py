@@ -83,7 +83,7 @@ def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], 
 def half_windows(n_ticks: int) -> NDArray[np.float64]:
     """The windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
     steps = max(0, math.ceil(math.log(max(n_ticks, 1) / SHORTEST, GROWTH)))
-    return SHORTEST * GROWTH ** np.arange(steps + 1)
+    return np.asarray(SHORTEST * GROWTH ** np.arange(steps + 1), np.float64)
 
 
 def adaptive_image(stream: SpikeStream, tick: int) -> Float32:

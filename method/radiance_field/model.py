@@ -213,7 +213,7 @@ class RadianceModel:
         config: dict[str, Any] = dict(file.config)
         planes = {**config["shape"]["deformation"], "spatial": tuple(config["shape"]["deformation"]["spatial"])}
         shape = FieldShape(**{**config["shape"], "deformation": HexPlaneShape(**planes)})
-        values = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in config["bounds"].items()}
+        values: dict[str, Any] = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in config["bounds"].items()}
         field = DynamicField(shape, Bounds(**values), config["brightest"], torch.Generator())
         field.load_state_dict(file.part("field"))
         return cls(field.to(device), file.provenance.duration_us, device)

@@ -119,7 +119,7 @@ def exact_patch(
 
     The Gaussians are projected as for the whole picture; those that cannot reach the patch are left out.
     """
-    defaults = rasterise.__kwdefaults__
+    defaults: dict[str, Any] = rasterise.__kwdefaults__ or {}
     drawn, views = model.splats(t_us), Views.from_cameras([camera])
     wide = Splats(*(t.double().cpu() for t in (*drawn.geometry, drawn.colors)))
     whole = (camera.width, camera.height)
