@@ -28,6 +28,7 @@ from spike4dgs.generators.recorder.board_clip import (
     BoardMotion,
     array,
     draw_board,
+    key_spacing,
     write_board_clip,
 )
 from spike4dgs.generators.recorder.board_views import BoardRecording, View, choose_views, common_cameras, picture
@@ -104,6 +105,16 @@ def test_a_board_that_is_not_seen_whole_is_not_found():
     covered[:, : int(uv[:, 0].min()) + 8] = WALL
     assert find_corners(covered, BOARD) is None
     assert find_corners(np.zeros((40, 60), np.float32), BOARD) is None
+
+
+def test_keys_are_as_dense_as_the_board_is_fast():
+    cameras, ticks = CAMERAS[::4], 4000
+    spacing = key_spacing(cameras, BOARD, MOTION, ticks)
+    assert 1 < spacing < 20
+    at = [projected(c, s / ticks)[0] for c in cameras for s in range(0, ticks + spacing, spacing)]
+    moved = np.linalg.norm(np.diff(np.reshape(at, (len(cameras), -1, 40, 2)), axis=1), axis=-1)
+    assert 0.5 < moved.max() < 1.02
+    assert key_spacing(cameras, BOARD, MOTION, 10**6) == 20 and key_spacing(cameras, BOARD, MOTION, 20) == 1
 
 
 # ------------------------------------------------------------ bundle adjustment
@@ -303,5 +314,5 @@ def test_a_board_clip_is_a_scene_and_nothing_is_overwritten(tmp_path, capsys):
     scene = open_scene(tmp_path / "b")
     assert (scene.n_ticks, len(scene.cameras), scene.meta["source"]["square_m"]) == (40, 9, 0.04)
     assert main(arguments) == 2
-    assert main([*arguments[:2], str(tmp_path / "c"), "--seconds", "0.0005"]) == 2
-    assert "at least 0.001" in capsys.readouterr().err
+    assert main([*arguments[:2], str(tmp_path / "c"), "--seconds", "0.00001"]) == 2
+    assert "at least 5e-05, one tick" in capsys.readouterr().err

@@ -1,9 +1,9 @@
 """A chessboard that moves before an array of nine spike cameras, without hardware: a clip to try the calibration on.
 
-The board's radiance is traced with 4x4 samples a pixel at a key every millisecond and handed to the same sensor
-simulator as every scene, with gain and dark maps and shot noise. What is written is a scene folder, so
+The board's radiance is traced with 4x4 samples a pixel, at a key for every pixel that the board moves, and handed to
+the same sensor simulator as every scene, with gain and dark maps and shot noise. What is written is a scene folder, so
 `record --emulate` serves it like a real array, and its poses are the truth for `calibrate-rig`. Not modelled: lenses
-(the cameras are pinholes), shading of the board by its tilt, and motion within a key's instant.
+(the cameras are pinholes), and shading of the board by its tilt.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, RADIANCE_GAIN, Sensor
 from spike4dgs.generators.sensor_maps import dark_map, gain_map
 
 RATE_HZ = 20000
-KEY_TICKS = 20  # 1 ms
+LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames, and how far the board moves in that time at most
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
+_POSES = 500  # of the motion at which its speed is looked at
 DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of view is the horizontal one
 _PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
 
@@ -155,7 +156,8 @@ def write_board_clip(
 ) -> Path:
     """Write the clip as a scene folder and return its path. Raises UserError where something is there already."""
     check_new(out)
-    key_ticks = list(range(0, n_ticks + KEY_TICKS, KEY_TICKS))
+    spacing = key_spacing(cameras, board, motion, n_ticks)
+    key_ticks = list(range(0, n_ticks + spacing, spacing))
     poses = [motion.pose(tick / n_ticks) for tick in key_ticks]
     for camera in cameras:
         size, entropy = (camera.height, camera.width), [seed, *f"board {camera.id}".encode()]
@@ -194,6 +196,17 @@ def write_board_clip(
         ),
     )
     return out
+
+
+def key_spacing(cameras: Sequence[Camera], board: Board, motion: BoardMotion, n_ticks: int) -> int:
+    """Ticks between key frames: no corner of the board moves by more than `KEY_PX` in any camera."""
+    ticks = np.linspace(0, n_ticks, _POSES)
+    corners = board.corners[[0, board.columns - 1, -board.columns, -1]]
+    poses = [motion.pose(tick / n_ticks) for tick in ticks]
+    world = np.concatenate([corners @ R.T + t for R, t in poses])
+    tracks = np.stack([c.project(world)[0].reshape(_POSES, len(corners), 2) for c in cameras])
+    fastest = float(np.linalg.norm(np.diff(tracks, axis=1), axis=-1).max()) / (ticks[1] - ticks[0])  # px a tick
+    return int(np.clip(KEY_PX / fastest, 1, LONGEST_KEY_TICKS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +248,8 @@ def board_clip(
         seed: Of the array's errors of mounting and of the sensors.
     """
     n_ticks = round(seconds * RATE_HZ)
-    if n_ticks < KEY_TICKS:
-        raise problem("--seconds", f"at least {KEY_TICKS / RATE_HZ:g}", f"{seconds:g}", "ask for a longer clip")
+    if n_ticks < 1:
+        raise problem("--seconds", f"at least {1 / RATE_HZ:g}, one tick", f"{seconds:g}", "ask for a longer clip")
     cameras = array(width, height, seed)
     path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(), n_ticks, seed)
     print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")

@@ -29,7 +29,7 @@ from spike4dgs.generators.recorder.board_views import (
 from spike4dgs.generators.recorder.bundle import Adjusted, Freedom, Rig, Sightings, adjust, rms_px, trimmed
 from spike4dgs.generators.recorder.profile import calibration_toml
 
-WORST_PX, MOST_LEFT_OUT = 1.0, 0.1  # with a worse reprojection error, or more corners that do not fit, it is no array
+WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # with a worse reprojection error, or more corners that do not fit, it is no array
 
 
 @dataclass(frozen=True, eq=False)

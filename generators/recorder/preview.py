@@ -1,0 +1,117 @@
+"""What a capture looks like: its states and spike rates while it runs, and a sheet of every camera's picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.gaps import present
+from spike4dgs.benchmark.images import encode_srgb
+from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.generators.recorder.profile import RigProfile
+from spike4dgs.generators.recorder.rates import Rate
+
+WINDOW_TICKS = 64  # of a picture on the sheet
+_BAR = 20  # characters for one spike per tick
+
+
+class Watch:
+    """Shows a capture: a line for each state, or with `live` a table that follows the cameras' rates.
+
+    >>> with Watch(profile, live=True) as watch:  # doctest: +SKIP
+    ...     clip = capture(profile, links, 0.5, on_state=watch.state, on_rate=watch.rates)
+    """
+
+    def __init__(self, profile: RigProfile, live: bool, console: Console | None = None) -> None:
+        self._profile, self._console = profile, console or Console(width=100)
+        self._state, self._rates = "", dict[str, Rate]()
+        # Drawn when there is something new: a thread of its own would take time from the cameras' threads.
+        self._live = Live(self._table(), console=self._console, auto_refresh=False) if live else None
+
+    def state(self, state: str) -> None:
+        """The capture has reached a state."""
+        self._state = state
+        if self._live is None:
+            self._console.print(state.lower())
+        else:
+            self._live.update(self._table(), refresh=True)
+
+    def rates(self, rates: Mapping[str, Rate]) -> None:
+        """How the cameras do now."""
+        self._rates.update(rates)
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+
+    def _table(self) -> Table:
+        table = Table("camera", "MB/s", "ticks", "spikes/tick", "", "waiting", "lost ticks", title=self._state.lower())
+        for camera in self._profile.cameras:
+            r = self._rates.get(camera.id)
+            if r is None:
+                table.add_row(camera.id)
+                continue
+            known = not math.isnan(r.spikes_per_tick)
+            rate, bar = (f"{r.spikes_per_tick:.4f}", "#" * round(_BAR * r.spikes_per_tick)) if known else ("-", "")
+            speed, lost = f"{r.bytes_per_s / 1e6:.1f}", f"[red]{r.lost_ticks}" if r.lost_ticks else "0"
+            table.add_row(camera.id, speed, f"{r.ticks}", rate, f"{bar:<{_BAR}}", f"{r.backlog}", lost)
+        return table
+
+    def __enter__(self) -> Watch:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+
+def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
+    """Write one PNG with a picture of every camera: the spikes of `WINDOW_TICKS` ticks near the middle (TFP).
+
+    One scale for all: white is the 99th percentile of all pictures. Where no such window is without a gap, the place
+    stays empty.
+    """
+    from matplotlib.figure import Figure
+
+    pictures = {camera: middle_picture(stream) for camera, stream in streams.items()}
+    seen = [image for _, image in (p for p in pictures.values() if p is not None)]
+    white = max(float(np.percentile(np.concatenate([i.ravel() for i in seen]), 99)), 1e-6) if seen else 1.0
+    first = next(iter(streams.values()))
+    side = math.ceil(math.sqrt(len(streams)))
+    rows = math.ceil(len(streams) / side)
+    figure = Figure(figsize=(12, 12 / side * rows * (first.height / first.width + 0.08) + 0.5), layout="constrained")
+    for axes, (camera, stream) in zip(figure.subplots(rows, side, squeeze=False).flat, streams.items(), strict=False):
+        picture = pictures[camera]
+        lost = sum(gap.ticks for gap in stream.gaps)
+        title = f"{camera}, tick {picture[0]}" if picture else f"{camera}: no window without a gap"
+        axes.set_title(title + (f", {lost} ticks lost" if lost else ""), fontsize=9)
+        if picture is not None:
+            axes.imshow(encode_srgb(picture[1] / np.float32(white)), cmap="gray", vmin=0, vmax=255)
+    for axes in figure.axes:
+        axes.axis("off")
+    ms = first.n_ticks * 1e3 / first.rate_hz
+    figure.suptitle(f"{first.n_ticks} ticks at {first.rate_hz:g} Hz ({ms:g} ms); white is {white:.3f} spikes per tick")
+    with atomic_path(path) as part:
+        figure.savefig(part, dpi=100)
+
+
+def middle_picture(stream: SpikeStream) -> tuple[int, NDArray[np.float32]] | None:
+    """First tick and mean [H, W] of the window without a gap that is nearest the middle; None where there is none."""
+    length = min(WINDOW_TICKS, stream.n_ticks)
+    kept = np.concatenate([[0], np.cumsum(present(stream.gaps, stream.n_ticks))])
+    starts = np.nonzero(kept[length:] - kept[:-length] == length)[0]
+    if not len(starts):
+        return None
+    start = int(starts[np.argmin(np.abs(starts - (stream.n_ticks - length) // 2))])
+    return start, stream.counts(start, start + length).astype(np.float32) / np.float32(length)

@@ -1,0 +1,193 @@
+"""`record`: a synchronised clip of the array, from USB to a scene folder."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.manifest import NAME as MANIFEST
+from spike4dgs.benchmark.manifest import write_manifest
+from spike4dgs.generators.recorder.board_views import open_recording
+from spike4dgs.generators.recorder.capture import capture
+from spike4dgs.generators.recorder.checks import check_machine, find_cameras
+from spike4dgs.generators.recorder.clip import Clip
+from spike4dgs.generators.recorder.clip_files import ClipRecord, StreamFiles
+from spike4dgs.generators.recorder.preview import Watch, write_sheet
+from spike4dgs.generators.recorder.profile import RigProfile
+from spike4dgs.generators.recorder.sources import (
+    CLIP,
+    Source,
+    Truth,
+    calibration_truth,
+    emulated_source,
+    real_source,
+    truth,
+)
+from spike4dgs.generators.recorder.sync import SyncReport, fit_arrival
+from spike4dgs.generators.recorder.transport import Link, open_link
+
+LOST_DATA = 3  # exit code
+_PATIENCE = 3  # presses of Ctrl-C after which even the writing of what was captured is given up
+
+
+def record(
+    rig: Positional[Path | None] = None,
+    *,
+    out: Path,
+    seconds: float | None = None,
+    mode: Literal["clip", "flat", "dark"] = "clip",
+    emulate: Path | None = None,
+    continuous: bool = False,
+    preview: bool = False,
+    flat: Path | None = None,
+    dark: Path | None = None,
+    flat_radiance: float | None = None,
+) -> int:
+    """Record all cameras of an array at once: OUT is a scene folder, or streams without poses before the calibration.
+
+    Ctrl-C ends the recording and keeps what was captured. The exit code is 3 where a camera lost data: the gaps are in
+    scene.json, and readers refuse the recording unless --allow-gaps.
+
+    Args:
+        rig: Rig profile (TOML, see docs/rig_profile.md); may be left out with --emulate.
+        out: Folder of the recording; its name is the scene's.
+        seconds: Length; 0.5 or, with --emulate, the scene's. With --continuous, the greatest length.
+        mode: flat and dark record uniform light and darkness, for a later clip's --flat and --dark.
+        emulate: Record an emulated array that sends this scene's streams, to try everything without hardware.
+        continuous: Write to disk while recording, instead of afterwards from memory.
+        preview: Show spike rates while recording, and write OUT/sheet.png.
+        flat: Recording of uniform light that goes into the scene, for `calibrate` and for methods.
+        dark: Recording in the dark that goes with it.
+        flat_radiance: Radiance of that light, 1 is white.
+    """
+    source = _source(rig, emulate, mode)
+    profile = source.profile if mode == CLIP else _without_poses(source.profile)
+    light = _light(profile, flat, dark, flat_radiance)
+    length = source.seconds if seconds is None else seconds
+    n_ticks = round(length * profile.fps)
+    if n_ticks < 1:
+        raise problem("--seconds", f"at least {1 / profile.fps:g}, one tick", f"{length:g}", "record for longer")
+    if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulate is not None):
+        raise UserError("; ".join(map(str, problems)))
+    with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
+        links = _open(profile, source.backend)
+        with Watch(profile, live=preview) as watch:
+            sink = files.write if continuous else None
+            clip = capture(profile, links, length, on_state=watch.state, on_rate=watch.rates, stop=stop, sink=sink)
+        for camera in clip.cameras:  # without frames in continuous mode: the sink has had them
+            files.write_ticks(camera.camera, camera.ticks, camera.frames)
+        sync = fit_arrival(clip, profile.fps)
+        files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
+        if preview:
+            _write_preview(out)
+    _print(clip, sync)
+    print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
+    return 0 if clip.complete else LOST_DATA
+
+
+def _source(rig: Path | None, emulate: Path | None, mode: str) -> Source:
+    if emulate is not None:
+        return emulated_source(emulate, rig, mode)
+    if rig is None:
+        fix = "name the array's profile, or try `spike4dgs record --emulate SCENE`"
+        raise problem("record", "a rig profile", "none", fix)
+    return real_source(rig)
+
+
+def _without_poses(profile: RigProfile) -> RigProfile:
+    """The same cameras; what they record of light and darkness is no scene."""
+    return replace(profile, cameras=tuple(replace(c, calibration=None) for c in profile.cameras))
+
+
+def _light(profile: RigProfile, flat: Path | None, dark: Path | None, flat_radiance: float | None) -> Truth:
+    given = {"--flat": flat, "--dark": dark, "--flat-radiance": flat_radiance}
+    if flat is not None and dark is not None and flat_radiance is not None:
+        return calibration_truth(flat, dark, flat_radiance, profile)
+    if any(value is not None for value in given.values()):
+        lacks = ", ".join(name for name, value in given.items() if value is None)
+        raise problem("record", f"all of {', '.join(given)}, or none", f"no {lacks}", "add what is missing")
+    return Truth()
+
+
+def _open(profile: RigProfile, backend: Any | None) -> dict[str, Link]:
+    """All cameras or none."""
+    devices = find_cameras(profile, backend)
+    links: dict[str, Link] = {}
+    try:
+        for camera in profile.cameras:
+            links[camera.id] = open_link(devices[camera.id], camera, profile)
+    except BaseException:
+        for link in links.values():
+            link.close()
+        raise
+    return links
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Ctrl-C sets the event, on which a capture ends; writing what it brought goes on, unless the user insists."""
+    stop, presses = threading.Event(), 0
+
+    def press(number: int, frame: FrameType | None) -> None:
+        nonlocal presses
+        presses += 1
+        stop.set()
+        if presses >= _PATIENCE:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _described(clip: Clip, sync: SyncReport, known: Truth) -> ClipRecord:
+    return ClipRecord(
+        n_ticks=clip.n_ticks,
+        gaps=tuple(gap for camera in clip.cameras for gap in camera.gaps),
+        sync=sync.as_dict(),
+        t0_ns=sync.t0_ns or 0,
+        clock="CLOCK_MONOTONIC of the recording computer" if sync.t0_ns is not None else "unknown",
+        cameras={c.camera: asdict(c.stats) for c in clip.cameras},
+        targets=known.targets,
+        extras=known.extras,
+        files=known.files,
+    )
+
+
+def _write_preview(out: Path) -> None:
+    """The sheet of a recording; a scene's manifest then lists it too."""
+    write_sheet(out / "sheet.png", open_recording(out, allow_gaps=True).streams)
+    if (out / MANIFEST).is_file():
+        write_manifest(out)
+
+
+def _print(clip: Clip, sync: SyncReport) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console, fits = Console(width=120), {fit.camera: fit for fit in sync.cameras}
+    title = f"synchronised by {sync.method}" + (", ended early" if clip.interrupted else "")
+    columns = "camera", "MB", "lost ticks", "drift, ppm", "offset, us", "fullest ring", "no read, ms", "end"
+    table = Table(*columns, title=title)
+    for c in clip.cameras:
+        s, fit = c.stats, fits[c.camera]
+        drift = f"{fit.drift_ppm:+.0f} +- {fit.drift_error_ppm:.0f}" + (" suspect" if fit.suspect else "")
+        ring, idle = f"{s.backlog / s.slots:.0%}", f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
+        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", drift, f"{fit.offset_us:+.0f}", ring, idle, s.end]
+        table.add_row(*row, style="red" if c.gaps else None)
+    console.print(table)
+    if sync.worst_pair:
+        print(f"by their times of arrival {' and '.join(sync.worst_pair)} differ most, {sync.worst_pair_us:.0f} us")
+    for gap in (gap for c in clip.cameras for gap in c.gaps):
+        print(f"gap: {gap.camera} from tick {gap.first_tick}, {gap.ticks} ticks ({gap.reason})")

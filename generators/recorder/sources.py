@@ -1,0 +1,132 @@
+"""What `record` records: a real array behind USB, or an emulated one that shows a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.stream_folder import open_stream_folder
+from spike4dgs.generators.recorder.emulated_array import EmulatedArray, scene_profile, scene_streams
+from spike4dgs.generators.recorder.emulator import EmulatedBackend
+from spike4dgs.generators.recorder.layouts import PLAIN, UInt8, make_layout, orient
+from spike4dgs.generators.recorder.profile import PACKET_BYTES, RigProfile, load_profile
+
+CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")
+SECONDS = 0.5  # that are recorded where nothing else is asked for
+_READ_S = 1e-3
+
+_BY_TICK = ("images", "masks", "geometry")  # FOLDER/CAMERA/TICK.*
+_WHOLE = ("calibration", "truth")
+_EXTRAS = ("ground_truth", "calibration", "instances")  # of scene.json, which describe these folders
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """An array to record. `backend` is pyusb's, None for the system's own; `seconds` is its usual length of a clip.
+
+    `scene` is what an emulated array shows, where its cameras are the scene's own: then the truth is known.
+    """
+
+    profile: RigProfile
+    backend: Any | None = None
+    seconds: float = SECONDS
+    scene: Scene | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a recording gets from the scene that it shows, as fields of `ClipRecord`."""
+
+    targets: tuple[Target, ...] = ()
+    extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    def __or__(self, other: Truth) -> Truth:
+        """Both; where both have something, that of `other`."""
+        return Truth(self.targets + other.targets, {**self.extras, **other.extras}, {**self.files, **other.files})
+
+
+def real_source(rig: Path) -> Source:
+    """The array of a profile."""
+    return Source(load_profile(rig))
+
+
+def emulated_source(path: Path, rig: Path | None, mode: str) -> Source:
+    """An emulated array that sends a scene's streams at their rate; for `FLAT` and `DARK` its calibration recordings.
+
+    Its cameras are those of the profile `rig`, or made from the scene. Raises UserError where the scene cannot be read,
+    has no such recordings, or does not go with the profile.
+    """
+    scene = open_scene(path)
+    streams = scene_streams(scene) if mode == CLIP else _calibration_streams(scene, mode)
+    profile = _scene_profile(scene) if rig is None else load_profile(rig)
+    ticks = min(len(packed) for packed in streams.values())
+    array = EmulatedArray(profile, streams)
+    return Source(profile, EmulatedBackend(array), ticks / profile.fps, scene if rig is None and mode == CLIP else None)
+
+
+def _scene_profile(scene: Scene) -> RigProfile:
+    """Reads of about a millisecond, as 256 KiB are of 400x250, so that small scenes are not one read as a whole."""
+    size = make_layout(PLAIN, int(scene.meta["width"]), int(scene.meta["height"])).frame_bytes
+    packets = math.ceil(size * scene.rate_hz * _READ_S / PACKET_BYTES)
+    return scene_profile(scene, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
+
+
+def truth(scene: Scene | None, n_ticks: int) -> Truth:
+    """Ground truth and calibration recordings of the scene for its first `n_ticks` ticks; nothing without a scene."""
+    if scene is None:
+        return Truth()
+    # A split may hold out cameras, and so have targets, that the default one has not.
+    targets = [t for split in scene.meta["splits"] for t in open_scene(scene.root, split=split).targets]
+    names = [n for n in scene.manifest.files if _belongs(n, n_ticks)]
+    return Truth(
+        targets=tuple(t for t in dict.fromkeys(targets) if t.tick < n_ticks),
+        extras={name: scene.meta[name] for name in _EXTRAS if name in scene.meta},
+        files={name: scene.manifest.path(name) for name in names},
+    )
+
+
+def _belongs(name: str, n_ticks: int) -> bool:
+    folder = name.partition("/")[0]
+    return folder in _WHOLE or (folder in _BY_TICK and int(Path(name).stem) < n_ticks)
+
+
+def _calibration_streams(scene: Scene, mode: str) -> dict[str, UInt8]:
+    streams = {}
+    for camera in scene.cameras:
+        if (recordings := scene.recordings(camera)) is None:
+            fix = "emulate a scene that has calibration/"
+            raise problem(scene.root, f"a {mode} recording of each camera", f"none of {camera}", fix)
+        s = recordings.flat if mode == FLAT else recordings.dark
+        streams[camera] = orient(s.packed, s.width, s.height, not s.rows_bottom_up, False)
+    return streams
+
+
+def calibration_truth(flat: Path, dark: Path, flat_radiance: float, profile: RigProfile) -> Truth:
+    """Recordings of uniform light and of darkness, as a scene of this array holds them.
+
+    Raises UserError where they are not whole recordings of all its cameras, or the profile has no poses: what is then
+    recorded is no scene.
+    """
+    if not profile.calibrated:
+        fix = "run `spike4dgs calibrate-rig` first, or leave out --flat and --dark"
+        raise problem(f"rig {profile.name}", "a calibration, for a scene with --flat and --dark", "none", fix)
+    if not flat_radiance > 0:
+        raise problem("--flat-radiance", "a positive radiance", f"{flat_radiance:g}", "correct it")
+    names = {c.id for c in profile.cameras}
+    facts: dict[str, Any] = {"flat_radiance": flat_radiance}
+    files: dict[str, Path] = {}
+    for mode, folder in ((FLAT, flat), (DARK, dark)):
+        streams = open_stream_folder(folder)
+        kinds = {(s.width, s.height, s.n_ticks, s.rows_bottom_up) for s in streams.values()}
+        if not names <= streams.keys() or {k[:2] for k in kinds} != {(profile.width, profile.height)} or len(kinds) > 1:
+            found = f"{', '.join(streams)} of {', '.join(f'{k[0]}x{k[1]}' for k in kinds)}"
+            raise problem(folder, f"recordings of one length by the cameras of {profile.name}", found, "record them")
+        facts[f"{mode}_ticks"] = kinds.pop()[2]
+        files |= {f"calibration/{mode}/{name}.dat": Path(streams[name].source) for name in sorted(names)}
+    return Truth(extras={"calibration": facts}, files=files)
