@@ -65,8 +65,8 @@ def points(n: int = 120) -> Gaussians:
     return from_points(places, rng.uniform(0.2, 1, n).astype(np.float32), opacity=0.8)
 
 
-def gaussian_model(motion: str) -> FittedModel:
-    """A model of the trainer with any motion."""
+def gaussian_model(motion: str, still: int = 0) -> FittedModel:
+    """A model of the trainer with any motion; some of its Gaussians stand still beside it."""
     spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), SETTINGS)
     made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.2)
     footage = Footage(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
@@ -74,7 +74,7 @@ def gaussian_model(motion: str) -> FittedModel:
     rng = seeded(4, 0)
     extra = {k: v + 0.1 * torch.randn(v.shape, generator=rng) for k, v in gaussians.extra.items()}
     moved = Gaussians.from_tensors({**gaussians.tensors(), **extra})
-    return FittedModel(moved, moved.rows(torch.arange(0)), made, DURATION_US, "cpu", spec)
+    return FittedModel(moved, points().rows(torch.arange(still)), made, DURATION_US, "cpu", spec)
 
 
 def tracked_model() -> TrackedModel:
@@ -96,6 +96,7 @@ def field_model() -> RadianceModel:
 
 MODELS: dict[str, Callable[[], Any]] = {
     **{name: (lambda name=name: gaussian_model(name)) for name in MOTIONS},
+    "hexplane, some still": lambda: gaussian_model("hexplane", still=40),
     "tracking": tracked_model,
     "radiance-field": field_model,
 }

@@ -123,5 +123,5 @@ def resized(camera: Camera, scale: float) -> Camera:
     """
     width, height = (max(2, 2 * round(scale * n / 2)) for n in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
-    sizes = {"fx": x * camera.fx, "fy": y * camera.fy, "cx": x * camera.cx, "cy": y * camera.cy}
-    return replace(camera, width=width, height=height, **sizes)
+    fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
