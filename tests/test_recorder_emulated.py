@@ -291,6 +291,23 @@ def test_cameras_that_see_the_scene_upside_down_record_it_upright(two: Scene, tm
     check_identical(tmp_path / "clip", two)
 
 
+def test_cameras_that_send_from_the_moment_they_have_power_agree_on_a_tick(two: Scene) -> None:
+    profile = profile_of(two, layout="tagged-rows")
+    profile = replace(profile, cameras=tuple(replace(c, start=(), stop=()) for c in profile.cameras))
+    backend = emulate(two, profile)
+    devices = find_cameras(profile, backend)
+    clip = capture(profile, {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}, N / 20000)
+    assert clip.complete and clip.sync == "frame tags"
+    frames, origins = make_layout("tagged-rows", WIDTH, HEIGHT), set()
+    for camera in clip.cameras:
+        payload = np.empty((N, FRAME), np.uint8)
+        counts = frames.unpack(camera.frames, payload)
+        assert counts is not None
+        np.testing.assert_array_equal(payload, two.stream(camera.camera).packed[counts % N])
+        origins.add(int(counts[0]))
+    assert len(origins) == 1
+
+
 def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object) -> CameraClip:
     """Record with a fault of cam_01; checks that cam_00 has everything, and returns cam_01's clip."""
     profile = profile_of(scene, **changes)
