@@ -155,7 +155,7 @@ def rig_of(scene, folder: Path) -> Path:
         "bytes = 4096",
         "[defaults]",
     ]
-    lines += ["vendor_id = 0x0403", "product_id = 0x601f", "endpoint_in = 0x82", "endpoint_out = 0x01"]
+    lines += ["[defaults]", "vendor_id = 0x0403", "product_id = 0x601f", "endpoint_in = 0x82", "endpoint_out = 0x01"]
     lines += ['start = ["01"]', 'stop = ["02"]', "mirrored = true"]
     for i, name in enumerate(cameras):
         lines += ["[[camera]]", f'id = "{name}"', f'serial = "S{i}"', f'role = "{"secondary" if i else "primary"}"']

@@ -53,16 +53,16 @@ def test_the_picture_is_the_mean_of_the_window_nearest_the_middle_without_a_gap(
     start, image = middle_picture(whole)
     assert start == (400 - WINDOW_TICKS) // 2
     np.testing.assert_allclose(image, whole.window(start, start + WINDOW_TICKS).mean(axis=0), atol=1e-6)
-    gap = Gap("cam", 190, 30, "overflow")  # [190, 220): before it up to 126 + 64, after it from 220 on
-    assert middle_picture(stream(gaps=[gap]))[0] == 126
+    gap = Gap("cam", 190, 30, "overflow")  # [190, 220): the window before it is nearer the middle than the one after
+    assert middle_picture(stream(gaps=[gap]))[0] == 190 - WINDOW_TICKS
     assert middle_picture(stream(gaps=[Gap("cam", 100, 110, "stall")]))[0] == 210
-    assert middle_picture(stream(gaps=[Gap("cam", i, 1, "torn frame") for i in range(10, 400, 60)])) is None
+    assert middle_picture(stream(gaps=[Gap("cam", i, 1, "torn frame") for i in range(10, 400, 30)])) is None
     assert middle_picture(stream(n_ticks=20))[0] == 0
 
 
 def test_the_sheet_has_a_picture_of_each_camera_but_of_those_without_data(tmp_path):
     lost = Gap("cam_02", 0, 400, "unplugged")
-    streams = {"cam_00": stream(), "cam_01": stream(seed=1), "cam_02": stream(gaps=[lost])}
+    streams = {"cam_02": stream(gaps=[lost]), "cam_00": stream(), "cam_01": stream(seed=1)}
     write_sheet(tmp_path / "sheet.png", streams)
     with Image.open(tmp_path / "sheet.png") as image:
         gray = np.asarray(image.convert("L"), np.float64) / 255

@@ -20,7 +20,7 @@ from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.generators.recorder.profile import RigProfile
 from spike4dgs.generators.recorder.rates import Rate
 
-WINDOW_TICKS = 64  # of a picture on the sheet
+WINDOW_TICKS = 32  # of a picture on the sheet
 _BAR = 20  # characters for one spike per tick
 
 
@@ -32,24 +32,28 @@ class Watch:
     """
 
     def __init__(self, profile: RigProfile, live: bool, console: Console | None = None) -> None:
-        self._profile, self._console = profile, console or Console(width=100)
+        self._profile, self._live, self._console = profile, live, console or Console(width=100)
         self._state, self._rates = "", dict[str, Rate]()
-        # Drawn when there is something new: a thread of its own would take time from the cameras' threads.
-        self._live = Live(self._table(), console=self._console, auto_refresh=False) if live else None
+        self._shown: Live | None = None
 
     def state(self, state: str) -> None:
         """The capture has reached a state."""
         self._state = state
-        if self._live is None:
+        if self._shown is None:
             self._console.print(state.lower())
         else:
-            self._live.update(self._table(), refresh=True)
+            self._shown.update(self._table(), refresh=True)
 
     def rates(self, rates: Mapping[str, Rate]) -> None:
         """How the cameras do now."""
+        if not self._live:
+            return
         self._rates.update(rates)
-        if self._live is not None:
-            self._live.update(self._table(), refresh=True)
+        if self._shown is None:
+            # Drawn when there is something new: a thread of its own would take time from the cameras' threads.
+            self._shown = Live(self._table(), console=self._console, auto_refresh=False)
+            self._shown.start()
+        self._shown.update(self._table(), refresh=True)
 
     def _table(self) -> Table:
         table = Table("camera", "MB/s", "ticks", "spikes/tick", "", "waiting", "lost ticks", title=self._state.lower())
@@ -65,15 +69,15 @@ class Watch:
         return table
 
     def __enter__(self) -> Watch:
-        if self._live is not None:
-            self._live.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._live is not None:
-            self._live.stop()
+        if self._shown is not None:
+            self._shown.stop()
+            if not self._console.is_terminal:  # there the last table is left without an end of line
+                self._console.line()
 
 
 def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
@@ -84,6 +88,7 @@ def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
     """
     from matplotlib.figure import Figure
 
+    streams = dict(sorted(streams.items()))
     pictures = {camera: middle_picture(stream) for camera, stream in streams.items()}
     seen = [image for _, image in (p for p in pictures.values() if p is not None)]
     white = max(float(np.percentile(np.concatenate([i.ravel() for i in seen]), 99)), 1e-6) if seen else 1.0

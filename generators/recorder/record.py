@@ -89,7 +89,7 @@ def record(
         files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
         if preview:
             _write_preview(out)
-    _print(clip, sync)
+    _print(clip, sync, continuous)
     print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
     return 0 if clip.complete else LOST_DATA
 
@@ -172,7 +172,7 @@ def _write_preview(out: Path) -> None:
         write_manifest(out)
 
 
-def _print(clip: Clip, sync: SyncReport) -> None:
+def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -183,7 +183,8 @@ def _print(clip: Clip, sync: SyncReport) -> None:
     for c in clip.cameras:
         s, fit = c.stats, fits[c.camera]
         drift = f"{fit.drift_ppm:+.0f} +- {fit.drift_error_ppm:.0f}" + (" suspect" if fit.suspect else "")
-        ring, idle = f"{s.backlog / s.slots:.0%}", f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
+        ring = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
+        idle = f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
         row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", drift, f"{fit.offset_us:+.0f}", ring, idle, s.end]
         table.add_row(*row, style="red" if c.gaps else None)
     console.print(table)
