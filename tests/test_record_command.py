@@ -153,7 +153,6 @@ def rig_of(scene, folder: Path) -> Path:
         'calibration = "calibration.toml"',
         "[transfer]",
         "bytes = 4096",
-        "[defaults]",
     ]
     lines += ["[defaults]", "vendor_id = 0x0403", "product_id = 0x601f", "endpoint_in = 0x82", "endpoint_out = 0x01"]
     lines += ['start = ["01"]', 'stop = ["02"]', "mirrored = true"]
