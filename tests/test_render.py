@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.images import gray as gray_of
 from spike4dgs.generators.motion import KeyPlan
-from spike4dgs.generators.render import MultiViewRenderer, _tracer
+from spike4dgs.generators.render import MultiViewRenderer, make_tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, Deforming, Part, WorldScene
 from spike4dgs.generators.worlds.materials import Material
@@ -106,7 +106,7 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
     pixels = np.arange(WIDTH * HEIGHT)
     first, again, other = (
-        _tracer(together._scene, together.cameras, seed).trace(pixels, SPP, 0, False) for seed in (0, 0, 1)
+        make_tracer(together._scene, together.cameras, seed).trace(pixels, SPP, 0, False) for seed in (0, 0, 1)
     )
     assert first.tobytes() == again.tobytes() != other.tobytes()
     assert abs(first.mean() - other.mean()) < 0.01

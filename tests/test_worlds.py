@@ -16,7 +16,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.motion import KeyPlan, carried, key_plan, max_image_speed, spacings
-from spike4dgs.generators.render import _tracer
+from spike4dgs.generators.render import make_tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.scalar_tiles import load_sensor
 from spike4dgs.generators.worlds import WORLDS, Part, WorldScene
@@ -99,7 +99,7 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
     rig = cameras(world, WIDTH, HEIGHT)
     scene = MitsubaScene(world)
     scene.place(0.008)
-    tracer = _tracer(scene, rig, 0)
+    tracer = make_tracer(scene, rig, 0)
     rng = np.random.default_rng(0)
     for camera in rig:
         sent = rng.random((100, 2))
@@ -131,7 +131,7 @@ def test_moving_triangles_are_where_the_world_says(name):
         owners.append(np.full(60, number))
     ways, owner = np.concatenate(middles) - rig[0].center, np.concatenate(owners)
     expected = np.linalg.norm(ways, axis=1)
-    tracer = _tracer(scene, rig, 0)
+    tracer = make_tracer(scene, rig, 0)
     hits = tracer.cast_movers(tracer.prepare(np.repeat(rig[0].center[None], len(ways), 0), ways / expected[:, None]))
     # the triangle itself, or something before it; float32 rays may miss slivers and edges
     assert (hits.distance < expected * 1.0005).mean() > 0.97
