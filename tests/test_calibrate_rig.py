@@ -302,10 +302,11 @@ def test_the_command_finds_the_array_from_spikes(clip, tmp_path, capsys):
 
 def test_the_command_says_what_to_do(clip, tmp_path, capsys):
     assert main(["calibrate-rig", "--out", str(tmp_path)]) == 2
-    assert (
-        main(["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "2", "--columns", "5", "--rows", "4"]) == 2
-    )
-    assert "inner corners" in capsys.readouterr().err
+    assert "record the board" in capsys.readouterr().err
+    assert main(["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "2"]) == 2
+    assert "raise --views" in capsys.readouterr().err
+    assert main(["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "1", "--columns", "14"]) == 2
+    assert "check --columns and --rows (inner corners)" in capsys.readouterr().err
 
 
 def test_a_board_clip_is_a_scene_and_nothing_is_overwritten(tmp_path, capsys):
