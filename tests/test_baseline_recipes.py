@@ -170,8 +170,12 @@ def test_recipes_that_are_compared_differ_in_one_part() -> None:
         return {k for k in recipes[a] if recipes[a][k] != recipes[b][k]} - {"name"}
 
     for motion in ("d3dgs", "stg", "4dgs"):
-        assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"} == differ(f"tfi+{motion}", f"spk2img+{motion}")
-    for images in ("tfi", "tfp", "spk2img"):
+        assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"}
+        # Spk2ImgNet's pictures take time, so a quick fit has fewer of them, and 4DGS fewer steps.
+        assert differ(f"tfi+{motion}", f"spk2img+{motion}") == {"images"} | (
+            {"settings"} if motion != "d3dgs" else set()
+        )
+    for images in ("tfi", "tfp"):
         assert differ(f"{images}+d3dgs", f"{images}+4dgs") == {"motion"} == differ(f"{images}+stg", f"{images}+4dgs")
     for name in ("dy-spikegs", *(r.name for r in SUPERVISED)):
         assert differ("tfp+4dgs", name) == {"supervision"}
