@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Adam
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.optimizer import export_state, import_state
 from spike4dgs.method.tensor_file import part, read_tensors, write_tensors
 
 _SCHEMA = "spike4dgs-checkpoint/1"
@@ -45,3 +47,22 @@ def load_checkpoint(path: Path, fit: str) -> Checkpoint | None:
     if meta.get("fit") != fit:
         raise problem(path, "a checkpoint of this scene, recipe, budget and seed", "another fit's", fix)
     return Checkpoint(int(step), tensors)
+
+
+def save_training(path: Path, step: int, network: nn.Module, adam: Adam, fit: str) -> None:
+    """Write everything that the training of a network needs to go on from `step`."""
+    parts = {"network": network.state_dict(), "adam": export_state(adam)}
+    save_checkpoint(path, Checkpoint(step, {f"{n}.{k}": v for n, p in parts.items() for k, v in p.items()}), fit)
+
+
+def resume_training(path: Path, network: nn.Module, adam: Adam, fit: str) -> int:
+    """Put back what `save_training` wrote; returns the step to go on from, 0 where there is no checkpoint.
+
+    Raises UserError for a damaged or foreign one.
+    """
+    found = load_checkpoint(path, fit)
+    if not found:
+        return 0
+    network.load_state_dict(found.part("network"))
+    import_state(adam, found.part("adam"))
+    return found.step

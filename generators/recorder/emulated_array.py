@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
@@ -82,6 +83,25 @@ class EmulatedArray:
             self._armed.clear()
 
 
+def camera_profile(name: str, serial: str, role: str) -> CameraProfile:
+    """A camera as the emulator plays it: a bridge's usual numbers, and commands that only say what they are."""
+    return CameraProfile(
+        id=name,
+        serial=serial,
+        vendor_id=0x0403,
+        product_id=0x601F,
+        interface=1,
+        control_interface=0,
+        endpoint_in=0x82,
+        endpoint_out=0x01,
+        start=(b"start",),
+        stop=(b"stop",),
+        role=role,
+        rows=BOTTOM_UP,
+        mirrored=False,
+    )
+
+
 def scene_profile(scene: Scene, **changes: Any) -> RigProfile:
     """The profile of an emulated array that shows a scene; `changes` are fields of `RigProfile`.
 
@@ -102,22 +122,7 @@ def scene_profile(scene: Scene, **changes: Any) -> RigProfile:
         "held_out": scene.test,
     }
     cameras = tuple(
-        CameraProfile(
-            id=name,
-            serial=f"EMULATED{i:04d}",
-            vendor_id=0x0403,
-            product_id=0x601F,
-            interface=1,
-            control_interface=0,
-            endpoint_in=0x82,
-            endpoint_out=0x01,
-            start=(b"start",),
-            stop=(b"stop",),
-            role=SECONDARY if i else PRIMARY,
-            rows=BOTTOM_UP,
-            mirrored=False,
-            calibration=scene.cameras[name],
-        )
+        replace(camera_profile(name, f"EMULATED{i:04d}", SECONDARY if i else PRIMARY), calibration=scene.cameras[name])
         for i, name in enumerate(names)
     )
     return RigProfile(cameras=cameras, **{**facts, **changes})

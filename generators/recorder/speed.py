@@ -19,11 +19,11 @@ from spike4dgs.generators.recorder.capture import DRAIN, TRIGGERED, capture
 from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip import Clip
 from spike4dgs.generators.recorder.clip_files import StreamFiles
-from spike4dgs.generators.recorder.emulated_array import EmulatedArray
+from spike4dgs.generators.recorder.emulated_array import EmulatedArray, camera_profile
 from spike4dgs.generators.recorder.emulated_camera import EmulatedCamera
 from spike4dgs.generators.recorder.emulator import EmulatedBackend
 from spike4dgs.generators.recorder.layouts import PLAIN, UInt8
-from spike4dgs.generators.recorder.profile import BOTTOM_UP, PRIMARY, SECONDARY, CameraProfile, RigProfile
+from spike4dgs.generators.recorder.profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.reads import Completion, Transfers
 from spike4dgs.generators.recorder.transport import UsbLink, open_link
 
@@ -184,22 +184,7 @@ def _flush(folder: Path) -> None:
 def array_profile(load: Load) -> RigProfile:
     """A rig without calibration."""
     cameras = tuple(
-        CameraProfile(
-            id=f"cam_{i:02d}",
-            serial=f"SPEED{i:04d}",
-            vendor_id=0x0403,
-            product_id=0x601F,
-            interface=1,
-            control_interface=0,
-            endpoint_in=0x82,
-            endpoint_out=0x01,
-            start=(b"start",),
-            stop=(b"stop",),
-            role=SECONDARY if i else PRIMARY,
-            rows=BOTTOM_UP,
-            mirrored=False,
-        )
-        for i in range(load.cameras)
+        camera_profile(f"cam_{i:02d}", f"SPEED{i:04d}", SECONDARY if i else PRIMARY) for i in range(load.cameras)
     )
     return RigProfile(
         name="speed",

@@ -23,7 +23,7 @@ from spike4dgs.benchmark.bursts import FIRST_TRAINING_VARIANT, BurstFile, open_f
 from spike4dgs.benchmark.environment import choose_device, device_type
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
-from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.msdi.checkpoints import read_state, transfer
 from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
 from spike4dgs.method.msdi.curves import Curve, plot_calibration, plot_curves
@@ -33,7 +33,7 @@ from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.report import model_card
 from spike4dgs.method.msdi.weights import Card, save_weights
-from spike4dgs.method.optimizer import export_state, import_state, make_adam
+from spike4dgs.method.optimizer import make_adam
 
 PUBLISHED: dict[str, float] = {"rate": 1e-4}  # all that the publication says of its training, besides the losses
 ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only
@@ -118,17 +118,11 @@ class Training:
 
     def save(self, path: Path, key: str) -> None:
         """Write everything needed to go on."""
-        network = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        adam = {f"adam.{k}": v for k, v in export_state(self.adam).items()}
-        save_checkpoint(path, Checkpoint(self.step, network | adam), key)
+        save_training(path, self.step, self.network, self.adam, key)
 
     def resume(self, path: Path, key: str) -> None:
         """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
-        found = load_checkpoint(path, key)
-        if found:
-            self.network.load_state_dict(found.part("network"))
-            import_state(self.adam, found.part("adam"))
-            self.step = found.step
+        self.step = resume_training(path, self.network, self.adam, key) or self.step
 
 
 def _ahead(make: Callable[[int], Batch], steps: int) -> Callable[[int], Batch]:

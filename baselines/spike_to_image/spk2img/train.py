@@ -29,8 +29,8 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.image_pair import ImagePair
 from spike4dgs.benchmark.metrics import METRICS
 from spike4dgs.benchmark.scene import Scene
-from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from spike4dgs.method.optimizer import export_state, import_state, make_adam
+from spike4dgs.method.checkpoint import resume_training, save_training
+from spike4dgs.method.optimizer import make_adam
 
 # Width 64; Adam at 1e-4, a tenth of it after epoch 20 of 61; batches of 16 patches of 40x40 pixels.
 PUBLISHED: dict[str, int] = {"width": 64, "epochs": 61, "batch": 16, "patch": 40}
@@ -101,17 +101,11 @@ class Training:
 
     def save(self, path: Path, key: str) -> None:
         """Write everything needed to go on."""
-        network = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        adam = {f"adam.{k}": v for k, v in export_state(self.adam).items()}
-        save_checkpoint(path, Checkpoint(self.step, network | adam), key)
+        save_training(path, self.step, self.network, self.adam, key)
 
     def resume(self, path: Path, key: str) -> None:
         """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
-        found = load_checkpoint(path, key)
-        if found:
-            self.network.load_state_dict(found.part("network"))
-            import_state(self.adam, found.part("adam"))
-            self.step = found.step
+        self.step = resume_training(path, self.network, self.adam, key) or self.step
 
 
 def score(network: Spk2ImgNet, scene: Scene) -> float:
