@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -137,25 +138,34 @@ def pick_targets(scene: Scene, count: int = 3) -> list[Target]:
 
 
 def write_scatter(path: Path, records: Sequence[Record]) -> None:
-    """Write a PNG: PSNR of the whole image and of the moving region against fit time, a point per method and scene."""
+    """Write a PNG: PSNR of the whole image and of the moving region against fit time, a point per method and scene.
+
+    A colour is a method, a marker a scene.
+    """
+    from matplotlib import colormaps
+
     figure = _figure((10.5, 4.4))
-    scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
+    markers = dict(
+        zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle("osD^vP*X"), strict=False)
+    )
+    keys: dict[str, Any] = {}
     for ax, metric in zip(figure.subplots(1, 2), ("psnr", "psnr_dynamic"), strict=True):
         for i, record in enumerate(records):
-            for scene, marker in zip(scenes, "osD^vP*X" * len(scenes), strict=False):
+            color = colormaps["tab20"](i % 20)
+            for scene, marker in markers.items():
                 cell = record["scenes"].get(scene)
                 if cell and cell["metrics"][metric] is not None and cell["fit_seconds"] is not None:
-                    label = record["method"]["name"]
                     seconds = max(cell["fit_seconds"], 1e-3)  # a logarithm needs more than zero
-                    point = ax.scatter(seconds, cell["metrics"][metric], color=f"C{i % 10}", marker=marker, s=60)
-                    point.set_label(f"{label}, {scene}")
+                    ax.scatter(seconds, cell["metrics"][metric], color=color, marker=marker, s=60)
+                    keys[record["method"]["name"]] = ax.plot([], [], "o", color=color)[0]
+                    keys[scene] = ax.plot([], [], marker, color="gray")[0]
         ax.set_xscale("log")
         ax.set_xlabel("fit time, s")
         ax.set_ylabel(f"{METRICS[metric].title}, {METRICS[metric].unit}")
         ax.grid(alpha=0.3)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside right upper", fontsize=8)
+    if keys:
+        names = [n for n in (*(r["method"]["name"] for r in records), *markers) if n in keys]
+        figure.legend([keys[n] for n in names], names, loc="outside right upper", fontsize=8)
     _save(figure, path)
 
 
