@@ -25,8 +25,22 @@ class Decay:
         return math.exp((1 - fraction) * math.log(self.first) + fraction * math.log(self.last))
 
 
+@dataclass(frozen=True)
+class WarmCosine:
+    """A learning rate that rises linearly to `peak` in `warm_up` steps, and falls to nothing with the cosine."""
+
+    peak: float
+    warm_up: int  # steps
+    steps: int  # of the whole training
+
+    def at(self, step: int) -> float:
+        """The rate of a step."""
+        rise = min(1.0, (step + 1) / self.warm_up)
+        return self.peak * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+
+
 def make_adam(groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> torch.optim.Adam:
-    """Adam with one named group per entry; learning rates are set before each step (`set_rates`).
+    """Adam with one named group per entry; learning rates are set before each step (`set_rates`, `set_rate`).
 
     eps is 1e-15 as in 3DGS: gradients of single Gaussians are far below Adam's usual 1e-8.
     """
@@ -38,6 +52,12 @@ def set_rates(adam: torch.optim.Adam, rates: dict[str, Decay], fraction: float) 
     """Set every group's learning rate for the point `fraction` in [0, 1] of a stage."""
     for group in adam.param_groups:
         group["lr"] = rates[group["name"]].at(fraction)
+
+
+def set_rate(adam: torch.optim.Adam, rate: float) -> None:
+    """Set one learning rate for all groups."""
+    for group in adam.param_groups:
+        group["lr"] = rate
 
 
 def apply_edit(adam: torch.optim.Adam, edit: Edit) -> Gaussians:

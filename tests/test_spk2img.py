@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,6 +95,37 @@ def test_the_public_benchmark_is_refused(small_scene: Path) -> None:
                 open_for_training(small_scene)
         else:
             assert open_for_training(small_scene).id == "pattern-0"
+
+
+@pytest.mark.parametrize(
+    ("camera", "first_tick", "ticks", "kept"),
+    [
+        ("cam_03", 0, 19, [40, 60]),  # tick 40 needs ticks [19, 60], the reversed window's first included
+        ("cam_03", 19, 1, [60]),
+        ("cam_03", 60, 1, [20]),
+        ("cam_03", 61, 1, [20, 40]),
+        ("cam_02", 0, 80, [20, 40, 60]),  # no image is of this camera
+    ],
+)
+def test_images_whose_spikes_lack_ticks_are_not_trained_on(
+    small_scene: Path, camera: str, first_tick: int, ticks: int, kept: list[int]
+) -> None:
+    write_gaps(small_scene, [{"camera": camera, "first_tick": first_tick, "ticks": ticks, "reason": "overflow"}])
+    assert [e.tick for e in read_examples(open_for_training(small_scene, allow_gaps=True))] == kept
+
+
+def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path) -> None:
+    write_gaps(small_scene, [{"camera": "cam_03", "first_tick": 0, "ticks": 80, "reason": "overflow"}])
+    with pytest.raises(UserError, match="a recording without gaps"):
+        train_spk2img(scenes=(small_scene,), out=tmp_path / "out")
+    with pytest.raises(UserError, match="with ground truth, found no image that has all its spikes"):
+        train_spk2img(scenes=(small_scene,), out=tmp_path / "out", allow_gaps=True)
+
+
+def write_gaps(scene: Path, gaps: list[dict[str, Any]]) -> None:
+    meta = json.loads((scene / "scene.json").read_text())
+    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": gaps}))
+    write_manifest(scene)
 
 
 def test_loss_from_its_definition() -> None:

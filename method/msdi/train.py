@@ -9,7 +9,6 @@ checkpoint as if it had never stopped.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,7 +32,7 @@ from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.report import model_card
 from spike4dgs.method.msdi.weights import Card, save_weights
-from spike4dgs.method.optimizer import make_adam
+from spike4dgs.method.optimizer import WarmCosine, make_adam, set_rate
 
 PUBLISHED: dict[str, float] = {"rate": 1e-4}  # all that the publication says of its training, besides the losses
 ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only
@@ -56,10 +55,10 @@ class TrainingSettings:
     unknown_share: float = 0.2  # of the steps do not tell the intrinsics
     score_every: int = 1000  # steps
 
-    def rate_at(self, step: int) -> float:
-        """Learning rate of a step."""
-        rise = min(1.0, (step + 1) / self.warm_up)
-        return self.rate * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+    @property
+    def schedule(self) -> WarmCosine:
+        """Adam's learning rate by step."""
+        return WarmCosine(self.rate, self.warm_up, self.steps)
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,7 @@ class Training:
             torch.from_numpy(a).to(self.device, non_blocking=True)
             for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics)
         )
-        for group in self.adam.param_groups:
-            group["lr"] = self.settings.rate_at(self.step)
+        set_rate(self.adam, self.settings.schedule.at(self.step))
         draws = np.random.default_rng([self.seed, self.step, 1])
         known = draws.random() >= self.settings.unknown_share
         kind = device_type(self.device)

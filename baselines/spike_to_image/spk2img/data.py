@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.spk2img.windows import WINDOW, window
+from spike4dgs.baselines.spike_to_image.spk2img.windows import HALF_WINDOW, WINDOW, window
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes import SpikeStream
@@ -46,9 +46,12 @@ class Batch:
     gain: Float32  # [B]
 
 
-def open_for_training(folder: Path) -> Scene:
-    """Open a scene folder. Raises UserError for one of the public benchmark."""
-    scene = open_scene(folder)
+def open_for_training(folder: Path, allow_gaps: bool = False) -> Scene:
+    """Open a scene folder.
+
+    Raises UserError for one of the public benchmark, and for a recording with gaps unless `allow_gaps`.
+    """
+    scene = open_scene(folder, allow_gaps)
     if scene.meta.get("source", {}).get("variant") == PUBLIC_VARIANT:
         fix = "make one with `spike4dgs make-dataset WORLD --variant 1`"
         raise problem(folder, "a training variant (1 or higher)", "the public benchmark's variant 0", fix)
@@ -56,18 +59,30 @@ def open_for_training(folder: Path) -> Scene:
 
 
 def read_examples(scene: Scene) -> list[Example]:
-    """All examples of a scene, in the order of camera and tick. Raises UserError where the scene has no image."""
+    """All examples of a scene whose spikes are all there, in the order of camera and tick.
+
+    Raises UserError where the scene has none.
+    """
     streams = {camera: scene.stream(camera) for camera in scene.meta["streams"]}
     paths = (PurePosixPath(name) for name in sorted(scene.manifest.files) if name.startswith("images/"))
     examples = []
     for path in paths:
         target = Target(path.parent.name, int(path.stem))
+        if not _is_whole(streams[target.camera], target.tick):
+            continue
         rate = np.clip(scene.ground_truth(target) * np.float32(scene.radiance_gain), 0, 1)
         moving = np.flatnonzero(scene.moving(target))
         examples.append(Example(streams[target.camera], target.tick, rate, moving, scene.radiance_gain))
     if not examples:
-        raise problem(scene.root, "a scene with ground truth", "no image", "train on another scene")
+        found = "no image that has all its spikes"
+        raise problem(scene.root, "a scene with ground truth", found, "train on another scene")
     return examples
+
+
+def _is_whole(stream: SpikeStream, tick: int) -> bool:
+    """Whether no tick is missing from the windows around `tick`: the image's own, and the reversed, a tick earlier."""
+    first, stop = tick - 1 - HALF_WINDOW, tick + HALF_WINDOW + 1
+    return all(gap.stop_tick <= first or stop <= gap.first_tick for gap in stream.gaps)
 
 
 def draw(examples: Sequence[Example], count: int, patch: int, moving_share: float, rng: np.random.Generator) -> Batch:

@@ -9,7 +9,6 @@ Everything random is drawn from (seed, step): a killed run goes on from its chec
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -30,7 +29,7 @@ from spike4dgs.benchmark.image_pair import ImagePair
 from spike4dgs.benchmark.metrics import METRICS
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.optimizer import make_adam
+from spike4dgs.method.optimizer import WarmCosine, make_adam, set_rate
 
 # Width 64; Adam at 1e-4, a tenth of it after epoch 20 of 61; batches of 16 patches of 40x40 pixels.
 PUBLISHED: dict[str, int] = {"width": 64, "epochs": 61, "batch": 16, "patch": 40}
@@ -52,10 +51,10 @@ class TrainingSettings:
     moving_share: float = 0.5  # of the patches lie around a moving pixel: most of a scene stands still
     estimate_weight: float = 0.02  # of each branch's estimate, as published
 
-    def rate_at(self, step: int) -> float:
-        """Learning rate of a step."""
-        rise = min(1.0, (step + 1) / self.warm_up)
-        return self.rate * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+    @property
+    def schedule(self) -> WarmCosine:
+        """Adam's learning rate by step."""
+        return WarmCosine(self.rate, self.warm_up, self.steps)
 
 
 def loss_of(found: Reconstruction, rate: Tensor, gain: Tensor, estimate_weight: float) -> Tensor:
@@ -88,8 +87,7 @@ class Training:
         batch = self.batch()
         spikes = torch.from_numpy(batch.spikes).to(self.device, memory_format=torch.channels_last)
         rate, gain = (torch.from_numpy(a).to(self.device) for a in (batch.rate, batch.gain))
-        for group in self.adam.param_groups:
-            group["lr"] = self.settings.rate_at(self.step)
+        set_rate(self.adam, self.settings.schedule.at(self.step))
         loss = loss_of(self.network(spikes), rate, gain, self.settings.estimate_weight)
         self.adam.zero_grad(set_to_none=True)
         loss.backward()
@@ -128,6 +126,7 @@ def train_spk2img(
     steps: int = 20_000,
     device: str = "auto",
     seed: int = 0,
+    allow_gaps: bool = False,
 ) -> int:
     """Train Spk2ImgNet on training variants of the worlds. A killed run goes on where it was with the same command.
 
@@ -142,10 +141,11 @@ def train_spk2img(
         steps: Steps of 8 patches of 48x48 pixels (smaller ones where pictures are smaller).
         device: auto, cpu or cuda.
         seed: Seed of the first weights and of the patches.
+        allow_gaps: Accept recordings with gaps; images whose spikes lack ticks are not trained on.
     """
     if width < 1 or steps < 1:
         raise problem("--width and --steps", "numbers from 1 up", f"{width}, {steps}", "correct them")
-    opened, kept = [open_for_training(s) for s in scenes], [open_for_training(s) for s in hidden]
+    opened, kept = ([open_for_training(s, allow_gaps) for s in folders] for folders in (scenes, hidden))
     if both := {s.revision for s in opened} & {s.revision for s in kept}:
         found = ", ".join(s.id for s in kept if s.revision in both)
         raise problem("--hidden", "scenes that are not trained on", found, "name them once")
