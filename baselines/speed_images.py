@@ -98,8 +98,9 @@ def images(argv: Sequence[str] = ()) -> int:
     p.add_argument("scenes", nargs="*", type=Path, help="scene folders; without any, only time is measured")
     p.add_argument("--repeats", type=int, default=5, help="the median of so many pictures counts")
     p.add_argument("--out", type=Path, default=Path("runs/images"), help="folder for the table and the strips")
+    p.add_argument("--allow-gaps", action="store_true", help="accept recordings with gaps")
     a = p.parse_args(list(argv))
-    scenes = [open_scene(path) for path in a.scenes]
+    scenes = [open_scene(path, a.allow_gaps) for path in a.scenes]
     rows = measure_generators(scenes, a.repeats)
     title = f"Pictures from spikes, median ms of {a.repeats}, quality at the held-out cameras of {len(scenes)} scene(s)"
     show_table(title, _columns(scenes), [_texts(r) for r in rows], a.out / "images.csv", [r.note for r in rows])

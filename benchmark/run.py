@@ -14,15 +14,13 @@ from __future__ import annotations
 
 import fcntl
 import sys
-import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.cell import Job, is_done, run_job
@@ -34,6 +32,7 @@ from spike4dgs.benchmark.recipes import Budget, Method, find_methods, make_budge
 from spike4dgs.benchmark.refinement import SUFFIX
 from spike4dgs.benchmark.report import cell_summary, make_console, results_table, write_scatter, write_sheet
 from spike4dgs.benchmark.result import Cell, Record, build_record, check_method_name, missing_cell, write_record
+from spike4dgs.benchmark.run_display import RunDisplay
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
 from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
@@ -73,7 +72,7 @@ def run_matrix(
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
     records = []
-    with _lock(settings.out), _Display(console, len(scenes) * len(methods)) as display:
+    with _lock(settings.out), RunDisplay(console, len(scenes) * len(methods)) as display:
         for method in methods:
             jobs = [Job(method, scene, settings.seed, settings.device, settings.budget) for scene in scenes]
             rows = [_run_cell(job, selection, settings.out, display) for job in jobs]
@@ -85,7 +84,7 @@ def run_matrix(
     return records
 
 
-def _run_cell(job: Job, selection: Selection, out: Path, display: _Display) -> list[Cell]:
+def _run_cell(job: Job, selection: Selection, out: Path, display: RunDisplay) -> list[Cell]:
     """The cells of the job's variants."""
     folders = [predictions_folder(out, variant.name, job.scene.id) for variant in job.variants]
     log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
@@ -135,52 +134,6 @@ def _lock(out: Path) -> Iterator[None]:
         yield
 
 
-class _Display:
-    """Progress on the console: bars with an estimate on a terminal, lines with one elsewhere."""
-
-    def __init__(self, console: Console, cells: int) -> None:
-        self._console, self._cells, self._done, self._start = console, cells, 0, time.perf_counter()
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-        self._bars = Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)
-        self._all = self._bars.add_task("all cells", total=cells)
-
-    def __enter__(self) -> _Display:
-        if self._console.is_terminal:
-            self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    @contextmanager
-    def cell(self, title: str) -> Iterator[_ShownCell]:
-        """Show one cell; yields what it reports to."""
-        task = self._bars.add_task(title, total=None)
-        label = f"[{self._done + 1}/{self._cells}] {title}"
-        self._console.print(label, highlight=False, markup=False)
-
-        def progress(done: int, total: int, note: str = "") -> None:
-            self._bars.update(task, completed=done, total=total, description=f"{title} {note}")
-            self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
-
-        def note(text: str) -> None:
-            self._console.print(f"    {text}", highlight=False, markup=False)
-
-        yield _ShownCell(progress, note)
-        self._done += 1
-        self._bars.remove_task(task)
-        self._bars.update(self._all, completed=self._done)
-        if left := self._cells - self._done:
-            elapsed = time.perf_counter() - self._start
-            note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
-
-
-@dataclass(frozen=True)
-class _ShownCell:
-    progress: Callable[..., None]
-    note: Callable[[str], None]
-
-
 def run_benchmark(
     scenes: Positional[tuple[Path, ...]] = (),
     *,
@@ -219,7 +172,7 @@ def run_benchmark(
         allow_gaps: Accept recordings with gaps.
     """
     if table == IMAGE_TABLE:
-        return _image_table(scenes, data, profile, out)
+        return _image_table(scenes, data, profile, out, allow_gaps)
     paper = None if table is None else published(table)
     if paper and scenes:
         raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
@@ -261,7 +214,7 @@ def _say(console: Console, text: str) -> None:
     console.print(text, highlight=False, markup=False)
 
 
-def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path) -> int:
+def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path, allow_gaps: bool) -> int:
     """Table 6 compares pictures, not methods: the command `speed images` measures it."""
     from spike4dgs.benchmark.cli import load_speed
 
@@ -270,7 +223,8 @@ def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path) 
     if not chosen:
         fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
         raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
-    return int(load_speed("images")([*map(str, chosen), "--out", str(out)]))
+    gaps = ["--allow-gaps"] if allow_gaps else []
+    return int(load_speed("images")([*map(str, chosen), "--out", str(out), *gaps]))
 
 
 def write_pictures(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:

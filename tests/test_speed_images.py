@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from spike4dgs.baselines.spike_to_image.tfp import TFP
 from spike4dgs.baselines.spike_to_image.tfstp import tfstp_image
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.manifest import write_manifest
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.benchmark.spikes import SpikeStream, pack
 from spike4dgs.benchmark.timing import module_of, show_table
@@ -149,6 +151,23 @@ def test_a_scene_without_ground_truth_is_refused(small_scene: Path, monkeypatch:
     object.__setattr__(scene, "targets", ())
     with pytest.raises(UserError, match="expected a scene with targets, found none in targets.json"):
         speed_images.middle_target(scene)
+
+
+def test_gaps_are_refused_unless_allowed(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meta = json.loads((small_scene / "scene.json").read_text())
+    meta["gaps"] = [{"camera": "cam_00", "first_tick": 3, "ticks": 2, "reason": "overflow"}]
+    (small_scene / "scene.json").write_text(json.dumps(meta))
+    write_manifest(small_scene)
+    seen: list[str] = []
+    monkeypatch.setattr(speed_images, "measure_generators", lambda scenes, _: seen.extend(s.id for s in scenes) or [])
+    for command in (["speed", "images", str(small_scene)], ["run-benchmark", str(small_scene), "--table", "6"]):
+        command += ["--out", str(tmp_path)]
+        assert main(command) == 2
+        assert "pass --allow-gaps" in capsys.readouterr().err
+        assert main([*command, "--allow-gaps"]) == 0
+    assert seen == ["pattern-0", "pattern-0"]
 
 
 def test_plain_numpy_is_the_same_method() -> None:

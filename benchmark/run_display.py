@@ -1,0 +1,59 @@
+"""How far a run is: bars with an estimate on a terminal, lines with one elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+@dataclass(frozen=True)
+class ShownCell:
+    """What a cell in progress reports to."""
+
+    progress: Callable[..., None]  # (done, total, note="")
+    note: Callable[[str], None]
+
+
+class RunDisplay:
+    """Progress on the console: bars with an estimate on a terminal, lines with one elsewhere."""
+
+    def __init__(self, console: Console, cells: int) -> None:
+        self._console, self._cells, self._done, self._start = console, cells, 0, time.perf_counter()
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+        self._bars = Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)
+        self._all = self._bars.add_task("all cells", total=cells)
+
+    def __enter__(self) -> RunDisplay:
+        if self._console.is_terminal:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    @contextmanager
+    def cell(self, title: str) -> Iterator[ShownCell]:
+        """Show one cell; yields what it reports to."""
+        task = self._bars.add_task(title, total=None)
+        label = f"[{self._done + 1}/{self._cells}] {title}"
+        self._console.print(label, highlight=False, markup=False)
+
+        def progress(done: int, total: int, note: str = "") -> None:
+            self._bars.update(task, completed=done, total=total, description=f"{title} {note}")
+            self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
+
+        def note(text: str) -> None:
+            self._console.print(f"    {text}", highlight=False, markup=False)
+
+        yield ShownCell(progress, note)
+        self._done += 1
+        self._bars.remove_task(task)
+        self._bars.update(self._all, completed=self._done)
+        if left := self._cells - self._done:
+            elapsed = time.perf_counter() - self._start
+            note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
