@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from spike4dgs.baselines.spike_to_image.spk2img.deformable import DeformableConv, deformable_conv
+from spike4dgs.baselines.spike_to_image.spk2img.deformable_cpu import convolve
 from spike4dgs.baselines.spike_to_image.spk2img.network import Extractor, Spk2ImgNet
 from spike4dgs.baselines.spike_to_image.spk2img.windows import mirrored
 
@@ -90,6 +91,41 @@ def test_without_offsets_it_is_a_convolution() -> None:
 def test_deformable_gradients() -> None:
     leaves = [t.requires_grad_() for t in random_case(2, 3, 4, 0.3, torch.float64)]
     assert torch.autograd.gradcheck(deformable_conv, leaves, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+@pytest.mark.parametrize(
+    ("groups", "height", "width", "reach"), [(1, 5, 6, 0.7), (2, 4, 3, 3.0), (1, 1, 4, 1.0), (1, 3, 1, 1e12)]
+)
+def test_the_kernel_for_inference_equals_the_loop(
+    groups: int, height: int, width: int, reach: float, channels_last: bool
+) -> None:
+    rng = torch.Generator().manual_seed(7)
+    layer = DeformableConv(8 * groups, groups)
+    x = torch.randn(2, 8 * groups, height, width, generator=rng)
+    found = torch.randn(2, groups * 27, height, width, generator=rng)
+    split = groups * 18
+    found[:, :split] *= reach
+    found[:, 0] = found[:, 0].round()  # pixel centres, and places just at the border
+    if channels_last:
+        x, found = (t.to(memory_format=torch.channels_last) for t in (x, found))
+    offsets = found[:, :split].reshape(2, groups, 9, 2, height, width)
+    masks = torch.sigmoid(found[:, split:]).reshape(2, groups, 9, height, width)
+    with torch.inference_mode():
+        fast = convolve(x, found, layer.weight, layer.bias).numpy()
+    np.testing.assert_allclose(fast, slow_deformable_conv(x, offsets, masks, layer.weight, layer.bias), atol=2e-5)
+
+
+def test_a_layer_gives_the_same_with_and_without_gradients() -> None:
+    layer = DeformableConv(16, groups=2)
+    torch.nn.init.normal_(layer.guide.weight, std=0.2, generator=torch.Generator().manual_seed(1))
+    x, guide = torch.randn(2, 2, 16, 9, 7, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        fast = layer(x, guide)
+    torch.testing.assert_close(fast, layer(x, guide).detach(), atol=2e-5, rtol=1e-5)
+    x[0, 3, 2, 2] = torch.nan  # must not become an address
+    with torch.no_grad():
+        assert layer(guide, x).isnan().any()
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 9])

@@ -2,7 +2,8 @@
 
 y(p) = bias + sum over taps k of weight_k * mask_k(p) * x(p + k + offset_k(p)), x read bilinearly and 0 outside the
 picture (Zhu, Hu, Lin, Dai: Deformable ConvNets v2, CVPR 2019). The samples of all taps and groups are one call of
-`grid_sample`, the sum over taps and channels is one matrix product.
+`grid_sample`, the sum over taps and channels is one matrix product. Without gradients,
+`deformable_cpu` does the same on the CPU in a quarter of the time.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
+
+from spike4dgs.baselines.spike_to_image.spk2img import deformable_cpu
 
 TAPS = 9
 
@@ -63,8 +66,12 @@ class DeformableConv(nn.Module):
 
     def forward(self, x: Tensor, guide: Tensor) -> Tensor:
         """Feature x and guide, both [B, width, H, W], to [B, width, H, W]."""
-        batch, _, height, width = x.shape
-        found = self.guide(guide).contiguous()  # channels last would make every step below slow
+        batch, channels, height, width = x.shape
+        found = self.guide(guide)
+        suits = x.device.type == "cpu" and x.dtype == torch.float32 and channels == deformable_cpu.GROUP * self.groups
+        if suits and not torch.is_grad_enabled():
+            return deformable_cpu.convolve(x, found, self.weight, self.bias)
+        found = found.contiguous()  # channels last would make every step below slow
         split = self.groups * TAPS * 2
         offsets = found[:, :split].reshape(batch, self.groups, TAPS, 2, height, width)
         masks = torch.sigmoid(found[:, split:]).view(batch, self.groups, TAPS, height, width)
