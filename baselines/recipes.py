@@ -38,12 +38,12 @@ PARTS = Parts(
 )
 _MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
 
-# Spk2ImgNet's pictures take half a minute of a quick fit's 90 s on two cores, at every other time of the other rows;
-# 4DGS, the slowest, has a third fewer steps for it.
+# Spk2ImgNet's pictures take a quarter of a quick fit's 90 s on two cores, at every other time of the other rows; 4DGS,
+# the slowest, has a quarter fewer steps for it.
 _SPK2IMG: dict[str, dict[str, Any]] = {
     "d3dgs": {},
     "stg": {"time_spacing_ticks": 20},
-    "4dgs": {"time_spacing_ticks": 20, "coarse_steps": 200, "fine_steps": 800},
+    "4dgs": {"time_spacing_ticks": 20, "coarse_steps": 250, "fine_steps": 900},
 }
 
 RECIPES = (

@@ -6,8 +6,8 @@ mask goes into the four bilinear weights, and no grid is written down. The twin 
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ TAPS = 9
 GROUP = 8  # channels of a group, which the kernel knows when it is compiled: one vector
 
 
-@cache
+@functools.cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "deformable")
 
@@ -91,12 +91,11 @@ def convolve(x: Tensor, found: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     found [B, G * 27, H, W] has the offsets and the masks before their sigmoid, as DeformableConv's guide gives them.
     """
     batch, channels, height, width = x.shape
-    places = x.permute(0, 2, 3, 1).contiguous().numpy()
-    guides = found.permute(0, 2, 3, 1).contiguous().numpy()
+    places, guides = (t.permute(0, 2, 3, 1).contiguous().numpy() for t in (x, found))
     columns = torch.empty(batch, height, width, TAPS * channels)
-    arguments: tuple[Any, ...] = (places.reshape(-1), guides, columns.view(-1).numpy(), channels)
-    helper = _pool().submit(_sample, *arguments, 1, 2)
-    _sample(*arguments, 0, 2)
+    sample: Any = functools.partial(_sample, places.reshape(-1), guides, columns.view(-1).numpy(), channels)
+    helper = _pool().submit(sample, 1, 2)  # every other row of pixels each
+    sample(0, 2)
     helper.result()
     matrix = weight.permute(2, 3, 1, 0).reshape(TAPS * channels, -1)
     return (columns.view(-1, TAPS * channels) @ matrix).add_(bias).view(batch, height, width, -1).permute(0, 3, 1, 2)
