@@ -85,7 +85,7 @@ def test_frames_become_upright_ticks_in_their_place(layout: str, rows: str, mirr
     frames = make_layout(layout, WIDTH, HEIGHT).pack(pack(sent, rows == "bottom-up"), 5)
     gap = Gap("cam_00", 600, 50, "overflow")
     with StreamFiles(tmp_path / "clip", profile, 700) as files:
-        files.write_ticks("cam_00", np.r_[:600, 650:700], np.concatenate([frames[:600], frames[650:]]))
+        files.write_ticks("cam_00", np.r_[:600, 650:699], np.concatenate([frames[:600], frames[650:699]]))
         files.write("cam_00", 699, frames[699:].repeat(3, axis=0))  # what is beyond the end is left out
         root = files.finish(ClipRecord(690, (gap,), SYNC))
     stream = open_scene(root, allow_gaps=True).stream("cam_00")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.gaps import Gap
+from spike4dgs.generators.recorder.gaps import DISK, Gap, merged
 
 UInt8 = NDArray[np.uint8]
 
@@ -33,7 +33,7 @@ class CameraStats:
     idle_worst_ms: float
     starved: int  # how often no read was in flight
     queued: bool
-    end: str  # "ok", or the reason that stopped this camera alone
+    end: str  # "ok", or the reason that stopped this camera alone; "disk" where only its file ended
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,3 +61,16 @@ class Clip:
     def complete(self) -> bool:
         """Whether no camera lost anything."""
         return not any(c.gaps for c in self.cameras)
+
+    def without(self, gaps: tuple[Gap, ...]) -> Clip:
+        """The same clip, of which the disk has not taken these ticks."""
+        return replace(self, cameras=tuple(_without(c, gaps, self.n_ticks) for c in self.cameras))
+
+
+def _without(clip: CameraClip, gaps: tuple[Gap, ...], n_ticks: int) -> CameraClip:
+    mine = [g for g in gaps if g.camera == clip.camera]
+    if not mine:
+        return clip
+    every = merged([*clip.gaps, *mine], n_ticks)
+    end = DISK if clip.stats.end == "ok" else clip.stats.end
+    return replace(clip, gaps=every, stats=replace(clip.stats, lost_ticks=sum(g.ticks for g in every), end=end))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -20,14 +20,15 @@ import numpy as np
 
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import atomic_path, check_new, writing
 from spike4dgs.benchmark.scene import Target
 from spike4dgs.benchmark.scene_writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes import open_stream
 from spike4dgs.benchmark.splits import Split, standard_splits
 from spike4dgs.benchmark.stream_folder import write_stream_folder
-from spike4dgs.generators.recorder.gaps import Gap, merged
+from spike4dgs.generators.recorder.disk import Buffers, DiskFile
+from spike4dgs.generators.recorder.gaps import DISK, Gap, merged
 from spike4dgs.generators.recorder.layouts import Int64, UInt8, make_layout, orient
 from spike4dgs.generators.recorder.profile import NAME, TOP_DOWN, CameraProfile, RigProfile
 
@@ -57,43 +58,62 @@ class ClipRecord:
 class StreamFiles:
     """The streams of a recording in progress: one `.part` file for each camera, as long as the clip from the start.
 
-    `write` is what `capture` calls its sink. Only `finish` leaves anything behind.
+    `write` is what `capture` calls its sink. Each camera's ticks ascend. A file that the system does not write ends
+    alone: what follows is dropped, and a gap of reason "disk". Only `finish` leaves anything behind.
 
     >>> with StreamFiles(out, profile, n_ticks) as files:  # doctest: +SKIP
     ...     clip = capture(profile, links, seconds, sink=files.write)
+    ...     clip = clip.without(files.flush(clip.n_ticks))
     ...     files.finish(ClipRecord(clip.n_ticks, gaps, sync))
     """
 
     def __init__(self, out: Path, profile: RigProfile, n_ticks: int) -> None:
         """Make the folder and reserve its disk space. Raises UserError where `out` is not new, or has no room."""
-        check_new(out)
-        if profile.calibrated and not NAME.match(out.resolve().name):
-            fix = "choose another --out"
-            raise problem(out, "a scene's name: letters, digits, '.', '_' and '-'", repr(out.resolve().name), fix)
+        _check_place(out, profile)
         self._out, self._profile, self._n_ticks = out, profile, n_ticks
         self._layout = make_layout(profile.layout, profile.width, profile.height)
         self._unpacked = np.empty((_FRAMES, self._layout.payload_bytes), np.uint8)
-        self._files: dict[str, int] = {}
+        self._files: dict[str, DiskFile] = {}
+        self._lost: tuple[Gap, ...] | None = None  # known after `flush`
+        size = n_ticks * self._layout.payload_bytes
+        self.buffers = Buffers(len(profile.cameras), size)
         try:
             for camera in profile.cameras:
                 with writing(self._path(camera)):
                     self._part(camera).parent.mkdir(parents=True, exist_ok=True)
-                    self._files[camera.id] = os.open(self._part(camera), os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
-                    os.posix_fallocate(self._files[camera.id], 0, n_ticks * self._layout.payload_bytes)
+                    self._files[camera.id] = DiskFile(self._part(camera), size, self.buffers)
         except BaseException:
             self._remove()
             raise
 
+    @property
+    def direct(self) -> bool:
+        """Whether all files have been written past the page cache so far."""
+        return all(file.direct for file in self._files.values())
+
+    @property
+    def failures(self) -> dict[str, UserError]:
+        """Camera -> why its file ended, as far as it is known yet."""
+        errors = ((c, self._files[c.id].error) for c in self._profile.cameras if c.id in self._files)
+        return {c.id: _refused(self._path(c), error) for c, error in errors if error is not None}
+
+    @property
+    def ended(self) -> bool:
+        """Whether no file takes anything any more, so that there is nothing to record for."""
+        return all(file.error is not None for file in self._files.values())
+
     def write(self, camera: str, first_tick: int, frames: UInt8) -> None:
         """Unpack raw frames [n, frame_bytes] of consecutive ticks from `first_tick` on, and write them in their place.
 
-        Frames from the end of the clip on are left out. Raises UserError where the system cannot write.
+        Frames from the end of the clip on are left out. Waits where the disk is behind.
         """
         c, p = self._profile.camera(camera), self._profile
         for start in range(0, len(frames), _FRAMES):
             raw = frames[start : start + _FRAMES]
-            packed = self._unpacked[: len(raw)]
-            self._layout.unpack(raw, packed)
+            packed = raw
+            if self._layout.has_tags():
+                packed = self._unpacked[: len(raw)]
+                self._layout.unpack(raw, packed)
             self.append(camera, first_tick + start, orient(packed, p.width, p.height, c.rows == TOP_DOWN, c.mirrored))
 
     def write_ticks(self, camera: str, ticks: Int64, frames: UInt8) -> None:
@@ -104,22 +124,32 @@ class StreamFiles:
 
     def append(self, camera: str, first_tick: int, packed: UInt8) -> None:
         """Write packed ticks [n, payload_bytes], bottom-up and not mirrored, in their place."""
-        size = self._layout.payload_bytes
-        left = packed[: max(self._n_ticks - first_tick, 0)].reshape(-1).data
-        at = first_tick * size
-        with writing(self._path(self._profile.camera(camera))):
-            while left:
-                done = os.pwrite(self._files[camera], left, at)
-                left, at = left[done:], at + done
+        inside = packed[: max(self._n_ticks - first_tick, 0)]
+        if len(inside):
+            self._files[camera].write(first_tick * self._layout.payload_bytes, inside.reshape(-1))
+
+    def flush(self, n_ticks: int) -> tuple[Gap, ...]:
+        """Cut the streams to the clip's length and have the disk hold them; what it does not hold, reason "disk".
+
+        Raises UserError where it holds no tick of any stream.
+        """
+        if self._lost is None:
+            for file in self._files.values():
+                file.flush()
+            size = n_ticks * self._layout.payload_bytes
+            kept = {c: self._close(file, size) // self._layout.payload_bytes for c, file in self._files.items()}
+            if self.failures and not any(kept.values()):
+                raise next(iter(self.failures.values()))
+            self._lost = merged((Gap(c, first, n_ticks - first, DISK) for c, first in kept.items()), n_ticks)
+        return self._lost
 
     def finish(self, record: ClipRecord) -> Path:
-        """Cut the streams to the clip's length, fsync and rename them, and describe the folder, which is returned."""
+        """Rename the streams and describe the folder, which is returned. Flushes them where that has not been done."""
+        record = replace(record, gaps=merged([*record.gaps, *self.flush(record.n_ticks)], record.n_ticks))
         for camera in self._profile.cameras:
             with writing(self._path(camera)):
-                os.truncate(self._files[camera.id], record.n_ticks * self._layout.payload_bytes)
-                os.fsync(self._files[camera.id])
-                os.close(self._files.pop(camera.id))
                 os.replace(self._part(camera), self._path(camera))
+            del self._files[camera.id]
         if self._profile.calibrated:
             _finish_scene(self._out, self._profile, record)
         else:
@@ -134,6 +164,18 @@ class StreamFiles:
     ) -> None:
         self._remove()
 
+    def _close(self, file: DiskFile, size: int) -> int:
+        """How many bytes of a stream of `size` the disk then holds; a tick that was torn is zero."""
+        kept = size
+        if file.error is not None:
+            kept = min(file.written // self._layout.payload_bytes * self._layout.payload_bytes, size)
+            file.blank(kept)
+        try:
+            file.close(size)
+        except OSError as e:
+            file.error, kept = e, 0  # nobody knows what of it is there
+        return kept
+
     def _path(self, camera: CameraProfile) -> Path:
         return self._out / (stream_name(camera.id) if self._profile.calibrated else f"{camera.id}.dat")
 
@@ -145,7 +187,7 @@ class StreamFiles:
         """Drop what was not finished, and the folders that hold nothing."""
         for camera in self._profile.cameras:
             if camera.id in self._files:
-                os.close(self._files.pop(camera.id))
+                self._files.pop(camera.id).close()
                 self._part(camera).unlink(missing_ok=True)
         for folder in (self._out / "spikes", self._out):
             if folder.is_dir() and not any(folder.iterdir()):
@@ -165,6 +207,27 @@ def write_clip(out: Path, profile: RigProfile, streams: Mapping[str, UInt8], rec
                 files.append(camera.id, at, streams[camera.id][at : gap.first_tick])
                 at = gap.stop_tick
         return files.finish(record)
+
+
+def _check_place(out: Path, profile: RigProfile) -> None:
+    if (part := next((p for part in ("", "spikes/") for p in out.glob(f"{part}.*.dat.part")), None)) is not None:
+        found = "the streams of one that still runs, or was killed"
+        raise problem(part, "a folder without a recording", found, f"choose another --out, or remove {out}")
+    check_new(out)
+    if profile.calibrated and not NAME.match(out.resolve().name):
+        fix = "choose another --out"
+        raise problem(out, "a scene's name: letters, digits, '.', '_' and '-'", repr(out.resolve().name), fix)
+
+
+def _refused(path: Path, error: OSError) -> UserError:
+    try:
+        with writing(path):
+            raise error
+    except UserError as e:
+        return e
+    except OSError as e:
+        fix = "see what the kernel's log (dmesg) says of it, and choose another disk"
+        return problem(path, "a disk that writes", (e.strerror or str(e)).lower(), fix)
 
 
 def _gaps_of(camera: str, gaps: Iterable[Gap]) -> tuple[Gap, ...]:

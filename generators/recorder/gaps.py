@@ -13,7 +13,8 @@ __all__ = ["REASONS", "Gap", "missing", "merged"]
 
 OVERFLOW, STALL, UNPLUGGED, TIME_OUT = "overflow", "stall", "unplugged", "time-out"
 SHORT_READ, TORN_FRAME, INTERRUPTED = "short read", "torn frame", "interrupted"
-REASONS = (OVERFLOW, STALL, UNPLUGGED, TIME_OUT, SHORT_READ, TORN_FRAME, INTERRUPTED)
+DISK = "disk"  # received, and not taken by the disk
+REASONS = (OVERFLOW, STALL, UNPLUGGED, TIME_OUT, SHORT_READ, TORN_FRAME, INTERRUPTED, DISK)
 
 
 def missing(camera: str, ticks: NDArray[np.int64], n_ticks: int, reason: str) -> tuple[Gap, ...]:

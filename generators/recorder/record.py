@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,8 +20,9 @@ from spike4dgs.benchmark.manifest import write_manifest
 from spike4dgs.generators.recorder.board_views import open_recording
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
-from spike4dgs.generators.recorder.clip import Clip
+from spike4dgs.generators.recorder.clip import Clip, Sink
 from spike4dgs.generators.recorder.clip_files import ClipRecord, StreamFiles
+from spike4dgs.generators.recorder.layouts import UInt8
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
 from spike4dgs.generators.recorder.profile import RigProfile
 from spike4dgs.generators.recorder.sources import (
@@ -81,15 +83,20 @@ def record(
     with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
         links = _open(profile, source.backend)
         with Watch(profile, live=preview) as watch:
-            sink = files.write if continuous else None
+            sink = _sink(files, stop) if continuous else None
             clip = capture(profile, links, length, on_state=watch.state, on_rate=watch.rates, stop=stop, sink=sink)
         for camera in clip.cameras:  # without frames in continuous mode: the sink has had them
             files.write_ticks(camera.camera, camera.ticks, camera.frames)
+        clip = clip.without(files.flush(clip.n_ticks))
+        failures, direct = files.failures, files.direct
         sync = fit_arrival(clip, profile.fps)
         files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
         if preview:
             _write_preview(out)
     _print(clip, sync, continuous)
+    for failure in failures.values():
+        print(f"error: {failure}; what it held before is kept", file=sys.stderr)
+    print(f"written {'past' if direct else 'through'} the page cache")
     print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
     return 0 if clip.complete else LOST_DATA
 
@@ -130,6 +137,17 @@ def _open(profile: RigProfile, backend: Any | None) -> dict[str, Link]:
             link.close()
         raise
     return links
+
+
+def _sink(files: StreamFiles, stop: threading.Event) -> Sink:
+    """Writes while the capture runs, and ends it when no file takes anything any more."""
+
+    def write(camera: str, first_tick: int, frames: UInt8) -> None:
+        files.write(camera, first_tick, frames)
+        if files.ended:
+            stop.set()
+
+    return write
 
 
 @contextmanager
