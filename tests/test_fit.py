@@ -35,14 +35,7 @@ def fitted(name: str) -> tuple[Model, tuple[float, ...]]:
 
 @cache
 def psnr(name: str, moving: bool) -> float:
-    """Mean over the clip, dB, of the centre camera: everywhere, or on the board and where it could have been."""
-    model, _ = fitted(name)
-    error = []
-    for t in np.linspace(0.1, 0.9, 5):
-        truth, _, board = WORLD.look(WORLD.held_out, t)
-        squared = (model.render(WORLD.held_out, t * WORLD.training.duration_us) - truth) ** 2
-        error.append(squared[board].mean() if moving else squared.mean())
-    return float(-10 * np.log10(error).mean())
+    return WORLD.psnr(fitted(name)[0], moving)
 
 
 @pytest.mark.slow

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -172,18 +172,18 @@ def test_a_killed_run_resumes_and_equals_an_uninterrupted_one(small_scene: Path,
 
 def test_the_fit_time_of_a_resumed_fit_is_the_sum_of_its_parts(tmp_path: Path) -> None:
     path, checkpoint = tmp_path / "clock.json", tmp_path / "checkpoint"
-    first = FitClock(path, checkpoint)
-    assert first.before == 0
-    time.sleep(0.05)
-    checkpoint.write_text("half done")
-    time.sleep(0.2)  # lost with the kill, and done again by the next part
-    second = FitClock(path, checkpoint)
-    assert 0.03 < second.before < 0.15
-    time.sleep(0.05)
-    checkpoint.write_text("nearly done")
-    third = FitClock(path, checkpoint)
-    assert second.before + 0.03 < third.before <= second.seconds() + 0.05
-    assert third.seconds() >= third.before
+
+    def part(seconds: float) -> FitClock:
+        """The clock of the next part, after one that wrote its last checkpoint `seconds` after its start."""
+        checkpoint.write_text("half done")
+        written = json.loads(path.read_text())["started_unix"] + seconds
+        os.utime(checkpoint, (written, written))
+        return FitClock(path, checkpoint)
+
+    assert FitClock(path, checkpoint).before == 0
+    assert part(40.0).before == pytest.approx(40, abs=1e-3), "what came after is lost with the kill, and done again"
+    third = part(30.0)
+    assert third.before == pytest.approx(70, abs=1e-3) and third.seconds() >= third.before
     checkpoint.unlink()
     assert FitClock(path, checkpoint).before == 0, "without a checkpoint everything is done again"
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from toy_world import GAIN, ToyWorld
+from toy_world import GAIN, ToyWorld, run_neurons
 
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.spike_cameras import fire
@@ -16,17 +16,6 @@ from spike4dgs.method.supervision_model import Sample
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
 SETTINGS = TrainSettings()
-
-
-def run_neurons(rate: np.ndarray, charge: np.ndarray, ticks: int) -> np.ndarray:
-    """Spikes of integrate-and-fire neurons with subtractive reset, one tick after the other."""
-    charge, spikes = charge.astype(np.float64).copy(), np.zeros(rate.shape)
-    for _ in range(ticks):
-        charge += rate
-        fired = charge >= 1
-        charge -= fired
-        spikes += fired
-    return spikes
 
 
 @pytest.mark.parametrize("ticks", [1, 7, 40])

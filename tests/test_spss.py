@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy_world import GAIN, RATE_HZ, ToyWorld
+from toy_world import GAIN, RATE_HZ, ToyWorld, run_neurons
 
 from spike4dgs.benchmark.calibration import Recordings
 from spike4dgs.benchmark.scene import TrainingScene
@@ -37,17 +37,6 @@ def make(name: str, scene: TrainingScene = WORLD.training, **changes: float) -> 
 def truth(t: float) -> torch.Tensor:
     cameras = WORLD.training.cameras
     return torch.from_numpy(np.stack([WORLD.look(cameras[v], t)[0] for v in VIEWS])).float()
-
-
-def run_neurons(rate: np.ndarray, charge: np.ndarray, ticks: int) -> np.ndarray:
-    """Mean spikes per tick of integrate-and-fire neurons with subtractive reset, one tick after the other."""
-    charge, spikes = charge.astype(np.float64).copy(), np.zeros(rate.shape)
-    for _ in range(ticks):
-        charge += rate
-        fired = charge >= 1
-        charge -= fired
-        spikes += fired
-    return spikes / ticks
 
 
 def every_pixel(phi: torch.nn.Linear, spike: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -159,7 +148,7 @@ def test_the_whole_loss_is_equations_14_to_18(tick: int) -> None:
     loss = make("spss", ssim_weight=0.0).double()
     found = float(loss(lambda t: rendered, sample(tick, step, picture)).detach())
     charge = random_charge(rendered, step).numpy()
-    spike = run_neurons(GAIN * rendered.numpy(), charge, SETTINGS.neuron_ticks)
+    spike = run_neurons(GAIN * rendered.numpy(), charge, SETTINGS.neuron_ticks) / SETTINGS.neuron_ticks
     (variation,) = (m for m in loss.modules() if isinstance(m, SpikeVariation))
     average, deviation = (m.detach().numpy() for m in every_pixel(variation.phi, torch.from_numpy(spike)))
     window = slice(max(0, tick - 20), min(120, tick + 20))
@@ -173,7 +162,8 @@ def test_the_whole_loss_is_equations_14_to_18(tick: int) -> None:
 def test_the_spike_loss_is_spikenerfs() -> None:
     rendered, step = truth(0.6).double(), 3
     found = float(make("spike").double()(lambda t: rendered, sample(60, step)))
-    rate = run_neurons(GAIN * rendered.numpy(), random_charge(rendered, step).numpy(), SETTINGS.neuron_ticks)
+    charge = random_charge(rendered, step).numpy()
+    rate = run_neurons(GAIN * rendered.numpy(), charge, SETTINGS.neuron_ticks) / SETTINGS.neuron_ticks
     seen = np.stack([WORLD.training.streams[v].window(40, 80) for v in VIEWS]).mean(1)
     errors = (rate + 1 / 256) ** (1 / 2.2) - (seen + 1 / 256) ** (1 / 2.2)
     assert found == pytest.approx(float(np.mean(errors**2)), rel=1e-6)

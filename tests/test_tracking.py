@@ -47,15 +47,7 @@ def shown() -> tuple[Footage, Start]:
     """Exact pictures of the board at `TIMES` times, and noisy points on the surfaces as they are at the middle one."""
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks, TIMES))
     frames = np.array([[WORLD.look(c, t / WORLD.n_ticks)[0] for c in CAMERAS] for t in ticks], np.float32)
-    rng, points, values = np.random.default_rng(0), [], []
-    for camera in CAMERAS[::3]:
-        image, depth, _ = WORLD.look(camera, 0.5)
-        v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
-        points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
-        values.append(image[v, u])
-    cloud = np.concatenate(points)
-    cloud += 0.005 * rng.normal(size=cloud.shape)
-    start = Start(CAMERAS, cloud.astype(np.float32), np.concatenate(values).astype(np.float32))
+    start = Start(CAMERAS, *WORLD.surfaces(CAMERAS[::3], 0.005))
     return Footage(Views.from_cameras(CAMERAS), ticks, torch.from_numpy(frames), WORLD.n_ticks), start
 
 

@@ -36,16 +36,7 @@ def pictures(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarr
 
 def surfaces(scene: TrainingScene, seed: int) -> Start:
     """A stand-in for the initialisation: noisy points on the true surfaces at the middle of the clip."""
-    rng = np.random.default_rng(seed)
-    points, values = [], []
-    for camera in scene.cameras[::2]:
-        image, depth, _ = WORLD.look(camera, 0.5)
-        v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
-        points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
-        values.append(image[v, u])
-    cloud = np.concatenate(points)
-    cloud += 0.01 * rng.normal(size=cloud.shape)
-    return Start(scene.cameras, cloud.astype(np.float32), np.concatenate(values).astype(np.float32))
+    return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
 PARTS = Parts({"short": pictures}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
@@ -62,28 +53,19 @@ def fitted(motion: str) -> FittedModel:
     return method(motion, **extra).fit(WORLD.training, Budget(), "cpu", 0, silent)
 
 
-def psnr(model: FittedModel, moving: bool) -> float:
-    errors = []
-    for t in np.linspace(0.1, 0.9, 5):
-        truth, _, board = WORLD.look(WORLD.held_out, t)
-        error = (model.render(WORLD.held_out, t * WORLD.training.duration_us) - truth) ** 2
-        errors.append(error[board].mean() if moving else error.mean())
-    return float(-10 * np.log10(errors).mean())
-
-
 @pytest.mark.slow
 def test_a_moving_board_is_seen_from_a_new_place():
-    assert psnr(fitted("hexplane"), moving=False) > 25
+    assert WORLD.psnr(fitted("hexplane"), moving=False) > 25
 
 
 @pytest.mark.slow
 def test_spacetime_gaussians_beat_a_static_scene_where_things_move():
-    assert psnr(fitted("spacetime"), moving=True) > psnr(fitted("static"), moving=True) + 2
+    assert WORLD.psnr(fitted("spacetime"), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
 
 
 @pytest.mark.slow
 def test_deformation_beats_a_static_scene_where_things_move():
-    assert psnr(fitted("hexplane"), moving=True) > psnr(fitted("static"), moving=True) + 2
+    assert WORLD.psnr(fitted("hexplane"), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
 
 
 def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", **settings: float) -> Trainer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,10 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.cameras import Camera, look_at
+from spike4dgs.benchmark.recipes import Model
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.benchmark.spikes import SpikeStream, pack
 
 RATE_HZ, GAIN = 20000.0, 0.6
+
+
+def run_neurons(rate: NDArray[np.floating], charge: NDArray[np.floating], ticks: int) -> NDArray[np.float64]:
+    """Spikes of integrate-and-fire neurons with subtractive reset, one tick after the other."""
+    charge, spikes = charge.astype(np.float64), np.zeros(rate.shape)
+    for _ in range(ticks):
+        charge += rate
+        fired = charge >= 1
+        charge -= fired
+        spikes += fired
+    return spikes
 
 
 @dataclass(frozen=True)
@@ -83,6 +96,29 @@ class ToyWorld:
             charge -= fired
             packed.append(pack(fired[None]))
         return SpikeStream(np.concatenate(packed), self.width, self.height, RATE_HZ)
+
+    def surfaces(
+        self, cameras: Sequence[Camera], noise_m: float, seed: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Noisy points [n, 3] on what `cameras` see at the middle of the clip, a point for 2x2 pixels; values [n]."""
+        rng, points, values = np.random.default_rng(seed), [], []
+        for camera in cameras:
+            image, depth, _ = self.look(camera, 0.5)
+            v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
+            points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
+            values.append(image[v, u])
+        cloud = np.concatenate(points)
+        cloud += noise_m * rng.normal(size=cloud.shape)
+        return cloud.astype(np.float32), np.concatenate(values).astype(np.float32)
+
+    def psnr(self, model: Model, moving: bool) -> float:
+        """Mean over the clip, dB, of the centre camera: everywhere, or on the board only."""
+        error = []
+        for t in np.linspace(0.1, 0.9, 5):
+            truth, _, board = self.look(self.held_out, t)
+            squared = (model.render(self.held_out, t * self.training.duration_us) - truth) ** 2
+            error.append(squared[board].mean() if moving else squared.mean())
+        return float(-10 * np.log10(error).mean())
 
     @cached_property
     def held_out(self) -> Camera:
