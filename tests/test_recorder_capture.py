@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -330,25 +328,3 @@ def test_spike_rates_are_counted_in_whole_frames(layout: str) -> None:
     assert spikes_per_tick(shape, block) == 3 / (WIDTH * HEIGHT)
     assert math.isnan(spikes_per_tick(shape, Block(stream[11:30], 11, 19, 0)))
     assert math.isnan(spikes_per_tick(shape, None))
-
-
-def test_the_speed_measurement_counts_what_is_lost_and_wrong(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from spike4dgs.generators.recorder.speed import COLUMNS, Load, record, run
-
-    slow = Load(cameras=2, fps=400, transfer_bytes=16384, transfers=16, memory_bytes=1 << 20)
-    outcome = run(slow, 0.1, queued=True)
-    assert outcome.clip.complete and outcome.unseen_bytes == 0 and outcome.wrong_frames == 0
-    assert outcome.clip.n_ticks == 40 and outcome.seconds > 0.08
-    arguments = "--cameras 1 --fps 400 --seconds 0.05 --transfer-kib 16 --disk-seconds 0.05 --disk"
-    assert record([*arguments.split(), str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
-    lines = list(csv.reader((tmp_path / "t.csv").read_text().splitlines()))
-    assert lines[0] == list(COLUMNS)
-    assert [line[:3] for line in lines[1:]] == [
-        ["memory", "16 queued", "1"],
-        ["memory", "one at a time", "1"],
-        ["disk", "16 queued", "1"],
-    ]
-    assert "to disk, for 0.05 s" in capsys.readouterr().out
-    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
