@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import usb_cases
-from usb_mock import LIBRARIES, PRELOAD
+from usb_testbed import LIBRARIES, PRELOAD
 
 CASES = sorted(name for name in vars(usb_cases) if name.startswith("test_"))
 

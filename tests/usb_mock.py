@@ -14,101 +14,33 @@ import errno
 import struct
 import traceback
 from collections import deque
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from usb_testbed import (
+    CAPABILITIES,
+    CLEAR_HALT,
+    CONTROL,
+    DISCARD,
+    GET_DRIVER,
+    GRANTED,
+    REAP,
+    REAP_NOW,
+    SUBMIT,
+    Handler,
+    Urb,
+    library,
+)
 
 from spike4dgs.generators.recorder.emulated_array import EmulatedArray
 from spike4dgs.generators.recorder.emulated_camera import DUPLICATE, HIGH_SPEED, MISSING, EmulatedCamera
 from spike4dgs.generators.recorder.emulator import interfaces, string_descriptor
 from spike4dgs.generators.recorder.gaps import OVERFLOW, STALL, UNPLUGGED
 
-PRELOAD = "libumockdev-preload.so.0"
-LIBRARIES = (PRELOAD, "libumockdev.so.0", "libgobject-2.0.so.0", "libusb-1.0.so.0")
-
-
-class Urb(c.Structure):
-    """struct usbdevfs_urb of a 64-bit kernel."""
-
-    _fields_ = [
-        ("type", c.c_uint8),
-        ("endpoint", c.c_uint8),
-        ("status", c.c_int),
-        ("flags", c.c_uint),
-        ("buffer", c.c_void_p),
-        ("buffer_length", c.c_int),
-        ("actual_length", c.c_int),
-        ("start_frame", c.c_int),
-        ("number_of_packets", c.c_int),
-        ("error_count", c.c_int),
-        ("signr", c.c_uint),
-        ("usercontext", c.c_void_p),
-    ]
-
-
-class Memory(c.Structure):
-    """struct UMockdevIoctlData (a GObject): a copy of the client's memory at `client_addr`."""
-
-    _fields_ = [
-        ("g_class", c.c_void_p),
-        ("ref_count", c.c_uint),
-        ("qdata", c.c_void_p),
-        ("data", c.c_void_p),
-        ("data_len", c.c_int),
-        ("client_addr", c.c_ulong),
-    ]
-
-
-def _ioctl(number: int, size: int = 0, direction: int = 2) -> int:
-    """A request number of usbfs, as the kernel's _IO, _IOW (1) and _IOR (2) make it."""
-    return (direction << 30 if size else 0) | size << 16 | ord("U") << 8 | number
-
-
-SUBMIT, DISCARD = _ioctl(10, c.sizeof(Urb)), _ioctl(11)
-REAP, REAP_NOW = _ioctl(12, 8, 1), _ioctl(13, 8, 1)
-CAPABILITIES, GET_DRIVER = _ioctl(26, 4), _ioctl(8, 260, 1)
-CLEAR_HALT = _ioctl(21, 4)
-# Claim, release, set configuration, set interface, disconnect and claim, reset the device, reset an endpoint.
-GRANTED = {_ioctl(15, 4), _ioctl(16, 4), _ioctl(5, 4), _ioctl(4, 8), _ioctl(27, 264), _ioctl(20), _ioctl(3, 4)}
-
-CONTROL = 2  # a type of urb
 # Zero packets, bulk continuation, no packet size limit, scatter-gather, reaping after a disconnect.
 _CAPABILITIES = 0x01 | 0x02 | 0x04 | 0x08 | 0x10
 _STATUS = {STALL: -errno.EPIPE, OVERFLOW: -errno.EOVERFLOW, UNPLUGGED: -errno.ESHUTDOWN}
 _ROOT_HUB = "/devices/pci0000:00/0000:00:14.0/usb1"
-_Handler = c.CFUNCTYPE(c.c_int, c.c_void_p, c.c_void_p, c.c_void_p)
-
-_P, _PP = c.c_void_p, c.POINTER(c.c_void_p)
-_FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
-    "testbed_new": (_P, []),
-    "testbed_add_from_string": (c.c_int, [_P, c.c_char_p, _PP]),
-    "testbed_attach_ioctl": (c.c_int, [_P, c.c_char_p, _P, _PP]),
-    "testbed_detach_ioctl": (c.c_int, [_P, c.c_char_p, _PP]),
-    "testbed_uevent": (None, [_P, c.c_char_p, c.c_char_p]),
-    "ioctl_base_new": (_P, []),
-    "ioctl_client_get_request": (c.c_ulong, [_P]),
-    "ioctl_client_get_arg": (c.POINTER(Memory), [_P]),
-    "ioctl_client_complete": (None, [_P, c.c_long, c.c_int]),
-    "ioctl_data_resolve": (c.POINTER(Memory), [_P, c.c_size_t, c.c_size_t, _PP]),
-    "ioctl_data_set_ptr": (c.c_int, [_P, c.c_size_t, _P]),
-}
-
-
-_OF_GOBJECT: dict[str, tuple[Any, list[Any]]] = {
-    "connect": (c.c_ulong, [_P, c.c_char_p, _Handler, _P, _P, c.c_int]),
-    "unref": (None, [_P]),
-}
-
-
-def _library() -> SimpleNamespace:
-    """The functions of libumockdev that are used, by their names without prefix."""
-    umockdev, gobject = c.CDLL("libumockdev.so.0"), c.CDLL("libgobject-2.0.so.0")
-    functions = {name: getattr(umockdev, f"umockdev_{name}") for name in _FUNCTIONS}
-    functions |= {"connect": gobject.g_signal_connect_data, "unref": gobject.g_object_unref}
-    for name, (result, arguments) in {**_FUNCTIONS, **_OF_GOBJECT}.items():
-        functions[name].restype, functions[name].argtypes = result, arguments
-    return SimpleNamespace(**functions)
 
 
 class UsbMock:
@@ -119,7 +51,7 @@ class UsbMock:
         self.devices: list[MockDevice] = []
 
     def __enter__(self) -> UsbMock:
-        self.lib = _library()
+        self.lib = library()
         self.testbed = self.lib.testbed_new()
         hub = struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0300, 9, 0, 3, 9, 0x1D6B, 3, 0x0617, 0, 0, 0, 1)
         hub += struct.pack("<BBHBBBBB", 9, 2, 31, 1, 1, 0, 0xE0, 0) + struct.pack(
@@ -192,7 +124,7 @@ class MockDevice:
                 "speed": "480" if slow else "5000",
             },
         )
-        self._callback = _Handler(self._on_ioctl)  # libumockdev keeps the address, so we keep the object
+        self._callback = Handler(self._on_ioctl)  # libumockdev keeps the address, so we keep the object
         self._handler = mock.lib.ioctl_base_new()
         mock.lib.connect(self._handler, b"handle-ioctl", self._callback, None, None, 0)
         mock.check(mock.lib.testbed_attach_ioctl, self.node.encode(), self._handler)
