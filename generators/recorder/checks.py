@@ -20,7 +20,7 @@ MEMINFO = Path("/proc/meminfo")
 
 SUPER_SPEED = 4  # LIBUSB_SPEED_SUPER; 5 is SuperSpeed+
 _SPEEDS = {1: "Low Speed", 2: "Full Speed", 3: "High Speed (480 Mbit/s)"}
-_SPARE_BYTES = 256 << 20  # for the program itself, and for what else the machine does
+_SPARE_BYTES = 256 << 20  # for the program itself, the buffers of its files, and what else the machine does
 
 
 def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, usb.core.Device]:
