@@ -31,7 +31,9 @@ def slow(spikes, tick):
 
     def window(y, x, half):
         t = np.flatnonzero(spikes[:, y, x])
-        t = t[(t >= tick - half) & (t < tick + half)]
+        near = (t >= tick - half) & (t < tick + half)
+        near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=n))
+        t = t[near]
         return (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else None, t
 
     level = np.full((height, width), len(halves) - 1)
@@ -83,6 +85,15 @@ def test_a_step_of_light_is_not_blurred():
     for tick, truth in ((150, 0.2), (192, 0.2), (208, 0.4), (250, 0.4)):
         assert adaptive_image(stream, tick).mean() == pytest.approx(truth, abs=0.03)
     assert abs(IMAGES["tfp"](stream, [208], 1.0)[0].mean() - 0.4) > 0.05
+
+
+def test_a_dark_stripe_between_bright_ones_is_dark():
+    """No spike falls while it passes: that there is none must count, though a constant rate explains all there are."""
+    rates = np.full((400, 24, 24), 0.5)
+    rates[180:210] = 0.004
+    stream = stream_of(fire(rates, np.random.default_rng(4).random((24, 24))))
+    assert adaptive_image(stream, 195).max() < 0.08
+    np.testing.assert_allclose(adaptive_image(stream, 160), 0.5, atol=0.02)
 
 
 @pytest.mark.parametrize("fired", [[], [7]])

@@ -1,7 +1,8 @@
 """Adaptive windows: every pixel's rate over the longest window in which its light does not change.
 
 Between two of its spikes a pixel gathers a whole number of thresholds of light, whatever the light does. With the
-spikes i ... j in the window of h ticks on either side of tick t, and T = t_j - t_i ticks between them, the rate is
+spikes i ... j in the window of h ticks on either side of tick t, the ones before and after t always among them, and
+T = t_j - t_i ticks between them, the rate is
 
     r_h = (j - i) / T,    and under constant light it lies between (j - i) / (T + 1) and (j - i) / (T - 1),
 
@@ -9,7 +10,8 @@ for both spikes are known to the tick. A count over the same window would leave 
 r_h is 1 / r_h times as precise.
 
 Of windows that grow by half an octave each, a pixel takes the longest before these bounds cease to have a point in
-common: then no constant light explains the spikes. (It is the rule of intersecting confidence intervals, with bounds
+common: then no constant light explains the spikes. The first of them is the interval that t lies in: that no spike fell
+there is what tells a dark stripe between bright ones. (It is the rule of intersecting confidence intervals, with bounds
 that are certain but for shot noise.) A change that one pixel cannot see, a neighbour often can: of 3x3 pixels, all take
 the shortest window. At rest the window is the whole clip; where things move it shrinks to what the motion leaves. At
 the clip's ends windows are cut. A pixel with fewer than two spikes has their number / the clip.
@@ -100,6 +102,13 @@ def adaptive_image(stream: SpikeStream, tick: int) -> Float32:
 
 
 @kernel
+def _around(times: NDArray[np.int32], tick: int) -> tuple[int, int]:
+    """The last spike before `tick` and the first that is not; where there is none, the nearest."""
+    after = np.searchsorted(times, tick)
+    return max(after - 1, 0), min(after, len(times) - 1)
+
+
+@kernel
 def _choose(
     ticks: NDArray[np.int32],
     starts: NDArray[np.int64],
@@ -112,8 +121,7 @@ def _choose(
     """The longest window of each pixel whose bounds, and those of all shorter ones, have a point in common."""
     for p in range(start, stop):
         times = ticks[starts[p] : starts[p + 1]]
-        middle = np.searchsorted(times, tick)
-        i, j = middle, middle - 1  # the first and the last spike of the window
+        i, j = _around(times, tick)  # the first and the last spike of the window
         low, high = -np.inf, np.inf
         level[p] = len(halves) - 1
         for s in range(len(halves)):
@@ -149,7 +157,9 @@ def _estimate(
         if len(times) < 2:
             continue
         for s in range(level[p], len(halves)):
-            i, j = np.searchsorted(times, tick - halves[s]), np.searchsorted(times, tick + halves[s]) - 1
+            i, j = _around(times, tick)
+            i = min(i, np.searchsorted(times, tick - halves[s]))
+            j = max(j, np.searchsorted(times, tick + halves[s]) - 1)
             if j - i >= 1:
                 image[p] = np.float32((j - i) / (times[j] - times[i]))
                 break
