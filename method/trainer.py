@@ -24,7 +24,7 @@ from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
 from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings
-from spike4dgs.method.splat import RenderOutput, Views, render
+from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.backdrop import Backdrop
 from spike4dgs.method.supervision_model import Sample, Supervision
 
@@ -167,7 +167,7 @@ class Trainer:
 
         def draw(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, t) if stage.deforms else self.gaussians.splats()
-            outputs.append(self.backdrop.render(splats, chosen) if self.backdrop else render(splats, views))
+            outputs.append(self.backdrop.render(splats, chosen) if self.backdrop else self._render(splats, views))
             image = outputs[-1].image
             return self.motion.picture(image, views) if stage.deforms else image[..., 0]
 
@@ -181,6 +181,9 @@ class Trainer:
         self.step += 1
         self._refine(stage)
         return loss.detach()
+
+    def _render(self, splats: Splats, views: Views) -> RenderOutput:
+        return render(splats, views)
 
     def _size(self) -> tuple[int, int]:
         return self.footage.views.width, self.footage.views.height
