@@ -83,6 +83,8 @@ class TrainSettings:
     times_rate: float = 1e-3  # [1e-4]
     lives_rate: float = 0.03  # [0.03]
     spins_rate: float = 1e-3  # [1e-4]
+    paths_rate: float = 1.4e-3  # of `paths`, in scene scales a clip
+    paths_rate_last: float = 1.4e-4
     features_rate: float = 5e-3  # [2.5e-3 and 1e-3]
     decoder_rate: float = 1e-3  # [1e-4]
 

@@ -119,6 +119,15 @@ class Paths(SpacetimeLite):
         """All at rest in the middle of the clip, for as long as it lasts."""
         return self.timed(gaussians, torch.full((len(gaussians),), 0.5), self.settings.static_life)
 
+    def rates(self) -> dict[str, Decay]:
+        """Paths must follow what moves while the times open up, and rest in the end."""
+        s, scale = self.settings, self.extent.scale
+        return {**super().rates(), "paths": Decay(s.paths_rate * scale, s.paths_rate_last * scale)}
+
+    def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
+        """Nothing: what things lack is added to them, by densification, for as long as they are seen."""
+        return gaussians
+
     def born(self, edit: Edit, generator: torch.Generator) -> Edit:
         """What densification added keeps its parent's time."""
         return edit

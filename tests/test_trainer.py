@@ -104,6 +104,15 @@ def test_what_never_changes_is_frozen_after_the_static_stage(motion: str) -> Non
     assert all(torch.equal(v, fit.still.tensors()[k]) for k, v in frozen.items())
 
 
+def test_paths_lay_nothing_down_where_the_backdrop_is_not_drawn() -> None:
+    """Guided sampling would take what is frozen for missing."""
+    fit = trainer(24, motion="paths", freeze_still=True)
+    while fit.step < 12:
+        fit.train_step()
+    assert fit.motion.guide(fit.gaussians, fit.footage, seeded(0, 0)) is fit.gaussians
+    assert (fit.gaussians.extra["times"].detach() - 0.5).abs().max() < 0.1
+
+
 class Killed(Exception):
     pass
 
