@@ -224,6 +224,7 @@ def film(
     if settings.flat_field and scene.calibrations:
         for view, camera in enumerate(scene.calibrations):
             pictures[:, view] = camera.radiance(pictures[:, view] * np.float32(scene.radiance_gain))
+            pictures[:, view, ~(camera.gain > 0)] = np.nan  # a dead pixel has seen nothing, which is not black
     views = Views.from_cameras(cameras, device=device)
     return Footage(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
 

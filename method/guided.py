@@ -23,6 +23,7 @@ from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.spacetime_decoder import rays
 from spike4dgs.method.splat import RenderOutput, Views, render
 from spike4dgs.method.splat.ssim import ssim
+from spike4dgs.method.supervision_model import known
 
 VIEWS, TIMES = 2, 5
 PATCH, BAD_PIXELS, BAD_SHARE = 16, 0.6, 0.85
@@ -44,7 +45,7 @@ def guide(
     for _, view, index in sorted(found)[:VIEWS]:
         t = footage.ticks[index] / footage.n_ticks
         out, image = _draw(motion, gaussians, footage, view, t)
-        picture, camera = footage.pictures[index, view], _one(footage.views, view)
+        picture, camera = known(footage.pictures[index, view], image), _one(footage.views, view)
         pixels = bad_pixels(image, picture)
         if len(pixels) >= 2:  # four points at least
             points = along_rays(camera, pixels, out, rng)
@@ -68,7 +69,7 @@ def _draw(motion: Motion, gaussians: Gaussians, footage: Footage, view: int, t: 
 
 def _score(motion: Motion, gaussians: Gaussians, footage: Footage, view: int, index: int) -> float:
     _, image = _draw(motion, gaussians, footage, view, footage.ticks[index] / footage.n_ticks)
-    return float(ssim(image[None], footage.pictures[index, view][None]))
+    return float(ssim(image[None], known(footage.pictures[index, view], image)[None]))
 
 
 def bad_pixels(image: Tensor, picture: Tensor) -> Tensor:

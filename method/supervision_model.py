@@ -38,11 +38,16 @@ class Supervision(nn.Module):
         return {}
 
 
+def known(picture: Tensor, image: Tensor) -> Tensor:
+    """The picture, and the rendered `image` of the same shape, without its gradient, where the picture is no number."""
+    return torch.where(picture.isfinite(), picture, image.detach())
+
+
 def difference(image: Tensor, picture: Tensor, w: float) -> Tensor:
     """(1 - w) mean |image - picture| + w (1 - SSIM) of batches [V, H, W].
 
     A pixel of `picture` that is no number counts as met.
     """
-    picture = torch.where(picture.isfinite(), picture, image.detach())
+    picture = known(picture, image)
     absolute = (image - picture).abs().mean()
     return (1 - w) * absolute + w * (1 - ssim(image, picture)) if w else absolute
