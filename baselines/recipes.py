@@ -1,7 +1,7 @@
 """The recipes of this package: `METHODS` is what the entry point `spike4dgs.methods` names.
 
 The rows of the paper's main tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf. Those of
-its ablations are named IMAGES + INITIALIZATION + 4dgs + SUPERVISION, without `rig` and `pixel`.
+its ablations, and of ours, are named IMAGES + INITIALIZATION + MOTION + SUPERVISION, without `rig` and `pixel`.
 """
 
 from __future__ import annotations
@@ -57,6 +57,23 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
 )
 
+# Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
+# corrected by the cameras' calibration; what does not move is fitted first and becomes a backdrop; what moves follows
+# paths of its own. The rows before it have a part of that each: the calibration alone, then the windows too.
+BEYOND = (
+    Recipe("tfp+rig-flat+stg", "tfp", "rig-flat", "spacetime", "pixel", {"flat_field": True}),
+    Recipe("tfp+rig-flat+4dgs", "tfp", "rig-flat", "hexplane", "pixel", {"flat_field": True}),
+    Recipe("adaptive+rig-flat+4dgs", "adaptive", "rig-flat", "hexplane", "pixel", {"flat_field": True}),
+    Recipe(
+        "spike4dgs-x",
+        "adaptive",
+        "rig-flat",
+        "paths",
+        "pixel",
+        {"flat_field": True, "freeze_still": True, "moving_change": 0.012, "coarse_steps": 600},
+    ),
+)
+
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
 SUPERVISED = tuple(
     Recipe(f"tfp+4dgs+{name}", "tfp", "rig", "hexplane", name) for name in ("spike", "pixel+spike", "spss")
@@ -74,7 +91,7 @@ POSED = (
 )
 
 METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *SUPERVISED)},
+    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *BEYOND, *SUPERVISED)},
     **{recipe.name: PosedRecipe(recipe, PARTS) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

@@ -51,6 +51,8 @@ class TrainSettings:
     min_opacity: float = 0.005  # fainter ones are removed
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
 
+    max_moving_per_pixel: float = 0.4  # the same of those before a backdrop, which is not counted
+
     # Deformation.
     cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
     levels: int = 2  # multires 1, 2

@@ -193,7 +193,7 @@ class Trainer:
         if done % s.refine_every or done > s.refine_until * stage.steps:
             return
         width, height = self._size()
-        limit = round(s.max_per_pixel * width * height) - len(self.still)
+        limit = round((s.max_moving_per_pixel if self.backdrop else s.max_per_pixel) * width * height)
         rng = seeded(self.seed, self.step)
         for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))

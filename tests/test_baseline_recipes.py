@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spike4dgs.baselines.recipes import METHODS, PARTS, POSED, RECIPES, SUPERVISED
+from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS, POSED, RECIPES, SUPERVISED
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.recipes import Budget, Recipe, find_methods, get_method
@@ -27,9 +27,10 @@ FITTED = [
     "dy-spikegs",
     "dy-spikenerf",
     "tfp+4dgs+spss",
+    "spike4dgs-x",
 ]
 # Beside the rows of the paper's main tables.
-EXTRA = ["nearest-view", "tfp+static", *(recipe.name for recipe in (*SUPERVISED, *POSED))]
+EXTRA = ["nearest-view", "tfp+static", *(recipe.name for recipe in (*BEYOND, *SUPERVISED, *POSED))]
 
 
 def quiet(done: int, total: int, note: str = "") -> None:
@@ -47,16 +48,16 @@ def test_every_row_of_the_papers_tables_is_a_method() -> None:
         assert set(published(number).rows) - {"spike4dgs"} == set(METHODS) - set(EXTRA)
 
 
-@pytest.mark.parametrize("recipe", [*RECIPES, *SUPERVISED, *POSED], ids=lambda r: r.name)
+@pytest.mark.parametrize("recipe", [*RECIPES, *BEYOND, *SUPERVISED, *POSED], ids=lambda r: r.name)
 def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
     motions = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane", "static": "static"}
-    if not recipe.name.startswith("dy-"):
+    if not recipe.name.startswith(("dy-", "spike4dgs")):
         images, *middle = recipe.name.split("+")
         at = next(i for i, part in enumerate(middle) if part in motions)
         assert (recipe.images, recipe.motion) == (images, motions[middle[at]])
         assert recipe.initialization == ("+".join(middle[:at]) or "rig")
         assert recipe.supervision == ("+".join(middle[at + 1 :]) or "pixel")
-    assert (recipe.initialization != "rig") == (recipe in POSED)
+    assert (recipe.initialization not in ("rig", "rig-flat")) == (recipe in POSED)
     assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
     assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
 
