@@ -38,8 +38,8 @@ PARTS = Parts(
 )
 _MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
 
-# Spk2ImgNet's pictures take a quarter of a quick fit's 90 s on two cores, at every other time of the other rows; STG has
-# a sixth and 4DGS, the slowest, a quarter fewer steps for it.
+# Spk2ImgNet's pictures take a quarter of a quick fit's 90 s on two cores, at every other time of the other rows; for it
+# STG has a sixth and 4DGS, the slowest, a quarter fewer steps.
 _SPK2IMG: dict[str, dict[str, Any]] = {
     "d3dgs": {},
     "stg": {"time_spacing_ticks": 20, "fine_steps": 950},
