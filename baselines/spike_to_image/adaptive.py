@@ -104,7 +104,7 @@ def adaptive_image(stream: SpikeStream, tick: int) -> Float32:
 @kernel
 def _around(times: NDArray[np.int32], tick: int) -> tuple[int, int]:
     """The last spike before `tick` and the first that is not; where there is none, the nearest."""
-    after = np.searchsorted(times, tick)
+    after = int(np.searchsorted(times, tick))
     return max(after - 1, 0), min(after, len(times) - 1)
 
 
