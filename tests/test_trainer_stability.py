@@ -80,6 +80,7 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 
 @pytest.mark.slow
 def test_three_seeds_agree() -> None:
-    fits = [method("paths").fit(WORLD.training, Budget(), "cpu", seed, silent) for seed in range(3)]
+    """With as many steps as a fit has: after a quarter of them they are 0.3 dB apart."""
+    fits = [method("paths", fine_steps=900).fit(WORLD.training, Budget(), "cpu", seed, silent) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
     assert max(scores) - min(scores) < 0.3
