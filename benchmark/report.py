@@ -142,30 +142,28 @@ def write_scatter(path: Path, records: Sequence[Record]) -> None:
 
     A colour is a method, a marker a scene.
     """
-    from matplotlib import colormaps
-
     figure = _figure((10.5, 4.4))
     markers = dict(
         zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle("osD^vP*X"), strict=False)
     )
-    keys: dict[str, Any] = {}
+    shown: set[str] = set()
     for ax, metric in zip(figure.subplots(1, 2), ("psnr", "psnr_dynamic"), strict=True):
         for i, record in enumerate(records):
-            color = colormaps["tab20"](i % 20)
             for scene, marker in markers.items():
                 cell = record["scenes"].get(scene)
                 if cell and cell["metrics"][metric] is not None and cell["fit_seconds"] is not None:
                     seconds = max(cell["fit_seconds"], 1e-3)  # a logarithm needs more than zero
-                    ax.scatter(seconds, cell["metrics"][metric], color=color, marker=marker, s=60)
-                    keys[record["method"]["name"]] = ax.plot([], [], "o", color=color)[0]
-                    keys[scene] = ax.plot([], [], marker, color="gray")[0]
+                    ax.scatter(seconds, cell["metrics"][metric], color=_color(i), marker=marker, s=60)
+                    shown |= {record["method"]["name"], scene}
         ax.set_xscale("log")
         ax.set_xlabel("fit time, s")
         ax.set_ylabel(f"{METRICS[metric].title}, {METRICS[metric].unit}")
         ax.grid(alpha=0.3)
-    if keys:
-        names = [n for n in (*(r["method"]["name"] for r in records), *markers) if n in keys]
-        figure.legend([keys[n] for n in names], names, loc="outside right upper", fontsize=8)
+    if shown:
+        keys = {r["method"]["name"]: ("o", _color(i)) for i, r in enumerate(records)}
+        keys |= {scene: (marker, "gray") for scene, marker in markers.items()}
+        lines = {n: ax.plot([], [], marker, color=c)[0] for n, (marker, c) in keys.items() if n in shown}
+        figure.legend(lines.values(), lines.keys(), loc="outside right upper", fontsize=8)
     _save(figure, path)
 
 
@@ -180,7 +178,7 @@ def write_views(path: Path, table: Mapping[str, Any]) -> None:
                 cells = {int(s.split("-")[-1]): method["scenes"][k]["values"][metric][kind] for k, s in scenes.items()}
                 known = {n: v for n, v in cells.items() if v is not None}
                 if known:
-                    ax.plot(known.keys(), known.values(), "o-", color=f"C{i % 10}", label=method["method"])
+                    ax.plot(known.keys(), known.values(), "o-", color=_color(i), label=method["method"])
             ax.set_title(f"{METRICS[metric].title}, {'measured' if kind == 'value' else 'published'}", fontsize=9)
             ax.set_xlabel("training views")
             ax.set_visible(bool(ax.lines))
@@ -188,6 +186,13 @@ def write_views(path: Path, table: Mapping[str, Any]) -> None:
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside right upper", fontsize=8)
     _save(figure, path)
+
+
+def _color(i: int) -> Any:
+    """The colour of the i-th method."""
+    from matplotlib import colormaps
+
+    return colormaps["tab20"](i % 20)
 
 
 def _figure(size: tuple[float, float], layout: Literal["constrained", "compressed"] = "constrained") -> Figure:

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
@@ -40,10 +41,19 @@ class Start:
     values: Float32  # [N] gray radiance
 
 
-ImageMaker = Callable[[SpikeStream, Sequence[int], float], Float32]  # stream, ticks, gain -> [n, H, W] radiance
 Initialization = Callable[[TrainingScene, int], Start]  # scene, seed
 MotionMaker = Callable[[Extent, TrainSettings, torch.Generator], Motion]
 SupervisionMaker = Callable[[TrainSettings, TrainingScene], Supervision]
+
+
+class ImageMaker(Protocol):
+    """Pictures from spikes, corrected if the camera's calibration is given; `spike_to_image.images` says more."""
+
+    def __call__(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> Float32:
+        """Linear radiance [n, H, W]; `gain` is spikes per tick of white."""
+        ...
 
 
 class FitSettings(Protocol):
@@ -220,11 +230,10 @@ def film(
 ) -> Footage:
     """Pictures of all training views at the chosen times; see `FitSettings.flat_field`."""
     ticks = choose_ticks(scene.n_ticks, settings)
-    pictures = np.stack([images(stream, ticks, scene.radiance_gain) for stream in scene.streams], axis=1)
-    if settings.flat_field and scene.calibrations:
-        for view, camera in enumerate(scene.calibrations):
-            pictures[:, view] = camera.radiance(pictures[:, view] * np.float32(scene.radiance_gain))
-            pictures[:, view, ~(camera.gain > 0)] = np.nan  # a dead pixel has seen nothing, which is not black
+    known = (settings.flat_field and scene.calibrations) or [None] * len(scene.streams)
+    pictures = np.stack(
+        [images(s, ticks, scene.radiance_gain, camera) for s, camera in zip(scene.streams, known, strict=True)], axis=1
+    )
     views = Views.from_cameras(cameras, device=device)
     return Footage(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
 

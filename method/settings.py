@@ -50,7 +50,6 @@ class TrainSettings:
     split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
     min_opacity: float = 0.005  # fainter ones are removed
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
-
     max_moving_per_pixel: float = 0.4  # the same of those before a backdrop, which is not counted
 
     # Deformation.

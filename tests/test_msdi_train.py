@@ -17,6 +17,7 @@ from spike4dgs.method.msdi import TINY, Estimate, Msdi
 from spike4dgs.method.msdi.curves import Curve
 from spike4dgs.method.msdi.data import Batch, Bursts
 from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
+from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA
 from spike4dgs.method.msdi.train import Training, TrainingSettings, start_from, train_msdi
 from spike4dgs.method.msdi.weights import load_network, read_card
@@ -107,8 +108,11 @@ class Oracle(torch.nn.Module):
         confidence[:, :, 1::2] = 2.0
         self.answer = Estimate(points, confidence, torch.from_numpy(batch.rate))
 
-    def forward(self, spikes: torch.Tensor, intrinsics: torch.Tensor | None) -> Estimate:
+    def forward(self, spikes: torch.Tensor, intrinsics: torch.Tensor | None, sensors: Sensors | None) -> Estimate:
         return self.answer
+
+    def images(self, spikes: torch.Tensor) -> torch.Tensor:
+        return self.answer.images.flatten(0, 1)
 
 
 def test_the_truth_has_no_error(data: Bursts) -> None:

@@ -18,7 +18,7 @@ from spike4dgs.baselines.spike_to_image.spk2img.data import Example, draw, open_
 from spike4dgs.baselines.spike_to_image.spk2img.network import Reconstruction, Spk2ImgNet
 from spike4dgs.baselines.spike_to_image.spk2img.train import Training, TrainingSettings, loss_of, train_spk2img
 from spike4dgs.baselines.spike_to_image.spk2img.weights import Card, load_network, read_card, save_weights
-from spike4dgs.baselines.spike_to_image.spk2img.windows import window
+from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.manifest import write_manifest
 from spike4dgs.benchmark.scene import open_scene

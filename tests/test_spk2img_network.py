@@ -13,7 +13,7 @@ from torch.nn import functional as F  # noqa: N812
 from spike4dgs.baselines.spike_to_image.spk2img.deformable import DeformableConv, deformable_conv
 from spike4dgs.baselines.spike_to_image.spk2img.deformable_cpu import convolve
 from spike4dgs.baselines.spike_to_image.spk2img.network import Extractor, Spk2ImgNet
-from spike4dgs.baselines.spike_to_image.spk2img.windows import mirrored
+from spike4dgs.baselines.spike_to_image.windows import mirrored
 
 
 def slow_deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, bias: Tensor) -> np.ndarray:

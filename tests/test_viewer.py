@@ -136,6 +136,11 @@ def difference(page: Page, picture: UInt8) -> float:
     return float(np.abs(shot[:, free] - wanted[:, free]).mean())
 
 
+def shows(page: Page, picture: UInt8, other: UInt8) -> bool:
+    """Whether the page shows the one picture and not the other: it comes in a quality of its own, and coarser first."""
+    return difference(page, picture) < difference(page, other) / 2
+
+
 @pytest.mark.slow
 def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp_path: Path) -> None:
     with browser(tmp_path) as page:
@@ -148,12 +153,11 @@ def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp
         free = free_camera(camera.R.T, camera.center, fov, WIDTH / HEIGHT, 4 * camera.width * camera.height)
         first, last = (viewer.stage.picture("rendered", free, t) for t in (0.0, viewer.time.max))
         assert np.abs(first.astype(float) - last).mean() > 4, "a test of nothing"
-        wait_for("picture at the start", lambda: difference(page, first) < 2)
-        assert difference(page, last) > 3
+        wait_for("picture at the start", lambda: shows(page, first, last))
         page.value("document.querySelector('[role=slider]').focus()")
         page.press("End")
-        wait_for("picture at the end", lambda: difference(page, last) < 2)
-        assert viewer.time.value == viewer.time.max and difference(page, first) > 3
+        wait_for("picture at the end", lambda: shows(page, last, first))
+        assert viewer.time.value == viewer.time.max
         assert "frames/s" in viewer.speed.value
 
         # Spikes are shown where a camera stood: the nearest one is chosen, and the picture keeps its shape.
@@ -162,4 +166,4 @@ def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp
         rate = padded(viewer.stage.picture("spike rate", camera, viewer.time.max), WIDTH / HEIGHT)
         wait_for("spike rate", lambda: difference(page, rate) < 4)
         viewer.camera.value = FREE
-        wait_for("rendered again", lambda: viewer.mode.value == "rendered" and difference(page, last) < 3)
+        wait_for("rendered again", lambda: viewer.mode.value == "rendered" and shows(page, last, first))

@@ -156,10 +156,10 @@ def _estimate(
         image[p] = np.float32(len(times) / n_ticks)
         if len(times) < 2:
             continue
+        before, after = _around(times, tick)
         for s in range(level[p], len(halves)):
-            i, j = _around(times, tick)
-            i = min(i, np.searchsorted(times, tick - halves[s]))
-            j = max(j, np.searchsorted(times, tick + halves[s]) - 1)
+            i = min(before, np.searchsorted(times, tick - halves[s]))
+            j = max(after, np.searchsorted(times, tick + halves[s]) - 1)
             if j - i >= 1:
                 image[p] = np.float32((j - i) / (times[j] - times[i]))
                 break

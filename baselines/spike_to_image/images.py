@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes import SpikeStream
 
@@ -26,7 +27,9 @@ class Learned:
 class ImageMaker:
     """A named way from spikes to pictures. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
 
-    `learned` tells of the weights in use; None where nothing is learned or no weights are there.
+    A pixel's own rate can be corrected by its calibration afterwards. What looks at neighbours is better told before:
+    `corrected` gives the rate that an ideal camera's pixels would have. `learned` tells of the weights in use; None
+    where nothing is learned or no weights are there.
 
     >>> IMAGES["tfp"](stream, ticks=[100, 200], gain=0.6).shape  # doctest: +SKIP
     (2, 250, 400)
@@ -37,16 +40,24 @@ class ImageMaker:
     source: str
     rate: Callable[[SpikeStream, int], Float32]
     learned: Callable[[], Learned | None] = lambda: None
+    corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
 
-    def __call__(self, stream: SpikeStream, ticks: Sequence[int], gain: float) -> Float32:
+    def __call__(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> Float32:
         """Linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`; `gain`: spikes per tick of white.
 
-        Raises UserError for a tick outside the clip.
+        `camera` corrects the pictures for what its pixels do to light; a dead pixel has seen nothing, which is not
+        black but NaN. Raises UserError for a tick outside the clip.
         """
         images = np.empty((len(ticks), stream.height, stream.width), np.float32)
         for image, tick in zip(images, ticks, strict=True):
             if not 0 <= tick < stream.n_ticks:
                 raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
-            image[:] = self.rate(stream, tick)
-        images /= gain
-        return images
+            image[:] = self.corrected(stream, tick, camera) if self.corrected and camera else self.rate(stream, tick)
+        if camera is None:
+            images /= gain
+            return images
+        found = images / np.float32(camera.radiance_gain) if self.corrected else camera.radiance(images)
+        found[:, ~(camera.gain > 0)] = np.nan
+        return found

@@ -14,6 +14,7 @@ class MsdiConfig:
     extractor_widths: tuple[int, ...]  # of each level, the first at full size, each next at half; one: a single layer
     generator_widths: tuple[int, int]  # of the first two of BCONV's three layers
     generator_sees_pixel: bool  # BCONV also gets the spikes of its own pixel, to which the features are blind
+    rate_windows: tuple[int, ...]  # ticks on either side, of the rates that it gets with them
     embed_channels: int  # what the patch embedding sees, mixed from the extractor's features
     patch: int  # px, 16 or 8
     encoder_layers: int
@@ -24,6 +25,13 @@ class MsdiConfig:
     fusion_heads: int
     head_widths: tuple[int, int, int, int]  # of the head's four levels, finest first
     head_features: int
+
+    @property
+    def own_channels(self) -> int:
+        """Of what BCONV gets of its own pixel: the spikes, and `inputs.own_rates`."""
+        if not self.generator_sees_pixel:
+            return 0
+        return self.ticks + (2 * len(self.rate_windows) + 1 if self.rate_windows else 0)
 
     @property
     def features(self) -> int:
@@ -46,6 +54,7 @@ PAPER = MsdiConfig(
     extractor_widths=(96,),
     generator_widths=(384, 96),
     generator_sees_pixel=False,
+    rate_windows=(),
     embed_channels=3,
     patch=16,
     encoder_layers=24,
@@ -67,6 +76,7 @@ SMALL = MsdiConfig(
     extractor_widths=(16, 32, 64),
     generator_widths=(64, 32),
     generator_sees_pixel=True,
+    rate_windows=(2, 4, 7, 11, 15, 20),
     embed_channels=16,
     patch=8,
     encoder_layers=6,
@@ -85,6 +95,7 @@ TINY = MsdiConfig(  # for tests
     extractor_widths=(4, 6),
     generator_widths=(8, 6),
     generator_sees_pixel=True,
+    rate_windows=(2, 4),
     embed_channels=4,
     patch=16,
     encoder_layers=2,

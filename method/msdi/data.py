@@ -30,6 +30,8 @@ class Batch:
     rate: Float32  # [B, V, H, W] truth: spikes per tick at the start of the middle tick, at most the 1 that can be told
     points: Float32  # [B, V, H, W, 3] what the pixel's centre sees, in view 0's frame, metres; NaN where it is nothing
     moving: NDArray[np.bool_]  # [B, V, H, W] where something moves, or its shadow, or near it
+    sensitivity: Float32  # [B, V, H, W] of the pixels, mean 1: n(x, y)
+    dark: Float32  # [B, V, H, W] spikes per tick in the dark
     intrinsics: Float32  # [B, V, 3, 3]
     w2c: Float64  # [B, V, 4, 4] from view 0's frame to the view's
     gain: float  # spikes per tick of white
@@ -93,6 +95,8 @@ class Bursts:
             rate=np.clip(rates[len(rates) // 2], 0, 1),
             points=points_of(burst.depth, burst.K, relative),
             moving=burst.moving,
+            sensitivity=np.ascontiguousarray(burst.gain),
+            dark=np.ascontiguousarray(burst.dark),
             intrinsics=burst.K.astype(np.float32),
             w2c=relative,
             gain=self.gain,
@@ -145,5 +149,5 @@ def points_of(depth: Float32, K: Float64, w2c: Float64) -> Float32:
 
 
 def _stacked(samples: Sequence[Batch]) -> Batch:
-    names = ("spikes", "rate", "points", "moving", "intrinsics", "w2c")
+    names = ("spikes", "rate", "points", "moving", "sensitivity", "dark", "intrinsics", "w2c")
     return Batch(**{name: np.stack([getattr(s, name) for s in samples]) for name in names}, gain=samples[0].gain)

@@ -2,7 +2,8 @@
 
 Names and units of `Scores.measured`:
 
-- `psnr_db`, `psnr_dynamic_db`: of the pictures, mean over views; `tfp_...`: of the mean of the same window's spikes.
+- `psnr_db`, `psnr_dynamic_db`: of the pictures, mean over views; `raw_...`: of those without knowledge of the sensors;
+  `tfp_...`: of the mean of the same window's spikes, as they are; `tfp_flat_...`: corrected for the sensors.
 - `point_error`, `point_error_median`: |X / z - Xgt / zgt| of all pixels that see something, z the mean distance of a
   sample's points; so 0.1 is a tenth of the scene's size. `point_error_confident`: of the half that is most certain.
 - `confidence_rank`: Spearman's correlation of the expected error, alpha / C, with the true one; 1 is a perfect order.
@@ -28,6 +29,7 @@ from spike4dgs.benchmark.image_pair import ImagePair
 from spike4dgs.benchmark.metrics import METRICS
 from spike4dgs.benchmark.poses import angle_deg
 from spike4dgs.method.msdi.data import Batch
+from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA, normalized
 from spike4dgs.method.msdi.network import Estimate, Msdi
 from spike4dgs.method.msdi.pose import poses_of
@@ -47,15 +49,18 @@ class Scores:
 
 
 def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
-    """Scores of the network on batches; intrinsics are known."""
+    """Scores of the network on batches; intrinsics and sensors are known."""
     was_training = network.training
     network.eval()
     pictures, points, poses = [], [], []
     with torch.inference_mode():
         for batch in batches:
-            intrinsics = torch.from_numpy(batch.intrinsics)
-            found = network(torch.from_numpy(batch.spikes).to(device), intrinsics.to(device))
-            pictures += _pictures(found.images, batch)
+            spikes, intrinsics, sensitivity, dark = (
+                torch.from_numpy(a).to(device) for a in (batch.spikes, batch.intrinsics, batch.sensitivity, batch.dark)
+            )
+            found = network(spikes, intrinsics, Sensors(sensitivity, dark))
+            raw = network.images(spikes.flatten(0, 1)).unflatten(0, spikes.shape[:2])
+            pictures += _pictures(found.images, raw, batch)
             points.append(_point_errors(found, batch))
             poses += _pose_errors(found, batch)
     network.train(was_training)
@@ -90,9 +95,11 @@ def tfp(spikes: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(spikes[..., :-1, :, :].mean(axis=-3), np.float32)
 
 
-def _pictures(images: Tensor, batch: Batch) -> list[dict[str, float]]:
+def _pictures(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float]]:
     """Scores of each view."""
-    made = {"": images.cpu().numpy(), "tfp_": tfp(batch.spikes)}
+    mean = tfp(batch.spikes)
+    flat = (mean - batch.dark) / batch.sensitivity
+    made = {"": images.cpu().numpy(), "raw_": raw.cpu().numpy(), "tfp_": mean, "tfp_flat_": flat}
     found = []
     for b, v in np.ndindex(batch.rate.shape[:2]):
         row = {}

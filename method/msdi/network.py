@@ -5,7 +5,8 @@ Spikes of V cameras go through one extractor (eqs. 6, 7). From its features, BCO
 gives the point that each pixel sees, in the frame of view 0, with a confidence (eq. 11). Poses follow from the points,
 by `pose.solve_poses`. Encoder, fusion and head are those of DUSt3R and Fast3R; `checkpoints` loads their weights.
 
-Known intrinsics enter as the direction of each pixel's ray, embedded beside the features. The sides of the streams are
+Known intrinsics enter as the direction of each pixel's ray, embedded beside the features. Known sensors enter as
+spikes of an ideal one (`inputs`), before anything looks at neighbours. The sides of the streams are
 padded to whole patches with zeros, and what comes out is cut back; nothing is cropped or resized.
 """
 
@@ -22,6 +23,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.msdi.config import MsdiConfig
 from spike4dgs.method.msdi.dpt import Dpt, unpack, widened
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
+from spike4dgs.method.msdi.inputs import Sensors, network_inputs
 from spike4dgs.method.msdi.transformer import NORM_EPS, Block, grid, initialize
 
 VIEW_IDS = 1000  # numbers that views may have, as in Fast3R; view 0 has number 0
@@ -141,26 +143,25 @@ class Msdi(nn.Module):
     def __init__(self, config: MsdiConfig) -> None:
         super().__init__()
         self.config = c = config
-        own_ticks = c.ticks if c.generator_sees_pixel else 0
         self.extractor = SpikeExtractor(c.ticks, c.extractor_widths)
-        self.generator = ImageGenerator(c.features, c.generator_widths, own_ticks)
+        self.generator = ImageGenerator(c.features, c.generator_widths, c.own_channels)
         self.encoder = Encoder(c)
         self.fusion = FusionTransformer(c)
         self.head = Dpt((c.encoder_width, *[c.fusion_width] * 3), c.head_widths, c.head_features, c.patch)
         with torch.no_grad():  # points start before the camera
             self.head.head["4"].bias.copy_(torch.tensor([0.0, 0.0, 1.0, 0.0]))  # type: ignore[operator, union-attr]
 
-    def forward(self, spikes: Tensor, intrinsics: Tensor | None = None) -> Estimate:
+    def forward(self, spikes: Tensor, intrinsics: Tensor | None = None, sensors: Sensors | None = None) -> Estimate:
         """Points, confidence and images of `spikes` [B, V, T, H, W] of 0 and 1; see `Estimate`.
 
-        `intrinsics` [B, V, 3, 3] in pixels, pixel centres at +0.5, or None where they are unknown. Raises UserError
-        for spikes or intrinsics of another shape.
+        `intrinsics` [B, V, 3, 3] in pixels, pixel centres at +0.5, and `sensors` [B, V, H, W] are None where they
+        are unknown. Raises UserError for spikes, intrinsics or sensors of another shape.
         """
         _check_shapes(spikes.shape, None if intrinsics is None else intrinsics.shape, self.config.ticks)
         batch, views, _, height, width = spikes.shape
         around = margins(height, width, self.config.patch)
-        padded = around.pad(_clean(spikes.flatten(0, 1)))
-        features = self.extractor(padded)
+        padded = around.pad(self._seen(spikes.flatten(0, 1), sensors))
+        features = self.extractor(padded[:, : self.config.ticks])
         images = around.cut(self.generator(features, padded))
         rays = around.pad(ray_map(intrinsics, batch * views, height, width, padded))
         tokens = self.encoder(features, rays)
@@ -174,12 +175,22 @@ class Msdi(nn.Module):
             images=widened(images).unflatten(0, split),
         )
 
-    def images(self, spikes: Tensor) -> Tensor:
-        """The pictures alone, of `spikes` [N, T, H, W]: spikes per tick [N, H, W]; raises as `forward`."""
+    def images(self, spikes: Tensor, sensors: Sensors | None = None) -> Tensor:
+        """The pictures alone, of `spikes` [N, T, H, W], `sensors` [N, H, W]: spikes per tick [N, H, W]; raises as
+        `forward`."""
         _check_shapes((1, *spikes.shape), None, self.config.ticks)
         around = margins(spikes.shape[2], spikes.shape[3], self.config.patch)
-        padded = around.pad(_clean(spikes))
-        return widened(around.cut(self.generator(self.extractor(padded), padded)))
+        padded = around.pad(self._seen(spikes, sensors))
+        return widened(around.cut(self.generator(self.extractor(padded[:, : self.config.ticks]), padded)))
+
+    def _seen(self, spikes: Tensor, sensors: Sensors | None) -> Tensor:
+        """What the networks see [N, T and rates, H, W]."""
+        n, _, height, width = spikes.shape
+        flat = None if sensors is None else sensors.flat()
+        if flat and {flat.sensitivity.shape, flat.dark.shape} != {(n, height, width)}:
+            found = f"{list(flat.sensitivity.shape)} and {list(flat.dark.shape)}"
+            raise problem("MSDI", f"sensors {[n, height, width]}", found, "give one pair of maps for each view")
+        return network_inputs(_clean(spikes), flat, self.config.rate_windows)
 
 
 def _check_shapes(spikes: Sequence[int], intrinsics: Sequence[int] | None, ticks: int) -> None:

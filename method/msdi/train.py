@@ -28,6 +28,7 @@ from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
 from spike4dgs.method.msdi.curves import Curve, plot_calibration, plot_curves
 from spike4dgs.method.msdi.data import Batch, Bursts, check_ticks
 from spike4dgs.method.msdi.evaluate import Scores, evaluate
+from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.report import model_card
@@ -53,6 +54,7 @@ class TrainingSettings:
     warm_up: int = 500  # steps
     image_weight: float = 4.0  # the points' gradient is multiplied by the confidence, which becomes several
     unknown_share: float = 0.2  # of the steps do not tell the intrinsics
+    raw_share: float = 0.2  # of the steps do not tell the sensors
     score_every: int = 1000  # steps
 
     @property
@@ -92,17 +94,18 @@ class Training:
     def train_step(self) -> StepLosses:
         """One step."""
         batch = self._take(self.step)
-        spikes, rate, points, intrinsics = (
+        spikes, rate, points, intrinsics, sensitivity, dark = (
             torch.from_numpy(a).to(self.device, non_blocking=True)
-            for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics)
+            for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics, batch.sensitivity, batch.dark)
         )
         set_rate(self.adam, self.settings.schedule.at(self.step))
         draws = np.random.default_rng([self.seed, self.step, 1])
         known = draws.random() >= self.settings.unknown_share
+        sensors = Sensors(sensitivity, dark) if draws.random() >= self.settings.raw_share else None
         kind = device_type(self.device)
         with torch.random.fork_rng(devices=[]), torch.autocast(kind, torch.bfloat16, enabled=kind == "cuda"):
             torch.manual_seed(int(draws.integers(1 << 62)))  # the numbers of the views
-            found = self.network(spikes, intrinsics if known else None)
+            found = self.network(spikes, intrinsics if known else None, sensors)
         image_l1 = image_loss(found.images, rate) / batch.gain
         of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
         total = self.settings.image_weight * image_l1 + of_points

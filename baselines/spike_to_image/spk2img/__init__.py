@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, Learned
 from spike4dgs.baselines.spike_to_image.spk2img.weights import load_network, read_card, weights_path
-from spike4dgs.baselines.spike_to_image.spk2img.windows import WINDOW, window
+from spike4dgs.baselines.spike_to_image.windows import WINDOW, window
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.spikes import SpikeStream

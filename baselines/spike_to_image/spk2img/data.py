@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.spk2img.windows import HALF_WINDOW, WINDOW, window
+from spike4dgs.baselines.spike_to_image.windows import HALF_WINDOW, WINDOW, window
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes import SpikeStream

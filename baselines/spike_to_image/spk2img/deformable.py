@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from spike4dgs.baselines.spike_to_image.spk2img import deformable_cpu
-
-TAPS = 9
+from spike4dgs.baselines.spike_to_image.spk2img.deformable_cpu import TAPS
 
 
 def deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

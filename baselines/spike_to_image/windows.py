@@ -1,4 +1,4 @@
-"""The 41 ticks that Spk2ImgNet looks at."""
+"""The 41 ticks that the networks look at."""
 
 from __future__ import annotations
 
