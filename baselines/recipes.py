@@ -1,7 +1,8 @@
 """The recipes of this package: `METHODS` is what the entry point `spike4dgs.methods` names.
 
 The rows of the paper's main tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf. Those of
-its ablations, and of ours, are named IMAGES + INITIALIZATION + MOTION + SUPERVISION, without `rig` and `pixel`.
+its ablations, and of ours, are named IMAGES + INITIALIZATION + MOTION + SUPERVISION, without `rig` and `pixel`, and
+with one `msdi` for pictures and points.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 
 from spike4dgs.baselines.colmap import colmap, colmap_uncalibrated
 from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
+from spike4dgs.baselines.msdi import msdi, msdi_uncalibrated
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.rig import rig, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
@@ -31,6 +33,8 @@ PARTS = Parts(
         "colmap-uncalibrated": colmap_uncalibrated,
         "dust3r": dust3r,
         "dust3r-uncalibrated": dust3r_uncalibrated,
+        "msdi": msdi,
+        "msdi-uncalibrated": msdi_uncalibrated,
     },
     motion=MOTIONS,
     supervision=SUPERVISIONS,
@@ -55,6 +59,15 @@ RECIPES = (
     Recipe("dy-spikenerf", "tfp", "rig", "radiance-field", "spike"),
     # The floor gets as many steps as the deforming recipes have in all, so that only motion makes the difference.
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
+)
+
+# The reference method, and with less of it. MSDI's pictures cost as much as Spk2ImgNet's.
+_MSDI: dict[str, Any] = {"flat_field": True, "time_spacing_ticks": 20, "coarse_steps": 250, "fine_steps": 900}
+SPIKE4DGS = (
+    Recipe("spike4dgs", "msdi", "msdi", "hexplane", "spss", _MSDI),
+    Recipe("msdi+4dgs", "msdi", "msdi", "hexplane", "pixel", _MSDI),
+    Recipe("msdi+4dgs+spike", "msdi", "msdi", "hexplane", "spike", _MSDI),
+    Recipe("msdi+4dgs+pixel+spike", "msdi", "msdi", "hexplane", "pixel+spike", _MSDI),
 )
 
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
@@ -83,7 +96,10 @@ SUPERVISED = tuple(
 POSED = (
     Recipe("tfp+colmap+4dgs", "tfp", "colmap", "hexplane", "pixel"),
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
-    # Tables 3 and 7, as far as they do without MSDI.
+    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-uncalibrated", "hexplane", "spss", _MSDI),
+    # Tables 3 and 7.
+    Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI),
+    Recipe("msdi+dust3r+4dgs", "msdi", "dust3r", "hexplane", "pixel", _MSDI),
     Recipe("tfi+colmap+4dgs", "tfi", "colmap", "hexplane", "pixel"),
     Recipe("tfi+dust3r+4dgs", "tfi", "dust3r", "hexplane", "pixel"),
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
@@ -91,7 +107,7 @@ POSED = (
 )
 
 METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *BEYOND, *SUPERVISED)},
+    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)},
     **{recipe.name: PosedRecipe(recipe, PARTS) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

@@ -64,8 +64,8 @@ def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
         clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
-    points, values = _thin(scene.cameras, points, values)
-    points, values = _fill(scene.cameras, mean, points, values)
+    points, values = thin(scene.cameras, points, values)
+    points, values = fill(scene.cameras, mean, points, values)
     return Start(scene.cameras, points.astype(np.float32), values.astype(np.float32))
 
 
@@ -122,7 +122,7 @@ def middle_camera(cameras: Sequence[Camera]) -> Camera:
     return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
 
 
-def _thin(
+def thin(
     cameras: Sequence[Camera], points: NDArray[np.float64], values: Float32
 ) -> tuple[NDArray[np.float64], Float32]:
     """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
@@ -141,7 +141,7 @@ def _thin(
     return merged[believed], mean(values[keep])[believed].astype(np.float32)
 
 
-def _fill(
+def fill(
     cameras: Sequence[Camera], mean: Float32, points: NDArray[np.float64], values: Float32
 ) -> tuple[NDArray[np.float64], Float32]:
     """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.

@@ -34,7 +34,7 @@ def test_published_numbers_are_the_papers() -> None:
     outdoor, objects = published(1), published(2)
     assert outdoor.worlds == ("jaywalk", "bicycle", "motor", "car", "van")
     assert objects.worlds == ("bricks", "chips", "turntable", "bird")
-    assert len(outdoor.rows) == len(objects.rows) == 12 and set(outdoor.rows) == set(objects.rows)
+    assert len(outdoor.rows) == len(objects.rows) == 13 and set(outdoor.rows) == set(objects.rows)
     # A corner, the middle and the end of each table, read from the print.
     assert outdoor.rows["tfi+d3dgs"]["jaywalk"] == (20.65, 0.757, 0.384)
     assert outdoor.rows["spk2img+stg"]["motor"] == (24.70, 0.847, 0.223)
@@ -46,7 +46,7 @@ def test_published_numbers_are_the_papers() -> None:
     assert outdoor.mean("spike4dgs", "psnr") == pytest.approx((28.29 + 27.69 + 27.92 + 27.74 + 27.13) / 5)
     assert outdoor.value("nearest-view", "car", "psnr") is None and outdoor.mean("nearest-view", "psnr") is None
     for table in (outdoor, objects):
-        assert all(set(r) == set(table.worlds) for r in table.rows.values())
+        assert all(set(r) == set(table.worlds) for name, r in table.rows.items() if name != "spike4dgs-x")
         assert all(0 < v[1] < 1 for r in outdoor.rows.values() for v in r.values()), "SSIM as a fraction"
 
 

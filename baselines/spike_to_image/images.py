@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.calibration import Calibration
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.spikes import SpikeStream
 
 Float32 = NDArray[np.float32]
@@ -21,6 +24,15 @@ class Learned:
 
     sha256: str  # of the weight file
     trained_on: tuple[str, ...]  # data sets, such as scenes as ID@REVISION
+
+
+def learned_from(find: Callable[[], Path], read_card: Callable[[Path], Any]) -> Learned | None:
+    """What the weights in use have seen; None where they are missing or damaged, which a fit will say."""
+    try:
+        path = find()
+        return Learned(sha256_file(path), read_card(path).trained_on)
+    except UserError:
+        return None
 
 
 @dataclass(frozen=True)

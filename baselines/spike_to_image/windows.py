@@ -1,4 +1,4 @@
-"""The 41 ticks that the networks look at."""
+"""The ticks that networks look at."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.spikes import SpikeStream
 
-WINDOW = 41  # ticks
+WINDOW = 41  # ticks, of Spk2ImgNet
 HALF_WINDOW = WINDOW // 2
 
 
@@ -19,12 +19,13 @@ def mirrored(indices: NDArray[np.integer[Any]], n: int) -> NDArray[np.int64]:
     return np.minimum(folded, 2 * n - 1 - folded)
 
 
-def window(stream: SpikeStream, tick: int) -> NDArray[np.uint8]:
-    """Spikes of ticks [tick - 20, tick + 20] as [41, H, W] uint8 of 0 and 1.
+def window(stream: SpikeStream, tick: int, length: int = WINDOW) -> NDArray[np.uint8]:
+    """Spikes of the `length` ticks, an odd number, around `tick` as [length, H, W] uint8 of 0 and 1.
 
     Beyond the clip's ends the clip is mirrored in time: the picture is then still that of `tick`, as it would not be
     if the window moved, and pixels keep their rates, as they would not if the last tick were repeated.
     """
-    ticks = mirrored(np.arange(tick - HALF_WINDOW, tick + HALF_WINDOW + 1), stream.n_ticks)
+    half = length // 2
+    ticks = mirrored(np.arange(tick - half, tick + half + 1), stream.n_ticks)
     first = int(ticks.min())
     return stream.window(first, int(ticks.max()) + 1)[ticks - first]

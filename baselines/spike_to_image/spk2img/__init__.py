@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, Learned
+from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.spk2img.weights import load_network, read_card, weights_path
 from spike4dgs.baselines.spike_to_image.windows import WINDOW, window
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.spikes import SpikeStream
 
 if TYPE_CHECKING:
@@ -38,20 +37,11 @@ def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
     return rate
 
 
-def spk2img_weights() -> Learned | None:
-    """The weights in use; None where they are missing or damaged, which a fit will say."""
-    try:
-        path = weights_path()
-        return Learned(sha256_file(path), read_card(path).trained_on)
-    except UserError:
-        return None
-
-
 SPK2IMG = ImageMaker(
     name="spk2img",
     definition=f"Spk2ImgNet on the {WINDOW} ticks around tick t",
     source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike stream, "
     "CVPR 2021",
     rate=spk2img_image,
-    learned=spk2img_weights,
+    learned=partial(learned_from, weights_path, read_card),
 )

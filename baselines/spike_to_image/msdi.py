@@ -1,0 +1,53 @@
+"""MSDI's pictures (eq. 12): what its image generator makes of the ticks around an instant, view by view."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
+from spike4dgs.baselines.spike_to_image.windows import window
+from spike4dgs.benchmark.calibration import Calibration
+from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.method.msdi.weights import load_network, read_card, weights_path
+
+if TYPE_CHECKING:
+    from spike4dgs.method.msdi.network import Msdi
+
+
+def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
+    """Spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
+
+    With a calibration: those of an ideal camera. Beyond the clip's ends the clip is mirrored. Raises UserError where
+    the weights are missing or damaged.
+    """
+    import torch  # imported where it is used: reading spikes must not wait for it
+
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return reconstruct(load_network(weights_path(), device), stream, tick, camera)
+
+
+def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
+    """What `network` takes the rate to be at the start of `tick`: spikes per tick [H, W] float32, not negative."""
+    import torch
+
+    from spike4dgs.method.msdi.inputs import Sensors
+
+    device = next(network.parameters()).device
+    sensors = None
+    if camera:
+        sensors = Sensors(*(torch.from_numpy(a).to(device)[None] for a in (camera.gain, camera.dark)))
+    with torch.inference_mode():
+        spikes = torch.from_numpy(window(stream, tick, network.config.ticks)).to(device)[None]
+        rate: Float32 = network.images(spikes, sensors)[0].clamp(min=0).cpu().numpy()
+    return rate
+
+
+MSDI = ImageMaker(
+    name="msdi",
+    definition="MSDI's image generator on the 41 ticks around tick t",
+    source="Spike4DGS, eq. 12",
+    rate=msdi_image,
+    learned=partial(learned_from, weights_path, read_card),
+    corrected=msdi_image,
+)

@@ -1,0 +1,148 @@
+"""The initialisations by MSDI: from what a perfect network would say of the toy world, and from random weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import GAIN, ToyWorld
+
+from spike4dgs.baselines.msdi import Glance, at_rig, block_means, look, msdi, rig_scale, shrunk, unposed
+from spike4dgs.baselines.spike_to_image import IMAGES
+from spike4dgs.benchmark.calibration import Calibration
+from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.poses import angle_deg
+from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.method.fit import Start
+from spike4dgs.method.msdi.config import TINY
+from spike4dgs.method.msdi.data import points_of
+from spike4dgs.method.msdi.network import Msdi
+from spike4dgs.method.msdi.weights import VARIABLE, Card, save_weights
+
+WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
+SCENE = WORLD.training
+SCALE = 3.7  # metres to a unit of the perfect network
+OFF = slice(10, 16)  # rows of which the perfect network says that it is not sure
+
+
+@pytest.fixture(scope="module")
+def perfect() -> Glance:
+    """The truth at half the size and another scale; some rows are far off, and known to be."""
+    cameras = tuple(shrunk(c, 2) for c in SCENE.cameras)
+    looks = [WORLD.look(c, 0.5) for c in cameras]
+    relative = np.stack([c.w2c @ np.linalg.inv(cameras[0].w2c) for c in cameras])
+    depth = np.array([x[1] for x in looks], np.float32)
+    points = points_of(depth, np.stack([c.K for c in cameras]), relative).astype(np.float64) / SCALE
+    confidence = np.full(depth.shape, 9.0)
+    points[:, OFF] *= 5
+    confidence[:, OFF] = 1.1
+    return Glance(2, cameras, np.array([x[0] for x in looks], np.float32), points, confidence)
+
+
+def depth_errors(start: Start, camera: Camera) -> np.ndarray:
+    """Relative errors of the depths of the points that a camera sees, beside the board's edges."""
+    _, truth, board = WORLD.look(camera, 0.5)
+    uv, z = camera.project(start.points.astype(np.float64))
+    u, v = np.floor(uv).astype(int).T
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    inside &= ~near_edge(board)[np.clip(v, 0, 60), np.clip(u, 0, 95)]
+    return np.abs(z[inside] / truth[v[inside], u[inside]] - 1)
+
+
+def near_edge(board: np.ndarray) -> np.ndarray:
+    rows, columns = np.nonzero(board)
+    found = np.zeros_like(board)
+    found[max(0, rows.min() - 8) : rows.max() + 8, max(0, columns.min() - 8) : columns.max() + 8] = True
+    return found
+
+
+def test_a_perfect_network_gives_the_surfaces_at_the_rigs_scale(perfect: Glance) -> None:
+    assert rig_scale(perfect) == pytest.approx(SCALE, rel=1e-6)
+    start = at_rig(SCENE, perfect)
+    assert start.cameras is SCENE.cameras
+    error = depth_errors(start, SCENE.cameras[3])
+    assert len(error) > 1000 and np.median(error) < 0.01 and np.mean(error < 0.05) > 0.95
+
+
+def test_what_is_sure_and_wrong_in_one_view_is_outvoted(perfect: Glance) -> None:
+    points = perfect.points.copy()
+    points[5] *= 1.5
+    assert rig_scale(replace(perfect, points=points)) == pytest.approx(SCALE, rel=1e-3)
+
+
+def test_points_behind_the_rig_are_refused(perfect: Glance) -> None:
+    with pytest.raises(UserError, match="points that fit the rig at some scale"):
+        at_rig(SCENE, replace(perfect, points=-perfect.points))
+
+
+def test_without_poses_the_rig_is_found_again(perfect: Glance) -> None:
+    start = unposed(SCENE, perfect, seed=0)
+    for found, true in zip(start.cameras, SCENE.cameras, strict=True):
+        assert angle_deg(found.R @ true.R.T) < 0.1
+        assert np.linalg.norm(found.center - true.center) < 0.01
+        assert found.fx == pytest.approx(true.fx, rel=0.01)
+    error = depth_errors(start, SCENE.cameras[3])
+    assert len(error) > 1000 and np.median(error) < 0.01
+
+
+def test_a_view_without_a_pose_is_named(perfect: Glance) -> None:
+    points = perfect.points.copy()
+    points[2] = np.random.default_rng(0).normal(size=points[2].shape)
+    with pytest.raises(UserError, match=f"a pose for each view, found none for {SCENE.cameras[2].id}"):
+        unposed(SCENE, replace(perfect, points=points), seed=0)
+
+
+def test_a_shrunk_camera_sees_the_same_points() -> None:
+    camera = SCENE.cameras[1]
+    points = camera.unproject(np.array([[3.0, 5.0], [90.0, 60.0]]), np.array([2.0, 4.0]))
+    small = shrunk(camera, 2)
+    assert (small.width, small.height) == (48, 31)
+    np.testing.assert_allclose(small.project(points)[0], camera.project(points)[0] / 2)
+
+
+def test_maps_of_blocks_are_means_of_the_pixels_that_there_are() -> None:
+    gain = np.arange(15, dtype=np.float32).reshape(3, 5)
+    found = block_means([Calibration(gain, 2 * gain, 0.6)], 2, "cpu")
+    assert found.sensitivity.shape == (1, 1, 2, 3)
+    assert found.sensitivity[0, 0, 0, 0] == gain[:2, :2].mean() and found.dark[0, 0, 1, 2] == 2 * gain[2, 4]
+
+
+@pytest.fixture
+def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Weights that nobody trained."""
+    torch.manual_seed(0)
+    path = tmp_path / "drawn.safetensors"
+    save_weights(path, Msdi(TINY), Card("tiny", 0, 0, ("toy-1",), {}))
+    monkeypatch.setenv(VARIABLE, str(path))
+    return path
+
+
+def test_the_network_in_use_looks_at_the_middle_of_the_clip(drawn: Path) -> None:
+    glance = look(SCENE)
+    assert glance.factor == 1 and glance.points.shape == (8, 61, 96, 3) and glance.pictures.shape == (8, 61, 96)
+    assert np.isfinite(glance.points).all() and (glance.confidence > 1).all()
+
+
+def test_pictures_are_the_networks_and_know_the_camera(drawn: Path) -> None:
+    stream, maker = SCENE.streams[0], IMAGES["msdi"]
+    plain = maker(stream, [40], GAIN)
+    even = Calibration(np.ones((61, 96), np.float32), np.zeros((61, 96), np.float32), GAIN)
+    np.testing.assert_allclose(maker(stream, [40], GAIN, even), plain, atol=1e-6)
+    uneven = replace(even, gain=even.gain.copy(), dark=even.dark + 0.01)
+    uneven.gain[:, :40], uneven.gain[3, 4] = 1.3, 0
+    found = maker(stream, [40], GAIN, uneven)[0]
+    assert np.isnan(found[3, 4]) and np.isfinite(found).sum() == found.size - 1
+    assert np.nanmean(np.abs(found - plain[0])) > 1e-3
+    learned = maker.learned()
+    assert learned is not None and learned.trained_on == ("toy-1",)
+
+
+def test_without_weights_it_is_said_how_to_train_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "absent.safetensors"))
+    with pytest.raises(WeightsError, match="train it with `spike4dgs train-msdi`"):
+        msdi(SCENE, 0)
+    assert IMAGES["msdi"].learned() is None
