@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import GAIN, HEIGHT, WIDTH, write_small_scene
+from conftest import GAIN, HEIGHT, WIDTH, array_cameras, write_small_scene
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
@@ -18,12 +18,16 @@ from spike4dgs.baselines.spike_to_image import IMAGES, ImageMaker
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image
 from spike4dgs.baselines.spike_to_image.tfp import TFP
 from spike4dgs.baselines.spike_to_image.tfstp import tfstp_image
+from spike4dgs.benchmark.calibration import estimate
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.manifest import write_manifest
 from spike4dgs.benchmark.scene import open_scene
 from spike4dgs.benchmark.spikes import SpikeStream, pack
 from spike4dgs.benchmark.timing import module_of, show_table
+from spike4dgs.generators import calibration
+from spike4dgs.generators.sensor import Sensor
+from spike4dgs.generators.sensor_maps import dark_map, gain_map
 
 MEAN = """
 import torch
@@ -120,6 +124,27 @@ def test_scores_are_those_of_the_held_out_streams_pictures(measured: Path) -> No
     row = rows(measured / "images.csv")["tfp"]
     assert float(row["PSNR"]) == pytest.approx(np.mean(psnr), abs=0.006)
     assert float(row["SSIM"]) == pytest.approx(np.mean(ssim), abs=6e-5)
+
+
+def test_pictures_are_scored_again_where_the_camera_is_known(measured: Path, tmp_path: Path) -> None:
+    assert rows(measured / "images.csv")["tfp"]["PSNR, corrected"] == "-"
+    for camera in array_cameras():
+        pixels = camera.height, camera.width, 0, camera.id
+        sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
+        calibration.write_calibration(tmp_path / "s/calibration", camera, sensor, [1])
+    facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
+    scene = open_scene(write_small_scene(tmp_path / "s", extras={"calibration": facts}))
+    row = next(r for r in speed_images.measure_generators([scene], 1) if r.title == "tfp")
+    known, expected = scene.recordings("cam_03"), []
+    assert known is not None
+    camera = estimate(known)
+    for target in scene.targets:
+        rate = TFP(scene.stream("cam_03"), [target.tick], 1.0)[0]
+        light = np.clip((rate - camera.dark) / camera.gain / camera.radiance_gain, 0, 1).astype(float)
+        truth = np.clip(scene.ground_truth(target).astype(float), 0, 1)
+        expected.append(peak_signal_noise_ratio(truth, light, data_range=1))
+    assert row.corrected_mean("psnr") == pytest.approx(np.mean(expected), abs=1e-3)
+    assert row.corrected_mean("psnr") != pytest.approx(row.mean("psnr"), abs=0.01)
 
 
 def test_spikezoo_sees_the_stream_upright_and_at_the_right_time(measured: Path) -> None:
