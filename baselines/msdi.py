@@ -1,17 +1,16 @@
 """The initialisations `msdi` and `msdi-uncalibrated`: poses and points by MSDI's network (section 3.3).
 
-The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that
-it was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel
-in view 0's frame, at a scale of its own.
+The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
+was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
+view 0's frame, at a scale of its own.
 
-`msdi` keeps the calibrated poses, which are better than any estimate. They tell the scale: a point s X of view v has to
-lie on its pixel's ray d, so s d x R X = -d x t with the pose (R, t) relative to view 0; of all pixels that are sure
-enough, the median counts, weighted by their parallax. Of a point only its depth is then believed, for the ray is known.
+`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, what views match is measured
+better than a network guesses it: those are the points of `rig-flat`. Where nothing matches, for lack of texture, the
+network's points take the place of the nearest depth; of view 0's, as inverse depths that a line brings to the matched
+ones.
 
-`msdi-uncalibrated` takes each view's pose from its points, by PnP (`method.msdi.pose`), with one focal length for all,
-and moves everything to the scene's frame as COLMAP's result is.
-
-Points are thinned and holes filled as in `rig`.
+`msdi-uncalibrated` has the network alone: each view's pose follows from its points, by PnP (`method.msdi.pose`), with
+one focal length for all, and everything is moved to the scene's frame as COLMAP's result is.
 """
 
 from __future__ import annotations
@@ -22,9 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch.nn import functional
 
-from spike4dgs.baselines.rig import fill, thin
+from spike4dgs.baselines.rig import HOLE_PX, Cloud, fill, filled, matched, thin
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
@@ -42,6 +42,9 @@ Float64 = NDArray[np.float64]
 
 TRAINED_PX = 104  # longer side of the training pictures
 LEAST_CONFIDENCE = 0.3  # quantile of a view's confidence below which its points are left out
+LEAST_MATCHES = 50  # for a line through inverse depths
+LINE_ROUNDS = 10
+FARTHEST = 2.0  # times the farthest match
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +65,13 @@ class Glance:
 
 
 def msdi(scene: TrainingScene, seed: int) -> Start:
-    """Points by the network, at the calibrated poses; see the module. Nothing is random, `seed` is not used.
+    """Points at the calibrated poses; see the module. Nothing is random, `seed` is not used.
 
-    Raises WeightsError where there are no weights, UserError where the points do not fit the rig.
+    Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
     """
-    return at_rig(scene, look(scene))
+    glance = look(scene)
+    cloud = matched(scene, flat_field=True)
+    return filled(scene, completed(cloud, glance), flat_field=True)
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
@@ -111,42 +116,40 @@ def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -
     return Sensors(small([c.gain for c in calibrations]), small([c.dark for c in calibrations]))
 
 
-def at_rig(scene: TrainingScene, glance: Glance) -> Start:
-    """First points at the scene's own cameras. Raises UserError where no positive scale fits."""
-    scale = rig_scale(glance)
-    if not scale > 0:
-        fix = "use rig, or other weights"
-        raise problem(f"MSDI on {scene.id}", "points that fit the rig at some scale", f"{scale:.3g}", fix)
-    points, values = [], []
-    first = glance.cameras[0].w2c
-    for camera, own, sure, picture in zip(glance.cameras, glance.points, glance.sure, glance.pictures, strict=True):
-        relative = camera.w2c @ np.linalg.inv(first)
-        depth = (scale * own @ relative[:3, :3].T + relative[:3, 3])[..., 2]
-        v, u = np.nonzero(sure & (depth > 0))
-        points.append(camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth[v, u]))
-        values.append(picture[v, u])
-    return _start(scene.cameras, np.concatenate(points), np.concatenate(values), glance)
+def completed(cloud: Cloud, glance: Glance) -> Cloud:
+    """The matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
+    camera, depth, sure = glance.cameras[0], glance.points[0, :, :, 2], glance.sure[0]
+    uv, z = camera.project(cloud.points)
+    uv, z = uv[z > 0], z[z > 0]
+    line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z)
+    if line is None:
+        return cloud
+    v, u = np.nonzero(sure & (depth > 0))
+    at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
+    hole = (cKDTree(uv).query(at)[0] > HOLE_PX / glance.factor) & (inverse * z.max() * FARTHEST > 1)
+    points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
+    return Cloud(points, np.concatenate([cloud.values, glance.pictures[0, v[hole], u[hole]]]))
 
 
-def rig_scale(glance: Glance) -> float:
-    """Metres to a unit of the network's points; NaN where no view tells."""
-    first, ratios, weights = glance.cameras[0].w2c, [], []
-    for camera, own, sure in zip(glance.cameras[1:], glance.points[1:], glance.sure[1:], strict=True):
-        relative = camera.w2c @ np.linalg.inv(first)
-        v, u = np.nonzero(sure)
-        rays = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(len(u))], -1)
-        across = np.cross(rays, own[v, u] @ relative[:3, :3].T)
-        shift = -np.cross(rays, relative[:3, 3])
-        square = (across**2).sum(-1)
-        seen = square > 0
-        ratios.append((across * shift).sum(-1)[seen] / square[seen])
-        weights.append(np.linalg.norm(shift[seen], axis=-1))
-    ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    if not weight.sum() > 0:
-        return float("nan")
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    return float(ratio[order][np.searchsorted(total, total[-1] / 2)])
+def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | None:
+    """(a, b) of the line a / depth + b that comes closest to the inverse depths 1 / z of points seen at pixels uv.
+
+    The sum of the absolute differences is made smallest, by least squares that the last residuals weigh. `depth` [h, w]
+    is NaN where nothing is known. None for fewer than `LEAST_MATCHES` points, or where the line does not rise.
+    """
+    inside = (uv >= 0).all(axis=1) & (uv < depth.shape[::-1]).all(axis=1)
+    u, v = uv[inside].astype(np.int64).T
+    known = depth[v, u] > 0
+    if known.sum() < LEAST_MATCHES:
+        return None
+    x, y = 1 / depth[v, u][known], 1 / z[inside][known]
+    if np.ptp(x) == 0:
+        return None
+    weights, line = np.ones(len(x)), np.zeros(2)
+    for _ in range(LINE_ROUNDS):
+        line = np.polyfit(x, y, 1, w=np.sqrt(weights))
+        weights = 1 / np.maximum(np.abs(np.polyval(line, x) - y), 1e-6 * y.mean())
+    return line if line[0] > 0 else None
 
 
 def unposed(scene: TrainingScene, glance: Glance, seed: int) -> Start:
@@ -171,12 +174,7 @@ def unposed(scene: TrainingScene, glance: Glance, seed: int) -> Start:
         placed.append(replace(at, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]))
     move = align_cameras(placed, scene.cameras)
     cameras = tuple(move.camera(c) for c in placed)
-    return _start(cameras, move(glance.points[glance.sure]), glance.pictures[glance.sure], glance)
-
-
-def _start(cameras: tuple[Camera, ...], points: Float64, values: Float32, glance: Glance) -> Start:
-    points, values = thin(cameras, points, values)
-    pictures = glance.pictures.repeat(glance.factor, axis=1).repeat(glance.factor, axis=2)
-    pictures = pictures[:, : cameras[0].height, : cameras[0].width]
-    points, values = fill(cameras, pictures, points, values)
-    return Start(cameras, points.astype(np.float32), values.astype(np.float32))
+    cloud = thin(cameras, Cloud(move(glance.points[glance.sure]), glance.pictures[glance.sure]))
+    pictures = glance.pictures.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = fill(cameras, pictures, cloud)
+    return Start(cameras, cloud.points.astype(np.float32), cloud.values)

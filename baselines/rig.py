@@ -10,6 +10,7 @@ ends those that are quiet just then, which is the background that something movi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -37,7 +38,16 @@ Float32 = NDArray[np.float32]
 WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
 CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
 CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
+HOLE_PX = 2.0  # from the nearest point: further away it is empty
 NEIGHBOURS = 5  # points that tell the depth of a place without any
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points [N, 3] in the world and their gray values [N]."""
+
+    points: NDArray[np.float64]
+    values: Float32
 
 
 def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
@@ -45,6 +55,11 @@ def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
 
     Raises UserError where all cameras stand in one place.
     """
+    return filled(scene, matched(scene, flat_field), flat_field)
+
+
+def matched(scene: TrainingScene, flat_field: bool) -> Cloud:
+    """The points on which views agree, thinned; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} in one place"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
@@ -64,9 +79,13 @@ def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
         clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
-    points, values = thin(scene.cameras, points, values)
-    points, values = fill(scene.cameras, mean, points, values)
-    return Start(scene.cameras, points.astype(np.float32), values.astype(np.float32))
+    return thin(scene.cameras, Cloud(points, values))
+
+
+def filled(scene: TrainingScene, cloud: Cloud, flat_field: bool) -> Start:
+    """The start from a cloud, with points where it leaves the picture empty."""
+    cloud = fill(scene.cameras, _pictures(scene, 0, scene.n_ticks, flat_field), cloud)
+    return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
 
 
 def rig_flat(scene: TrainingScene, seed: int) -> Start:
@@ -122,11 +141,9 @@ def middle_camera(cameras: Sequence[Camera]) -> Camera:
     return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
 
 
-def thin(
-    cameras: Sequence[Camera], points: NDArray[np.float64], values: Float32
-) -> tuple[NDArray[np.float64], Float32]:
+def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
     """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
-    uv, z = middle_camera(cameras).project(points)
+    uv, z = middle_camera(cameras).project(cloud.points)
     step = inverse_depth_step(cameras) * 2  # 2 px of parallax in the widest pair
     keep = z > 0
     cells = np.column_stack([np.floor(uv[keep] / CELL_PX), np.floor(1 / (z[keep] * step))]).astype(np.int64)
@@ -136,35 +153,34 @@ def thin(
     def mean(x: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.bincount(inverse, weights=x, minlength=len(count)) / count
 
-    merged = np.stack([mean(axis) for axis in points[keep].T], axis=-1)
+    merged = np.stack([mean(axis) for axis in cloud.points[keep].T], axis=-1)
     believed = count >= 2  # seen from one view only: not worth a Gaussian
-    return merged[believed], mean(values[keep])[believed].astype(np.float32)
+    return Cloud(merged[believed], mean(cloud.values[keep])[believed].astype(np.float32))
 
 
-def fill(
-    cameras: Sequence[Camera], mean: Float32, points: NDArray[np.float64], values: Float32
-) -> tuple[NDArray[np.float64], Float32]:
+def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
     """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.
 
     Fewer points than that are chance: all of the picture is then laid far away.
     """
     camera = middle_camera(cameras)
-    uv, z = camera.project(points)
+    uv, z = camera.project(cloud.points)
     # The picture's border too: outer views see beyond the middle one.
     margin = 0.1 * np.array([camera.width, camera.height])
     axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    if len(points) < NEIGHBOURS:
+    if len(cloud.points) < NEIGHBOURS:
         far = 1 / inverse_depth_step(cameras)
-        return camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32)
+        return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32))
     distance, nearest = cKDTree(uv).query(grid, k=NEIGHBOURS)
-    empty = distance[:, 0] > 2.0
+    empty = distance[:, 0] > HOLE_PX
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
     added = camera.unproject(grid[empty], depth)
     seen = np.stack([_look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
     visible = np.isfinite(seen).any(axis=0)
     added, seen = added[visible], seen[:, visible]
-    return np.concatenate([points, added]), np.concatenate([values, np.nanmedian(seen, axis=0).astype(np.float32)])
+    values = np.concatenate([cloud.values, np.nanmedian(seen, axis=0).astype(np.float32)])
+    return Cloud(np.concatenate([cloud.points, added]), values)
 
 
 def _look_up(camera: Camera, picture: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.msdi import Glance, at_rig, block_means, look, msdi, rig_scale, shrunk, unposed
+from spike4dgs.baselines.msdi import Glance, block_means, completed, inverse_depth_line, look, msdi, shrunk, unposed
+from spike4dgs.baselines.rig import Cloud, matched, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
@@ -60,23 +63,58 @@ def near_edge(board: np.ndarray) -> np.ndarray:
     return found
 
 
-def test_a_perfect_network_gives_the_surfaces_at_the_rigs_scale(perfect: Glance) -> None:
-    assert rig_scale(perfect) == pytest.approx(SCALE, rel=1e-6)
-    start = at_rig(SCENE, perfect)
+def test_holes_of_the_matched_points_take_the_networks(perfect: Glance) -> None:
+    """A network that is right but for a line through its inverse depths, and matches of one half of the picture."""
+    camera = SCENE.cameras[0]
+    _, truth, board = WORLD.look(camera, 0.5)
+    v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
+    points = camera.unproject(np.stack([u, v], -1) + 0.5, truth[v, u])
+    half = Cloud(points, np.full(len(points), 0.5, np.float32))
+    bent = perfect.points.copy()
+    bent[0] *= (1 / (1 / (0.6 * bent[0, :, :, 2]) + 0.05) / bent[0, :, :, 2])[..., None]
+    whole = completed(half, replace(perfect, points=bent))
+    assert len(whole.points) > 1.5 * len(points)
+    np.testing.assert_array_equal(whole.points[: len(points)], points)
+    error = depth_errors(Start(SCENE.cameras, whole.points[len(points) :], whole.values), camera)
+    assert len(error) > 300 and np.median(error) < 0.02 and np.mean(error < 0.05) > 0.95
+    uv = camera.project(whole.points[len(points) :])[0]
+    assert (uv[:, 0] > 46).all(), "nothing where views match"
+    assert not near(uv, 2 * OFF.start, 2 * OFF.stop).any(), "nothing where the network is not sure"
+
+
+def near(uv: np.ndarray, start: int, stop: int) -> np.ndarray:
+    return (uv[:, 1] > start) & (uv[:, 1] < stop)
+
+
+@given(st.floats(0.1, 10), st.floats(-0.05, 0.3), st.integers(0, 99))
+def test_a_line_is_found_through_outliers(a: float, b: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1, 5, (20, 30))
+    v, u = np.mgrid[:20, :30].reshape(2, -1)
+    inverse = a / depth[v, u] + b
+    wrong = rng.random(600) < 0.2
+    inverse = np.where(wrong, inverse * rng.uniform(1.5, 3, 600), inverse)
+    kept = inverse > 0
+    found = inverse_depth_line(depth, (np.stack([u, v], -1) + 0.5)[kept], 1 / inverse[kept])
+    assert found is not None
+    np.testing.assert_allclose(found, (a, b), atol=0.01 * a)
+
+
+def test_without_a_rising_line_the_matched_points_are_all(perfect: Glance) -> None:
+    camera = SCENE.cameras[0]
+    v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
+    depth = WORLD.look(camera, 0.5)[1][v, u]
+    for count, z in ((20, depth), (len(depth), 1 / depth)):
+        points = camera.unproject((np.stack([u, v], -1) + 0.5)[:count], z[:count])
+        cloud = Cloud(points, np.full(count, 0.5, np.float32))
+        assert completed(cloud, perfect) is cloud
+
+
+def test_the_start_is_rig_flats_where_views_match(drawn: Path) -> None:
+    start, flat = msdi(SCENE, 0), rig_flat(SCENE, 0)
     assert start.cameras is SCENE.cameras
-    error = depth_errors(start, SCENE.cameras[3])
-    assert len(error) > 1000 and np.median(error) < 0.01 and np.mean(error < 0.05) > 0.95
-
-
-def test_what_is_sure_and_wrong_in_one_view_is_outvoted(perfect: Glance) -> None:
-    points = perfect.points.copy()
-    points[5] *= 1.5
-    assert rig_scale(replace(perfect, points=points)) == pytest.approx(SCALE, rel=1e-3)
-
-
-def test_points_behind_the_rig_are_refused(perfect: Glance) -> None:
-    with pytest.raises(UserError, match="points that fit the rig at some scale"):
-        at_rig(SCENE, replace(perfect, points=-perfect.points))
+    n = len(matched(SCENE, flat_field=True).points)
+    np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 
 def test_without_poses_the_rig_is_found_again(perfect: Glance) -> None:
