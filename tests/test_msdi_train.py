@@ -57,6 +57,8 @@ def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training,
     assert learned["psnr_db"] > random["psnr_db"] + 3
     assert learned["point_error"] < 0.7 * random["point_error"]
     assert learned["point_error_median"] < 0.7 * random["point_error_median"]
+    assert learned["calibration"] < 0.6 * random["calibration"]
+    assert learned["rotation_deg"] < 15 and learned["posed"] == 1 and random["rotation_deg"] > 45
 
 
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(data: Bursts, tmp_path: Path) -> None:
@@ -186,6 +188,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (card.config, card.steps) == ("tiny", 3) and 0 < card.measured["psnr_db"] < 40
     text = (out / "README.md").read_text()
     assert "variants of each world: toy (2)" in text and f"| {card.measured['point_error']:g} |" in text
+    assert "`spike4dgs train-msdi --config tiny --steps 3 --views 4 --rate 0.0001 --seed 0`" in text
     assert (out / "curves.png").stat().st_size > 10_000 and (out / "calibration.png").stat().st_size > 5_000
     with open(out / "losses.csv", newline="") as f:
         rows = list(csv.DictReader(f))

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.bursts import HIDDEN_VARIANTS
+from spike4dgs.benchmark.environment import harness
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.weights import VARIABLE, Card
 
@@ -13,10 +14,14 @@ if TYPE_CHECKING:
     from spike4dgs.method.msdi.train import TrainingSettings
 
 _ROWS = {  # name in `evaluate` -> what the card says
-    "psnr_db": "pictures: PSNR (dB)",
+    "psnr_db": "pictures, sensors known: PSNR (dB)",
+    "raw_psnr_db": "pictures, sensors unknown: PSNR (dB)",
     "tfp_psnr_db": "the mean of the same spikes (tfp): PSNR (dB)",
-    "psnr_dynamic_db": "pictures, moving region: PSNR (dB)",
+    "tfp_flat_psnr_db": "tfp, corrected for the sensors: PSNR (dB)",
+    "psnr_dynamic_db": "pictures, sensors known, moving region: PSNR (dB)",
+    "raw_psnr_dynamic_db": "pictures, sensors unknown, moving region: PSNR (dB)",
     "tfp_psnr_dynamic_db": "tfp, moving region: PSNR (dB)",
+    "tfp_flat_psnr_dynamic_db": "tfp, corrected, moving region: PSNR (dB)",
     "point_error": "points: mean error, in mean distances of a sample",
     "point_error_median": "points: median error",
     "point_error_confident": "points: mean error of the half that is most certain",
@@ -37,6 +42,8 @@ def model_card(card: Card, settings: TrainingSettings, sha256: str) -> str:
     variants = ", ".join(f"{world} ({count})" for world, count in sorted(worlds.items()))
     rows = [f"| {text} | {card.measured[name]:g} |" for name, text in _ROWS.items() if name in card.measured]
     numbers = ", ".join(map(str, HIDDEN_VARIANTS))
+    command = f"spike4dgs train-msdi --config {card.config} --steps {settings.steps} --views {settings.views}"
+    command += f" --rate {settings.rate:g} --seed {card.seed}"
     return f"""# Model card: MSDI, configuration `{card.config}`
 
 From {config.ticks} ticks of spikes of two cameras or more: a picture of each, the point that each pixel sees in the
@@ -45,8 +52,8 @@ sha256 `{sha256}`; `{VARIABLE}=FILE` uses other weights of the same format.
 
 ## Measured on hidden variants
 
-Variants {numbers} of each world, seen by rigs that were not trained on; intrinsics known, up to
-{settings.most_views} views. A view without a pose counts as 180 degrees. `calibration.png` shows expected against true
+Variants {numbers} of each world, seen by rigs that were not trained on; intrinsics and, unless it says otherwise, sensors
+known, up to {settings.most_views} views. A view without a pose counts as 180 degrees. `calibration.png` shows expected against true
 errors, `curves.png` the training.
 
 | measured | value |
@@ -61,7 +68,10 @@ errors, `curves.png` the training.
 - Loss: {settings.image_weight:g} times the L1 of radiance, and DUSt3R's confidence-weighted regression of points.
 - {card.steps} steps of {settings.views} views in all, 2 to {settings.most_views} of a sample; Adam at {settings.rate:g}
   after {settings.warm_up} steps of warm-up, falling to 0 with the cosine over {settings.steps} steps; gradients clipped
-  at norm 1; seed {card.seed}. In {settings.unknown_share:.0%} of the steps the intrinsics are not told.
+  at norm 1; seed {card.seed}. In {settings.unknown_share:.0%} of the steps the intrinsics are not told, in
+  {settings.raw_share:.0%} the sensors are not.
+- Commit {harness()["commit"] or "unknown"}. Commands: `spike4dgs make-msdi-data --variants {max(worlds.values())}`, then
+  `{command}`. On other machines the numbers differ in their last digits.
 
 ## Limits
 
