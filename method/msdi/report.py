@@ -52,9 +52,9 @@ sha256 `{sha256}`; `{VARIABLE}=FILE` uses other weights of the same format.
 
 ## Measured on hidden variants
 
-Variants {numbers} of each world, seen by rigs that were not trained on; intrinsics and, unless it says otherwise, sensors
-known, up to {settings.most_views} views. A view without a pose counts as 180 degrees. `calibration.png` shows expected against true
-errors, `curves.png` the training.
+Variants {numbers} of each world, seen by rigs that were not trained on; intrinsics and, unless it says otherwise,
+sensors known, up to {settings.most_views} views. A view without a pose counts as 180 degrees. `calibration.png` shows
+expected against true errors, `curves.png` the training.
 
 | measured | value |
 |---|---|
@@ -70,8 +70,9 @@ errors, `curves.png` the training.
   after {settings.warm_up} steps of warm-up, falling to 0 with the cosine over {settings.steps} steps; gradients clipped
   at norm 1; seed {card.seed}. In {settings.unknown_share:.0%} of the steps the intrinsics are not told, in
   {settings.raw_share:.0%} the sensors are not.
-- Commit {harness()["commit"] or "unknown"}. Commands: `spike4dgs make-msdi-data --variants {max(worlds.values())}`, then
-  `{command}`. On other machines the numbers differ in their last digits.
+- Commit {harness()["commit"] or "unknown"}. Commands:
+  `spike4dgs make-msdi-data --variants {max(worlds.values())}`, then `{command}`.
+  On other machines the numbers differ in their last digits.
 
 ## Limits
 
