@@ -164,7 +164,8 @@ class Msdi(nn.Module):
         features = self.extractor(padded[:, : self.config.ticks])
         images = around.cut(self.generator(features, padded))
         rays = around.pad(ray_map(intrinsics, batch * views, height, width, padded))
-        tokens = self.encoder(features, rays)
+        # The pictures alone teach the extractor: the points' gradients, larger and noisier, would cost them several dB.
+        tokens = self.encoder(features.detach(), rays)
         layers = self.fusion(tokens.unflatten(0, (batch, views)))
         patch = self.config.patch
         points, confidence = unpack(self.head(layers, padded.shape[2] // patch, padded.shape[3] // patch))

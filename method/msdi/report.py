@@ -65,11 +65,11 @@ expected against true errors, `curves.png` the training.
 - Data: bursts that `make-msdi-data` rendered; variants of each world: {variants}. Variants 0 to 9 are never rendered
   for training, nor is any world's own rig. Spikes are made anew at every use, with other sensors, brightness, views,
   and direction of time, and half of the time in a mirror.
-- Loss: {settings.image_weight:g} times the L1 of radiance, and DUSt3R's confidence-weighted regression of points.
+- Loss: L1 of radiance for extractor and generator, DUSt3R's confidence-weighted regression of points for the rest.
 - {card.steps} steps of {settings.views} views in all, 2 to {settings.most_views} of a sample; Adam at {settings.rate:g}
-  after {settings.warm_up} steps of warm-up, falling to 0 with the cosine over {settings.steps} steps; gradients clipped
-  at norm 1; seed {card.seed}. In {settings.unknown_share:.0%} of the steps the intrinsics are not told, in
-  {settings.raw_share:.0%} the sensors are not.
+  ({settings.picture_rate:g} for extractor and generator) after {settings.warm_up} steps of warm-up, falling to 0 with
+  the cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
+  {settings.unknown_share:.0%} of the steps the intrinsics are not told, in {settings.raw_share:.0%} the sensors.
 - Commit {harness()["commit"] or "unknown"}. Commands:
   `spike4dgs make-msdi-data --variants {max(worlds.values())}`, then `{command}`.
   On other machines the numbers differ in their last digits.

@@ -1,6 +1,7 @@
 """Train MSDI on training bursts: `train-msdi`.
 
-Loss: L1 of the pictures in radiance, and DUSt3R's confidence-weighted regression of points (`losses`). Each step has a
+Loss: L1 of the pictures in radiance, which teaches extractor and generator, and DUSt3R's confidence-weighted regression
+of points (`losses`), which teaches everything behind them. Each step has a
 fixed number of views: few samples of many views, or many of few.
 
 Everything random is drawn from (seed, step): on one machine, with the same data, a killed run goes on from its
@@ -33,7 +34,7 @@ from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.report import model_card
 from spike4dgs.method.msdi.weights import Card, save_weights
-from spike4dgs.method.optimizer import WarmCosine, make_adam, set_rate
+from spike4dgs.method.optimizer import WarmCosine, make_adam
 
 PUBLISHED: dict[str, float] = {"rate": 1e-4}  # all that the publication says of its training, besides the losses
 ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only
@@ -51,16 +52,16 @@ class TrainingSettings:
     views: int = 8  # of a step: samples times views of a sample
     most_views: int = 8  # of a sample; at least two
     rate: float = PUBLISHED["rate"]  # Adam's, after the warm-up; it falls to nothing with the cosine
+    picture_rate: float = 1e-3  # the same of extractor and generator, which are small
     warm_up: int = 500  # steps
-    image_weight: float = 4.0  # the points' gradient is multiplied by the confidence, which becomes several
     unknown_share: float = 0.2  # of the steps do not tell the intrinsics
     raw_share: float = 0.2  # of the steps do not tell the sensors
     score_every: int = 1000  # steps
 
-    @property
-    def schedule(self) -> WarmCosine:
-        """Adam's learning rate by step."""
-        return WarmCosine(self.rate, self.warm_up, self.steps)
+    def rates(self, step: int) -> dict[str, float]:
+        """Adam's learning rates of the two groups at a step."""
+        peaks = {"pictures": self.picture_rate, "points": self.rate}
+        return {name: WarmCosine(peak, self.warm_up, self.steps).at(step) for name, peak in peaks.items()}
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,10 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = Msdi(config).to(device).train()
-        self.adam = make_adam({"network": list(self.network.parameters())}, (0.9, 0.999))
+        pictures = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
+        own = {id(p) for p in pictures}
+        points = [p for p in self.network.parameters() if id(p) not in own]
+        self.adam = make_adam({"pictures": pictures, "points": points}, (0.9, 0.999))
         self.step = 0
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
 
@@ -98,7 +102,6 @@ class Training:
             torch.from_numpy(a).to(self.device, non_blocking=True)
             for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics, batch.sensitivity, batch.dark)
         )
-        set_rate(self.adam, self.settings.schedule.at(self.step))
         draws = np.random.default_rng([self.seed, self.step, 1])
         known = draws.random() >= self.settings.unknown_share
         sensors = Sensors(sensitivity, dark) if draws.random() >= self.settings.raw_share else None
@@ -108,11 +111,14 @@ class Training:
             found = self.network(spikes, intrinsics if known else None, sensors)
         image_l1 = image_loss(found.images, rate) / batch.gain
         of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
-        total = self.settings.image_weight * image_l1 + of_points
+        total = image_l1 + of_points  # their parameters are not the same ones: there is nothing to weigh
         self.adam.zero_grad(set_to_none=True)
         total.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        if norm.isfinite():  # else the step is left out: one bad sample must not undo the network
+        rates, norms = self.settings.rates(self.step), []
+        for group in self.adam.param_groups:
+            group["lr"] = rates[group["name"]]
+            norms.append(torch.nn.utils.clip_grad_norm_(group["params"], 1.0))
+        if all(norm.isfinite() for norm in norms):  # else it is left out: one bad sample must not undo the network
             self.adam.step()
         self.step += 1
         return StepLosses(total.item(), image_l1.item(), of_points.item())
@@ -165,7 +171,7 @@ def train_msdi(
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
         steps: Steps.
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
-        rate: Adam's learning rate after the warm-up.
+        rate: Adam's learning rate after the warm-up, of what makes points.
         device: auto, cpu or cuda.
         seed: Seed of the first weights and of all that is drawn.
     """
