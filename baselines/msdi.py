@@ -76,7 +76,7 @@ def msdi(scene: TrainingScene, seed: int) -> Start:
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
     """Poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, look(scene), seed)
+    return unposed(scene, look(scene), seed, calibrated=False)
 
 
 def look(scene: TrainingScene) -> Glance:
@@ -152,8 +152,30 @@ def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | Non
     return line if line[0] > 0 else None
 
 
-def unposed(scene: TrainingScene, glance: Glance, seed: int) -> Start:
-    """Poses by PnP, and points, in the scene's frame. Raises UserError where a view has no pose."""
+def unposed(scene: TrainingScene, glance: Glance, seed: int, *, calibrated: bool) -> Start:
+    """Poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
+
+    Raises UserError where a view has no pose.
+    """
+    first, f = scene.cameras[0], glance.factor
+    cameras = list(scene.cameras) if calibrated else _one_focal(scene, glance)
+    K = np.stack([shrunk(camera, f).K for camera in cameras])
+    poses = solve_poses(glance.points, glance.confidence, K, seed)
+    if bad := [f"{c.id} ({p.reason})" for c, p in zip(glance.cameras, poses, strict=True) if not p.found]:
+        fix = "use rig or colmap"
+        raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
+    known = [pose.w2c for pose in poses if pose.w2c is not None]
+    placed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
+    move = align_cameras(placed, scene.cameras)
+    moved = tuple(move.camera(c) for c in placed)
+    cloud = thin(moved, Cloud(move(glance.points[glance.sure]), glance.pictures[glance.sure]))
+    pictures = glance.pictures.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = fill(moved, pictures, cloud)
+    return Start(moved, cloud.points.astype(np.float32), cloud.values)
+
+
+def _one_focal(scene: TrainingScene, glance: Glance) -> list[Camera]:
+    """The cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
     first, f = scene.cameras[0], glance.factor
     middle = first.width / 2, first.height / 2
     v, u = np.nonzero(glance.sure[0])
@@ -162,19 +184,4 @@ def unposed(scene: TrainingScene, glance: Glance, seed: int) -> Start:
     if focal is None:
         fix = "use rig or colmap"
         raise problem(f"MSDI on {scene.id}", "points that give a focal length", "none before the camera", fix)
-    K = np.array([[focal, 0, middle[0] / f], [0, focal, middle[1] / f], [0, 0, 1]])
-    poses = solve_poses(glance.points, glance.confidence, np.tile(K, (len(scene.cameras), 1, 1)), seed)
-    if bad := [f"{c.id} ({p.reason})" for c, p in zip(glance.cameras, poses, strict=True) if not p.found]:
-        fix = "use rig or colmap"
-        raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
-    placed = []
-    for camera, pose in zip(scene.cameras, poses, strict=True):
-        assert pose.w2c is not None
-        at = replace(camera, R=pose.w2c[:3, :3], t=pose.w2c[:3, 3])
-        placed.append(replace(at, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]))
-    move = align_cameras(placed, scene.cameras)
-    cameras = tuple(move.camera(c) for c in placed)
-    cloud = thin(cameras, Cloud(move(glance.points[glance.sure]), glance.pictures[glance.sure]))
-    pictures = glance.pictures.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
-    cloud = fill(cameras, pictures, cloud)
-    return Start(cameras, cloud.points.astype(np.float32), cloud.values)
+    return [replace(c, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]) for c in scene.cameras]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.colmap import clip_means, map_views
 from spike4dgs.baselines.dust3r import estimate as estimate_dust3r
+from spike4dgs.baselines.msdi import look, unposed
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.rig import rig
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.benchmark.cameras import Camera
@@ -20,9 +22,14 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.images import Float32
 from spike4dgs.benchmark.poses import pose_errors
+from spike4dgs.benchmark.recipes import Budget, Recipe
 from spike4dgs.benchmark.report import make_console
+from spike4dgs.benchmark.run_display import RunDisplay
 from spike4dgs.benchmark.scene import TrainingScene, open_scene
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.fitted_model import FittedModel
 
+Row = dict[str, float | int | str | None]
 CLIP = "clip"  # the pictures that the initialisations take: means of the whole clip
 
 
@@ -44,6 +51,11 @@ def _colmap(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool
     return Estimate(found.cameras, len(found.points))
 
 
+def _msdi(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = unposed(scene, look(scene), seed, calibrated=calibrated)
+    return Estimate(start.cameras, len(start.points))
+
+
 def _dust3r(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
     start = estimate_dust3r(scene, pictures, seed, calibrated=calibrated)
     return Estimate(start.cameras, len(start.points))
@@ -53,6 +65,7 @@ ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Estimate]] =
     "rig": _rig,
     "colmap": _colmap,
     "dust3r": _dust3r,
+    "msdi": _msdi,
 }
 COLUMNS = {  # key of the row -> heading, format
     "registered": ("views", "{}"),
@@ -76,6 +89,7 @@ def poses(
     initialization: tuple[str, ...] = ("colmap",),
     images: str = CLIP,
     unknown_intrinsics: bool = False,
+    refine: bool = False,
     seed: int = 0,
     split: str | None = None,
     out: Path | None = None,
@@ -88,9 +102,10 @@ def poses(
 
     Args:
         scenes: Scene folders.
-        initialization: What estimates: rig, colmap, dust3r.
+        initialization: What estimates: rig, colmap, dust3r, msdi.
         images: clip (means of the whole clip, what recipes take), or pictures of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
+        refine: Also fit 4DGS to TFP pictures from these poses, poses included, and measure what they became.
         seed: Seed of everything random.
         split: Split whose training cameras are taken; each scene's default one if left out.
         out: Write the rows to this JSON file.
@@ -106,10 +121,11 @@ def poses(
         scene = open_scene(path, allow_gaps, split).training
         pictures = _pictures(scene, images)
         for name in initialization:
-            rows.append(measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics))
+            budget = Budget() if refine else None
+            rows += measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics, refine=budget)
     _print(rows)
     if out:
-        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "seed": seed}
+        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "refine": refine, "seed": seed}
         write_json(out, {"settings": settings, "rows": rows})
     return 0
 
@@ -122,19 +138,40 @@ def _pictures(scene: TrainingScene, images: str) -> Float32:
 
 
 def measure_poses(
-    scene: TrainingScene, pictures: Float32, name: str, seed: int, *, calibrated: bool
-) -> dict[str, float | int | str | None]:
-    """One row of the table: what was found, its errors (None where fewer than two views are placed), seconds.
+    scene: TrainingScene, pictures: Float32, name: str, seed: int, *, calibrated: bool, refine: Budget | None = None
+) -> list[Row]:
+    """Rows of the table: what was found, its errors (None where fewer than two views are placed), seconds.
 
-    What an estimator refuses stands in the row's `error`.
+    What an estimator refuses stands in the row's `error`. With a budget to refine them, a row of the refined poses follows.
     """
-    row: dict[str, float | int | str | None] = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
     start = time.perf_counter()
     try:
         found = ESTIMATORS[name](scene, pictures, seed, calibrated)
     except UserError as e:
-        return {**row, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}
-    row["seconds"] = time.perf_counter() - start
+        empty: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
+        return [{**empty, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}]
+    rows = [_row(scene, name, found, time.perf_counter() - start)]
+    if refine and len(found.cameras) == len(scene.cameras):
+        start = time.perf_counter()
+        better = Estimate(refined(scene, found.cameras, refine, seed), found.points)
+        rows.append(_row(scene, f"{name}, refined", better, time.perf_counter() - start))
+    return rows
+
+
+def refined(scene: TrainingScene, cameras: Sequence[Camera], budget: Budget, seed: int) -> tuple[Camera, ...]:
+    """`cameras`, in any order, after 4DGS was fitted to TFP pictures from where they stand, poses included."""
+    placed = {camera.id: camera for camera in cameras}
+    start = rig(replace(scene, cameras=tuple(placed[camera.id] for camera in scene.cameras)), seed)
+    parts = replace(PARTS, initialization={"given": lambda scene, seed: start})
+    recipe = Recipe("refined", "tfp", "given", "hexplane", "pixel", {"refine_poses": True})
+    with RunDisplay(make_console(), 1) as display, display.cell(f"poses of {scene.id}, refined") as shown:
+        model = RecipeMethod(recipe, parts).fit(scene, budget, "cpu", seed, shown.progress)
+    assert isinstance(model, FittedModel)
+    return model.cameras
+
+
+def _row(scene: TrainingScene, name: str, found: Estimate, seconds: float) -> Row:
+    row: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS), "seconds": seconds}
     row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": found.points}
     if len(found.cameras) < 2:
         return {**row, "error": "fewer than two views are placed"}
@@ -144,7 +181,7 @@ def measure_poses(
     return {**row, **pose_errors(found.cameras, partners).summary(), "focal_ratio": float(np.mean(ratios))}
 
 
-def _print(rows: Sequence[dict[str, float | int | str | None]]) -> None:
+def _print(rows: Sequence[Row]) -> None:
     table = Table("scene", "poses", *(heading for heading, _ in COLUMNS.values()))
     for row in rows:
         values = ((row[key], text) for key, (_, text) in COLUMNS.items())

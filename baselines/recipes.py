@@ -96,7 +96,7 @@ SUPERVISED = tuple(
 POSED = (
     Recipe("tfp+colmap+4dgs", "tfp", "colmap", "hexplane", "pixel"),
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
-    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-uncalibrated", "hexplane", "spss", _MSDI),
+    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-uncalibrated", "hexplane", "spss", {**_MSDI, "refine_poses": True}),
     # Tables 3 and 7.
     Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI),
     Recipe("msdi+dust3r+4dgs", "msdi", "dust3r", "hexplane", "pixel", _MSDI),

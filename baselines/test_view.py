@@ -25,6 +25,7 @@ from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.poses import rigid_motion
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.trainer import one_torch_thread
 
@@ -136,12 +137,3 @@ def refine_pose(
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()
     return replace(camera, R=best[:3, :3], t=best[:3, 3])
-
-
-def rigid_motion(xi: Tensor) -> Tensor:
-    """The exponential of se(3): xi [6] (rotation vector, translation part) -> [4, 4], differentiable at zero too."""
-    zero = torch.zeros_like(xi[0])
-    x, y, z, a, b, c = xi
-    rows = [zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero]
-    motion: Tensor = torch.linalg.matrix_exp(torch.stack(rows).view(4, 4))
-    return motion

@@ -54,6 +54,7 @@ class FittedModel:
     duration_us: float
     device: str
     spec: MotionSpec
+    cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
 
     @property
     def size_bytes(self) -> int:

@@ -26,6 +26,11 @@ class TrainSettings:
     coarse_share: float = 0.2  # middle share of the clip that the coarse stage of a moving scene sees
     flat_field: bool = False  # correct the pictures by each camera's calibrated gain n(x, y) and dark rate, if known
 
+    # Poses of the training cameras.
+    refine_poses: bool = False  # fit them too; for starts that estimated them
+    pose_rate: float = 2e-4  # radians, and translations by the scene's scale: 0.05 px a step at 225 px
+    pose_rate_last: float = 2e-6
+
     # Model only what moves.
     freeze_still: bool = False  # after the static stage, Gaussians where nothing changes become a backdrop
 

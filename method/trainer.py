@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.recipes import Progress
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.density import Pressure, refine
@@ -22,6 +23,7 @@ from spike4dgs.method.footage import Footage
 from spike4dgs.method.gaussians import Edit, Gaussians
 from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.poses import Poses
 from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
@@ -101,6 +103,9 @@ class Trainer:
         scale: float,
         seed: int,
     ) -> None:
+        if settings.refine_poses and settings.freeze_still:
+            fix = "choose one of them: a backdrop is projected once"
+            raise problem("settings", "refine_poses or freeze_still", "both", fix)
         self.footage, self.motion, self.supervision = footage, motion, supervision
         self.settings, self.scale, self.seed = settings, scale, seed
         self.plan = stages(settings, motion.moves, motion.rests_first)
@@ -109,6 +114,7 @@ class Trainer:
         self.gaussians = gaussians.trainable()
         self.still = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # frozen: the backdrop
         self.backdrop: Backdrop | None = None
+        self.poses = Poses(footage.views, scale)
         self._begin(self.plan[0])
 
     @property
@@ -120,6 +126,8 @@ class Trainer:
         """Start a stage as 4DGS does: a fresh optimiser, and nothing gathered for densification."""
         s = self.settings
         own = {**self.supervision.groups(), **(self.motion.groups() if stage.deforms else {})}
+        if s.refine_poses:
+            own["poses"] = [self.poses.xi], Decay(s.pose_rate, s.pose_rate_last)
         self.rates = {
             "means": Decay(s.means_rate * self.scale, s.means_rate_last * self.scale),
             "log_scales": Decay(s.scales_rate, s.scales_rate),
@@ -162,7 +170,7 @@ class Trainer:
                 self._freeze()
             self._begin(stage)
         chosen = list(sample.views)
-        views = Views(self.footage.views.w2c[chosen], self.footage.views.K[chosen], *self._size())
+        views = self.poses.views(chosen) if self.settings.refine_poses else self._views(chosen)
         outputs: list[RenderOutput] = []
 
         def draw(t: float) -> Tensor:
@@ -184,6 +192,9 @@ class Trainer:
 
     def _render(self, splats: Splats, views: Views) -> RenderOutput:
         return render(splats, views)
+
+    def _views(self, chosen: list[int]) -> Views:
+        return Views(self.footage.views.w2c[chosen], self.footage.views.K[chosen], *self._size())
 
     def _size(self) -> tuple[int, int]:
         return self.footage.views.width, self.footage.views.height
@@ -232,6 +243,7 @@ class Trainer:
             "still": self.still.tensors(),
             "motion": self.motion.state_dict(),
             "supervision": self.supervision.state_dict(),
+            "poses": self.poses.state_dict(),
             "adam": export_state(self.adam),
             "pressure": {"gradient": self.pressure.gradient, "seen": self.pressure.seen},
         }
@@ -249,6 +261,7 @@ class Trainer:
             self._set_still(Gaussians.from_tensors(on["still"]))
         self.motion.load_state_dict(saved.part("motion"))
         self.supervision.load_state_dict(saved.part("supervision"))
+        self.poses.load_state_dict(saved.part("poses"))
         # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.
         stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
         self._begin(stage)

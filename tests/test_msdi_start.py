@@ -118,7 +118,7 @@ def test_the_start_is_rig_flats_where_views_match(drawn: Path) -> None:
 
 
 def test_without_poses_the_rig_is_found_again(perfect: Glance) -> None:
-    start = unposed(SCENE, perfect, seed=0)
+    start = unposed(SCENE, perfect, seed=0, calibrated=False)
     for found, true in zip(start.cameras, SCENE.cameras, strict=True):
         assert angle_deg(found.R @ true.R.T) < 0.1
         assert np.linalg.norm(found.center - true.center) < 0.01
@@ -131,7 +131,7 @@ def test_a_view_without_a_pose_is_named(perfect: Glance) -> None:
     points = perfect.points.copy()
     points[2] = np.random.default_rng(0).normal(size=points[2].shape)
     with pytest.raises(UserError, match=f"a pose for each view, found none for {SCENE.cameras[2].id}"):
-        unposed(SCENE, replace(perfect, points=points), seed=0)
+        unposed(SCENE, replace(perfect, points=points), seed=0, calibrated=True)
 
 
 def test_a_shrunk_camera_sees_the_same_points() -> None:

@@ -12,16 +12,14 @@ from conftest import GAIN, TICKS
 from dummy_methods import CountMethod, CountModel, FailingMethod, run
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import expm
 from splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from torch import Tensor
 
 from spike4dgs.baselines.rig import rig
-from spike4dgs.baselines.test_view import PosedRecipe, Refinement, refine_pose, rigid_motion
+from spike4dgs.baselines.test_view import PosedRecipe, Refinement, refine_pose
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.images import read_exr
-from spike4dgs.benchmark.poses import angle_deg
 from spike4dgs.benchmark.recipes import Recipe
 from spike4dgs.benchmark.refinement import MAX_TICKS, free_ticks
 from spike4dgs.benchmark.result import read_record
@@ -29,6 +27,7 @@ from spike4dgs.benchmark.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Parts
 from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.poses import rigid_motion
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision import SUPERVISIONS
 
@@ -59,18 +58,6 @@ def off(a: Camera, b: Camera) -> float:
     """Mean distance in px between the images of the Gaussians' centres."""
     points = SPLATS.means.double().numpy()
     return float(np.linalg.norm(a.project(points)[0] - b.project(points)[0], axis=1).mean())
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9, 0.1, 2.0])
-def test_exponential_is_a_rigid_motion(size: float) -> None:
-    xi = size * np.random.default_rng(1).normal(size=6)
-    (x, y, z), v = xi[:3], xi[3:]
-    twist = np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]])
-    motion = rigid_motion(torch.tensor(xi)).numpy()
-    assert np.allclose(motion, expm(twist), atol=1e-12)
-    assert np.allclose(motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-12)
-    assert abs(float(angle_deg(motion[:3, :3])) - np.degrees(np.linalg.norm(xi[:3])) % 360) < 1e-6 or size == 2.0
-    assert torch.autograd.gradcheck(rigid_motion, torch.tensor(xi, requires_grad=True))
 
 
 def test_refinement_finds_the_pose_from_still_pixels_alone() -> None:

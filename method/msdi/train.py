@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spike4dgs.benchmark.bursts import FIRST_TRAINING_VARIANT, BurstFile, open_folder
 from spike4dgs.benchmark.environment import choose_device, device_type
@@ -82,9 +83,9 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = Msdi(config).to(device).train()
-        pictures = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
+        pictures: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
         own = {id(p) for p in pictures}
-        points = [p for p in self.network.parameters() if id(p) not in own]
+        points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
         self.adam = make_adam({"pictures": pictures, "points": points}, (0.9, 0.999))
         self.step = 0
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
