@@ -142,7 +142,7 @@ def measure_poses(
 ) -> list[Row]:
     """Rows of the table: what was found, its errors (None where fewer than two views are placed), seconds.
 
-    What an estimator refuses stands in the row's `error`. With a budget to refine them, a row of the refined poses follows.
+    What an estimator refuses stands in the row's `error`. With a budget to refine, a row of the refined poses follows.
     """
     start = time.perf_counter()
     try:
