@@ -69,18 +69,18 @@ def msdi(scene: TrainingScene, seed: int) -> Start:
 
     Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
     """
-    glance = look(scene)
+    glance = look(scene, calibrated=True)
     cloud = matched(scene, flat_field=True)
     return filled(scene, completed(cloud, glance), flat_field=True)
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
     """Poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, look(scene), seed, calibrated=False)
+    return unposed(scene, look(scene, calibrated=False), seed, calibrated=False)
 
 
-def look(scene: TrainingScene) -> Glance:
-    """What the network in use makes of the middle of the clip; raises as `msdi`."""
+def look(scene: TrainingScene, *, calibrated: bool) -> Glance:
+    """What the network in use makes of the middle of the clip, told the intrinsics or not; raises as `msdi`."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
@@ -93,7 +93,7 @@ def look(scene: TrainingScene) -> Glance:
         sensors = block_means(calibrations, factor, device)
         gain = float(np.mean([c.radiance_gain for c in calibrations]))
     with torch.inference_mode():
-        found = network(small.to(device), K.to(device), sensors)
+        found = network(small.to(device), K.to(device) if calibrated else None, sensors)
     pictures = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
     points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
     return Glance(factor, cameras, pictures, points, confidence)

@@ -52,7 +52,7 @@ def _colmap(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool
 
 
 def _msdi(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = unposed(scene, look(scene), seed, calibrated=calibrated)
+    start = unposed(scene, look(scene, calibrated=calibrated), seed, calibrated=calibrated)
     return Estimate(start.cameras, len(start.points))
 
 

@@ -24,7 +24,7 @@ from spike4dgs.method.fit import Start
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.data import points_of
 from spike4dgs.method.msdi.network import Msdi
-from spike4dgs.method.msdi.weights import VARIABLE, Card, save_weights
+from spike4dgs.method.msdi.weights import VARIABLE, Card, load_network, save_weights
 
 WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
 SCENE = WORLD.training
@@ -160,9 +160,19 @@ def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_network_in_use_looks_at_the_middle_of_the_clip(drawn: Path) -> None:
-    glance = look(SCENE)
+    glance = look(SCENE, calibrated=True)
     assert glance.factor == 1 and glance.points.shape == (8, 61, 96, 3) and glance.pictures.shape == (8, 61, 96)
     assert np.isfinite(glance.points).all() and (glance.confidence > 1).all()
+
+
+def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path) -> None:
+    """The layer that takes them starts at zero and is set here: other intrinsics are then other points."""
+    network = load_network(drawn, "cpu")
+    torch.nn.init.normal_(network.encoder.ray_embed.weight, std=0.1)
+    longer = replace(SCENE, cameras=tuple(replace(c, fx=1.3 * c.fx, fy=1.3 * c.fy) for c in SCENE.cameras))
+    for calibrated in (True, False):
+        a, b = (look(s, calibrated=calibrated).points for s in (SCENE, longer))
+        assert np.array_equal(a, b) != calibrated
 
 
 def test_pictures_are_the_networks_and_know_the_camera(drawn: Path) -> None:
