@@ -231,10 +231,12 @@ def film(
 ) -> Footage:
     """Pictures of all training views at the chosen times; see `FitSettings.flat_field`."""
     ticks = choose_ticks(scene.n_ticks, settings)
-    known = (settings.flat_field and scene.calibrations) or [None] * len(scene.streams)
-    pictures = np.stack(
-        [images(s, ticks, scene.radiance_gain, camera) for s, camera in zip(scene.streams, known, strict=True)], axis=1
-    )
+    gain, cameras_known = scene.radiance_gain, scene.calibrations if settings.flat_field else None
+    if cameras_known:
+        made = [images(s, ticks, gain, camera) for s, camera in zip(scene.streams, cameras_known, strict=True)]
+    else:
+        made = [images(s, ticks, gain) for s in scene.streams]
+    pictures = np.stack(made, axis=1)
     views = Views.from_cameras(cameras, device=device)
     return Footage(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
 

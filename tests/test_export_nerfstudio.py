@@ -169,7 +169,7 @@ def test_cameras_that_the_layout_cannot_say_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"images": "video"}, "--images: expected one of tfp, tfi, tfstp, spk2img, adaptive, found 'video'"),
+        ({"images": "video"}, "--images: expected one of tfp, tfi, tfstp, spk2img, adaptive, msdi, found 'video'"),
         ({"every": 1}, "--every: expected 2 ticks or more, found 1"),
         ({"split": "left"}, "expected a split among center, found 'left'"),
     ],
