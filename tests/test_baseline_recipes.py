@@ -17,7 +17,7 @@ from spike4dgs.benchmark.tables import published
 from spike4dgs.method.fit import RecipeMethod
 
 TINY = Budget(scale=0.01)
-# One of each kind of fit that needs no weights and no features in the pictures.
+# One of each kind of fit that needs nothing that a user brings, and no features in the pictures.
 FITTED = [
     "nearest-view",
     "tfp+static",
@@ -27,6 +27,7 @@ FITTED = [
     "dy-spikegs",
     "dy-spikenerf",
     "tfp+4dgs+spss",
+    "spike4dgs",
     "spike4dgs-x",
 ]
 

@@ -10,11 +10,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spike4dgs.baselines.dust3r_network import Dust3r, Dust3rShape
+from spike4dgs.benchmark.bursts import FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
 from spike4dgs.method.msdi.checkpoints import load_pretrained, source_of, transfer
-from spike4dgs.method.msdi.weights import Card, load_network, read_card, save_weights, weights_path
+from spike4dgs.method.msdi.weights import SHIPPED, Card, load_network, read_card, save_weights, weights_path
 
 EMBED = replace(TINY, embed_channels=3)  # as the published patch embedding
 DUST3R = Dust3rShape(2, 16, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
@@ -225,3 +227,14 @@ def test_the_environment_names_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_
         weights_path()
     (tmp_path / "absent.safetensors").touch()
     assert weights_path() == tmp_path / "absent.safetensors"
+
+
+def test_the_shipped_weights_are_those_of_their_card() -> None:
+    card = read_card(SHIPPED)
+    text = (SHIPPED.parent / "README.md").read_text()
+    assert sha256_file(SHIPPED) in text and f"Weights of step {card.steps}" in text
+    assert load_network(SHIPPED, "cpu").config.name == card.config == "small"
+    variants = [int(name.partition("@")[0].rpartition("-")[2]) for name in card.trained_on]
+    assert min(variants) >= FIRST_TRAINING_VARIANT, "neither the benchmark's nor the hidden ones"
+    assert card.measured["psnr_db"] > card.measured["tfp_psnr_db"] + 3
+    assert SHIPPED.stat().st_size < 20e6
