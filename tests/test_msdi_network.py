@@ -132,6 +132,14 @@ def test_any_size_comes_out_whole(size: tuple[int, int], patch: int) -> None:
     assert torch.allclose(out.images[0], cut, atol=1e-6)
 
 
+def test_half_features_change_a_picture_by_less_than_a_hundredth() -> None:
+    x = spikes(2, 9, 24, 40)
+    with torch.no_grad():
+        exact, half = tiny().images(x), tiny().images(x, half=True)
+    assert half.dtype == torch.float32
+    assert 0 < (half - exact).abs().max() < 0.01 * exact.abs().max()
+
+
 def test_the_papers_size_is_padded() -> None:
     around = margins(250, 400, 16)
     assert (around.top, around.bottom, around.left, around.right) == (3, 3, 0, 0)

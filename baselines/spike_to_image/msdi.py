@@ -32,6 +32,7 @@ def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibrati
     import torch
 
     from spike4dgs.method.msdi.inputs import Sensors
+    from spike4dgs.method.msdi.network import has_bfloat16
 
     device = next(network.parameters()).device
     sensors = None
@@ -39,7 +40,7 @@ def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibrati
         sensors = Sensors(*(torch.from_numpy(a).to(device)[None] for a in (camera.gain, camera.dark)))
     with torch.inference_mode():
         spikes = torch.from_numpy(window(stream, tick, network.config.ticks)).to(device)[None]
-        rate: Float32 = network.images(spikes, sensors)[0].clamp(min=0).cpu().numpy()
+        rate: Float32 = network.images(spikes, sensors, half=has_bfloat16(device))[0].clamp(min=0).cpu().numpy()
     return rate
 
 
