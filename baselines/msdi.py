@@ -28,6 +28,7 @@ from spike4dgs.baselines.rig import HOLE_PX, Cloud, fill, filled, matched, thin
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.poses import align_cameras
 from spike4dgs.benchmark.scene import TrainingScene
@@ -70,8 +71,8 @@ def msdi(scene: TrainingScene, seed: int) -> Start:
     Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
     """
     glance = look(scene, calibrated=True)
-    cloud = matched(scene, flat_field=True)
-    return filled(scene, completed(cloud, glance), flat_field=True)
+    cloud, mean = matched(scene, flat_field=True)
+    return filled(scene, completed(cloud, glance), mean)
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
@@ -81,7 +82,7 @@ def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
 
 def look(scene: TrainingScene, *, calibrated: bool) -> Glance:
     """What the network in use makes of the middle of the clip, told the intrinsics or not; raises as `msdi`."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = choose_device("auto")
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
     spikes = np.stack([window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams])

@@ -55,11 +55,11 @@ def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
 
     Raises UserError where all cameras stand in one place.
     """
-    return filled(scene, matched(scene, flat_field), flat_field)
+    return filled(scene, *matched(scene, flat_field))
 
 
-def matched(scene: TrainingScene, flat_field: bool) -> Cloud:
-    """The points on which views agree, thinned; raises as `rig`."""
+def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
+    """The points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} in one place"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
@@ -79,12 +79,12 @@ def matched(scene: TrainingScene, flat_field: bool) -> Cloud:
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
         clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
-    return thin(scene.cameras, Cloud(points, values))
+    return thin(scene.cameras, Cloud(points, values)), mean
 
 
-def filled(scene: TrainingScene, cloud: Cloud, flat_field: bool) -> Start:
-    """The start from a cloud, with points where it leaves the picture empty."""
-    cloud = fill(scene.cameras, _pictures(scene, 0, scene.n_ticks, flat_field), cloud)
+def filled(scene: TrainingScene, cloud: Cloud, mean: Float32) -> Start:
+    """The start from a cloud, with points where it leaves the picture empty, coloured by the clip's means [C, H, W]."""
+    cloud = fill(scene.cameras, mean, cloud)
     return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
 
 

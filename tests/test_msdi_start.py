@@ -113,7 +113,7 @@ def test_without_a_rising_line_the_matched_points_are_all(perfect: Glance) -> No
 def test_the_start_is_rig_flats_where_views_match(drawn: Path) -> None:
     start, flat = msdi(SCENE, 0), rig_flat(SCENE, 0)
     assert start.cameras is SCENE.cameras
-    n = len(matched(SCENE, flat_field=True).points)
+    n = len(matched(SCENE, flat_field=True)[0].points)
     np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.calibration import Calibration
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes import SpikeStream
 from spike4dgs.method.msdi.weights import load_network, read_card, weights_path
 
@@ -21,15 +22,12 @@ def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None
     With a calibration: those of an ideal camera. Beyond the clip's ends the clip is mirrored. Raises UserError where
     the weights are missing or damaged.
     """
-    import torch  # imported where it is used: reading spikes must not wait for it
-
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return reconstruct(load_network(weights_path(), device), stream, tick, camera)
+    return reconstruct(load_network(weights_path(), choose_device("auto")), stream, tick, camera)
 
 
 def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
     """What `network` takes the rate to be at the start of `tick`: spikes per tick [H, W] float32, not negative."""
-    import torch
+    import torch  # imported where it is used: reading spikes must not wait for it
 
     from spike4dgs.method.msdi.inputs import Sensors
     from spike4dgs.method.msdi.network import has_bfloat16

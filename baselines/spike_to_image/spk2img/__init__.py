@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.spk2img.weights import load_network, read_card, weights_path
 from spike4dgs.baselines.spike_to_image.windows import WINDOW, window
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes import SpikeStream
 
 if TYPE_CHECKING:
@@ -19,15 +20,12 @@ def spk2img_image(stream: SpikeStream, tick: int) -> Float32:
 
     Beyond the clip's ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
     """
-    import torch  # imported where it is used: reading spikes must not wait for it
-
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return reconstruct(load_network(weights_path(), device), stream, tick)
+    return reconstruct(load_network(weights_path(), choose_device("auto")), stream, tick)
 
 
 def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
     """What `network` takes the rate to be at the start of `tick`: spikes per tick [H, W] float32, not negative."""
-    import torch
+    import torch  # imported where it is used: reading spikes must not wait for it
 
     device = next(network.parameters()).device
     with torch.inference_mode():
