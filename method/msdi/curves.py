@@ -78,7 +78,7 @@ def plot_calibration(path: Path, groups: Float64) -> None:
     axes.plot(ends, ends, color="0.7", label="as expected")
     axes.plot(groups[:, 0], groups[:, 1], "o-", label="tenths of the pixels, by expected error")
     axes.set(xscale="log", yscale="log", xlabel="expected error, alpha / C", ylabel="true error")
-    axes.set_title("points of hidden variants, in mean distances of a sample")
+    axes.set_title("points of hidden variants,\nin mean distances of a sample")
     axes.grid(True, color="0.9")
     axes.legend(fontsize=8)
     with atomic_path(path) as part:
