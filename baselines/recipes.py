@@ -84,7 +84,13 @@ BEYOND = (
         "rig-flat",
         "paths",
         "pixel",
-        {"flat_field": True, "freeze_still": True, "moving_change": 0.012, "coarse_steps": 600},
+        {
+            "flat_field": True,
+            "freeze_still": True,
+            "moving_change": 0.012,
+            "coarse_steps": 600,
+            "max_gaussians": 30_000,
+        },
     ),
 )
 

@@ -198,9 +198,8 @@ def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, super
     supervision = supervise(settings, job.scene).to(job.device)
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
-    gaussians = trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
     cameras = trainer.poses.cameras(start.cameras)
-    return FittedModel(gaussians, trainer.still, motion, job.scene.duration_us, job.device, spec, cameras)
+    return FittedModel(trainer.pieces(), trainer.still, motion, job.scene.duration_us, job.device, spec, cameras)
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from spike4dgs.method.motion import MOTIONS, Extent, Motion
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.backdrop import join
+from spike4dgs.method.trainer import one_torch_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class FittedModel:
 
     KIND: ClassVar = "gaussians"
 
-    gaussians: Gaussians
+    pieces: tuple[Gaussians, ...]  # of equal parts of the clip, one after the other
     still: Gaussians  # none unless the fit froze some
     motion: Motion
     duration_us: float
@@ -59,22 +61,29 @@ class FittedModel:
     @property
     def size_bytes(self) -> int:
         """Bytes of the Gaussians and of the motion model."""
-        tensors = [*self.gaussians.tensors().values(), *self.still.tensors().values()]
+        tensors = [t for g in (*self.pieces, self.still) for t in g.tensors().values()]
         return count_bytes([*tensors, *self.motion.state_dict().values()])
 
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
         """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
-        image = render(self.splats(t_us), views).image
-        return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+        with one_torch_thread():
+            image = render(self.splats(t_us), views).image
+            return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
         """What is drawn at `t_us`."""
-        moving = self.motion.splats(self.gaussians, min(max(t_us / self.duration_us, 0.0), 1.0))
+        t, count = min(max(t_us / self.duration_us, 0.0), 1.0), len(self.pieces)
+        piece = min(int(t * count), count - 1)
+        moving = self.motion.splats(self.pieces[piece], t * count - piece)
         if not len(self.still):
             return moving
-        return join(self.still.splats(), moving)
+        return join(self._backdrop, moving)
+
+    @cached_property
+    def _backdrop(self) -> Splats:
+        return self.still.splats()
 
     def picture(self, image: Tensor, views: Views) -> Tensor:
         """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
@@ -82,8 +91,10 @@ class FittedModel:
 
     def save(self, path: Path, provenance: Provenance) -> None:
         """Write the model to one file; see `saved_model.load_model`."""
-        tensors = group(gaussians=self.gaussians.tensors(), still=self.still.tensors(), motion=self.motion.state_dict())
-        write_model(path, ModelFile(self.KIND, {"motion": self.spec.as_dict()}, tensors, provenance))
+        pieces = {f"piece{i}": g.tensors() for i, g in enumerate(self.pieces)}
+        tensors = group(**pieces, still=self.still.tensors(), motion=self.motion.state_dict())
+        config = {"motion": self.spec.as_dict(), "pieces": len(pieces)}
+        write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> FittedModel:
@@ -91,11 +102,11 @@ class FittedModel:
         spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
         motion = MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator())
         motion.load_state_dict(file.part("motion"))
-        gaussians, still = (
+        *pieces, still = (
             Gaussians.from_tensors({k: v.to(device) for k, v in file.part(part).items()})
-            for part in ("gaussians", "still")
+            for part in (*(f"piece{i}" for i in range(file.config["pieces"])), "still")
         )
-        return cls(gaussians, still, motion.to(device), file.provenance.duration_us, device, spec)
+        return cls(tuple(pieces), still, motion.to(device), file.provenance.duration_us, device, spec)
 
 
 def count_bytes(tensors: Iterable[Tensor]) -> int:

@@ -34,8 +34,13 @@ class Motion(nn.Module):
     moves = True  # False: all times look the same, and only the static stage is trained
     rests_first = True  # a static stage comes before the moving one
 
+    @property
+    def pieces(self) -> int:
+        """Parts of the clip, of one length, that have Gaussians of their own; odd."""
+        return 1
+
     def splats(self, gaussians: Gaussians, t: float) -> Splats:
-        """What is drawn at t in [0, 1], differentiable in the Gaussians and in the model's own parameters."""
+        """What is drawn at t in [0, 1] of the clip, or a piece; differentiable in Gaussians and own parameters."""
         raise NotImplementedError
 
     def picture(self, image: Tensor, views: Views) -> Tensor:
@@ -49,6 +54,10 @@ class Motion(nn.Module):
     def born(self, edit: Edit, generator: torch.Generator) -> Edit:
         """The same edit after a change of the Gaussians that densification added."""
         return edit
+
+    def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
+        """The Gaussians of a piece as those with which the next one begins, or, not forward, the one before it."""
+        raise NotImplementedError
 
     def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
         """The Gaussians followed by new ones where pictures are bad; asked for `guided_rounds` times in a fit."""

@@ -16,6 +16,7 @@ class TrainSettings:
     # Steps. One step renders several views at one time, where 4DGS takes one image: 1 step here is 4 there.
     coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
     fine_steps: int = 1200  # deforming stage (4DGS: 14000 single images)
+    piece_steps: int = 800  # the same of each further piece of a long clip, where the motion model has pieces
     views_per_step: int = 4  # they share one time and one deformation; of 8 views only half as many steps fit the time
     ramp: float = 0.3  # share of the fine stage in which the times open up from the middle to the whole clip
 
@@ -23,7 +24,7 @@ class TrainSettings:
     time_spacing_ticks: int = 10  # 0.5 ms at 20 kHz: half a ground-truth interval
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their pictures belong to a later time
     max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
-    coarse_share: float = 0.2  # middle share of the clip that the coarse stage of a moving scene sees
+    coarse_share: float = 0.2  # middle share of the clip (or its middle piece) that a moving scene's coarse stage sees
     flat_field: bool = False  # correct the pictures by each camera's calibrated gain n(x, y) and dark rate, if known
 
     # Poses of the training cameras.
@@ -56,6 +57,7 @@ class TrainSettings:
     min_opacity: float = 0.005  # fainter ones are removed
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
     max_moving_per_pixel: float = 0.4  # the same of those before a backdrop, which is not counted
+    max_gaussians: int = 1_000_000  # whatever the pictures' size; half as many before a backdrop
 
     # Deformation.
     cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
@@ -100,6 +102,7 @@ class TrainSettings:
             self,
             coarse_steps=max(1, round(self.coarse_steps * scale)),
             fine_steps=max(1, round(self.fine_steps * scale)),
+            piece_steps=max(1, round(self.piece_steps * scale)),
         )
 
 

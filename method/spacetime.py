@@ -41,6 +41,7 @@ from spike4dgs.method.spacetime_decoder import Decoder
 from spike4dgs.method.splat import Splats, Views
 
 CUBIC = 9  # m1, m2, m3
+PIECE_TICKS = 400  # 20 ms at 20 kHz
 
 
 class SpacetimeLite(Motion):
@@ -114,6 +115,25 @@ class Paths(SpacetimeLite):
     """
 
     rests_first = True
+
+    @property
+    def pieces(self) -> int:
+        """About 20 ms each: what a cubic can follow, at a cost of drawing that does not grow with the clip."""
+        return 2 * round((self.extent.n_ticks / PIECE_TICKS - 1) / 2) + 1
+
+    def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
+        """The Gaussians as they are at the piece's end, or beginning, going on straight at the speed that they have."""
+        end, ahead = (1.0, 0.5) if forward else (0.0, -0.5)
+        with torch.no_grad():
+            d = (end - gaussians.extra["times"])[:, None]
+            m1, m2, m3 = gaussians.extra["paths"].view(-1, 3, 3).unbind(1)
+            means, quats, _, opacities = at_time(gaussians, end)
+            speed, spins = m1 + d * (2 * m2 + 3 * d * m3), gaussians.extra["spins"]
+            there = replace(gaussians, means=means + ahead * speed, quats=quats + ahead * spins,
+                            logits=torch.logit(opacities, 1e-6))  # fmt: skip
+            new = self.timed(there, torch.full_like(gaussians.logits, 0.5), self.settings.static_life)
+            new.extra["paths"][:, :3], new.extra["spins"][:] = speed, spins
+        return new
 
     def attach(self, gaussians: Gaussians, footage: Footage) -> Gaussians:
         """All at rest in the middle of the clip, for as long as it lasts."""

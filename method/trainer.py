@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -24,50 +23,12 @@ from spike4dgs.method.gaussians import Edit, Gaussians
 from spike4dgs.method.motion_model import Motion
 from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
 from spike4dgs.method.poses import Poses
+from spike4dgs.method.schedule import Stage, choose_time, stages
 from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.backdrop import Backdrop
 from spike4dgs.method.supervision_model import Sample, Supervision
-
-GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stretch of steps with its own optimiser and schedule."""
-
-    first: int
-    steps: int
-    deforms: bool
-
-    def fraction(self, step: int) -> float:
-        """Position of a step within the stage, in [0, 1)."""
-        return (step - self.first) / self.steps
-
-
-def stages(settings: TrainSettings, moves: bool, rests_first: bool = True) -> list[Stage]:
-    """The static stage, followed by the deforming one where the motion model moves; or one that deforms throughout."""
-    if moves and not rests_first:
-        return [Stage(0, settings.coarse_steps + settings.fine_steps, deforms=True)]
-    coarse = Stage(0, settings.coarse_steps, deforms=False)
-    return [coarse, Stage(coarse.steps, settings.fine_steps, deforms=True)] if moves else [coarse]
-
-
-def choose_time(settings: TrainSettings, stage: Stage, step: int, times: int, moves: bool) -> int:
-    """Index of the step's time among `times`.
-
-    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians, and opens up to the
-    whole clip: motion is then followed from known into unknown times. A static scene sees all times throughout.
-    """
-    share = 1.0
-    if moves and not stage.deforms:
-        share = settings.coarse_share
-    elif moves:
-        opened = min(1.0, stage.fraction(step) / settings.ramp) if settings.ramp else 1.0
-        share = settings.coarse_share + (1 - settings.coarse_share) * opened
-    at = 0.5 + share * ((step * GOLDEN) % 1.0 - 0.5)
-    return min(times - 1, int(at * times))
 
 
 def seeded(seed: int, step: int) -> torch.Generator:
@@ -108,10 +69,11 @@ class Trainer:
             raise problem("settings", "refine_poses or freeze_still", "both", fix)
         self.footage, self.motion, self.supervision = footage, motion, supervision
         self.settings, self.scale, self.seed = settings, scale, seed
-        self.plan = stages(settings, motion.moves, motion.rests_first)
+        self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
         self.gaussians = gaussians.trainable()
+        self.ended: dict[int, Gaussians] = {}  # the pieces of the clip that are fitted
         self.still = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # frozen: the backdrop
         self.backdrop: Backdrop | None = None
         self.poses = Poses(footage.views, scale)
@@ -141,6 +103,22 @@ class Trainer:
         self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
         self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
 
+    def _continue(self, stage: Stage) -> None:
+        """Go over to a stage: what is still becomes a backdrop, or a piece of the clip ends and another begins."""
+        if stage.neighbour is None:
+            if stage.deforms and self.settings.freeze_still:
+                self._freeze()
+            return
+        before = self.plan[self.plan.index(stage) - 1]
+        self.ended[before.piece] = self.gaussians.rows(torch.arange(len(self.gaussians)))
+        first = self.motion.continued(self.ended[stage.neighbour], forward=stage.piece > stage.neighbour)
+        self.gaussians = first.trainable()
+
+    def pieces(self) -> tuple[Gaussians, ...]:
+        """What is fitted of each piece of the clip, in their order, once the fit is done."""
+        last = {self.stage.piece: self.gaussians.rows(torch.arange(len(self.gaussians)))}
+        return tuple(g for _, g in sorted({**self.ended, **last}.items()))
+
     def _freeze(self) -> None:
         """Make a backdrop of the Gaussians at whose places no view sees a change."""
         moves = moving(self.gaussians.means.detach(), self.footage) > self.settings.moving_change
@@ -153,7 +131,7 @@ class Trainer:
     def sample(self) -> Sample:
         """The current step's views and time."""
         footage, count = self.footage, len(self.footage.views)
-        index = choose_time(self.settings, self.stage, self.step, len(footage.ticks), self.motion.moves)
+        index = choose_time(self.settings, self.stage, self.step, len(footage.ticks))
         views = torch.arange(count)
         if self.settings.views_per_step < count:
             order = torch.randperm(count, generator=seeded(self.seed, self.step))
@@ -166,15 +144,14 @@ class Trainer:
         """One step; returns the loss."""
         stage, sample = self.stage, self.sample()
         if self.step == stage.first and self.step:
-            if stage.deforms and self.settings.freeze_still:
-                self._freeze()
+            self._continue(stage)
             self._begin(stage)
         chosen = list(sample.views)
         views = self.poses.views(chosen) if self.settings.refine_poses else self._views(chosen)
         outputs: list[RenderOutput] = []
 
         def draw(t: float) -> Tensor:
-            splats = self.motion.splats(self.gaussians, t) if stage.deforms else self.gaussians.splats()
+            splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
             outputs.append(self.backdrop.render(splats, chosen) if self.backdrop else self._render(splats, views))
             image = outputs[-1].image
             return self.motion.picture(image, views) if stage.deforms else image[..., 0]
@@ -204,7 +181,10 @@ class Trainer:
         if done % s.refine_every or done > s.refine_until * stage.steps:
             return
         width, height = self._size()
-        limit = round((s.max_moving_per_pixel if self.backdrop else s.max_per_pixel) * width * height)
+        density, most = (
+            (s.max_moving_per_pixel, s.max_gaussians // 2) if self.backdrop else (s.max_per_pixel, s.max_gaussians)
+        )
+        limit = min(round(density * width * height), most)
         rng = seeded(self.seed, self.step)
         for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
@@ -241,6 +221,7 @@ class Trainer:
         parts = {
             "gaussians": self.gaussians.tensors(),
             "still": self.still.tensors(),
+            **{f"piece{i}": g.tensors() for i, g in self.ended.items()},
             "motion": self.motion.state_dict(),
             "supervision": self.supervision.state_dict(),
             "poses": self.poses.state_dict(),
@@ -259,6 +240,9 @@ class Trainer:
         self.gaussians = Gaussians.from_tensors(on["gaussians"]).trainable()
         if len(on["still"]["means"]):
             self._set_still(Gaussians.from_tensors(on["still"]))
+        for stage in self.plan:
+            if ended := saved.part(f"piece{stage.piece}"):
+                self.ended[stage.piece] = Gaussians.from_tensors({k: v.to(device) for k, v in ended.items()})
         self.motion.load_state_dict(saved.part("motion"))
         self.supervision.load_state_dict(saved.part("supervision"))
         self.poses.load_state_dict(saved.part("poses"))

@@ -74,7 +74,7 @@ def gaussian_model(motion: str, still: int = 0) -> FittedModel:
     rng = seeded(4, 0)
     extra = {k: v + 0.1 * torch.randn(v.shape, generator=rng) for k, v in gaussians.extra.items()}
     moved = Gaussians.from_tensors({**gaussians.tensors(), **extra})
-    return FittedModel(moved, points().rows(torch.arange(still)), made, DURATION_US, "cpu", spec)
+    return FittedModel((moved,), points().rows(torch.arange(still)), made, DURATION_US, "cpu", spec)
 
 
 def tracked_model() -> TrackedModel:

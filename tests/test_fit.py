@@ -68,7 +68,8 @@ def test_a_model_renders_the_same_bits_again_and_stops_at_the_ends_of_the_clip()
 def bits(seed: int = 0, name: str = "tfp+4dgs") -> dict[str, torch.Tensor]:
     model = METHODS[name].fit(WORLD.training, SHORT, "cpu", seed, quiet)
     assert isinstance(model, FittedModel)
-    return {**model.gaussians.tensors(), **model.motion.state_dict()}
+    (gaussians,) = model.pieces
+    return {**gaussians.tensors(), **model.motion.state_dict()}
 
 
 def test_cores_do_not_change_a_bit_and_the_seed_does() -> None:

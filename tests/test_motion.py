@@ -106,7 +106,12 @@ def test_pictures_are_never_negative() -> None:
     g.colors[:] = -1.0
     static = MOTIONS["static"](EXTENT, SETTINGS, seeded(0, 0))
     model = FittedModel(
-        g, g.rows(torch.zeros(len(g), dtype=torch.bool)), static, 1000.0, "cpu", MotionSpec("static", EXTENT, SETTINGS)
+        (g,),
+        g.rows(torch.zeros(len(g), dtype=torch.bool)),
+        static,
+        1000.0,
+        "cpu",
+        MotionSpec("static", EXTENT, SETTINGS),
     )
     image = model.render(WORLD.cameras[0], 500.0)
     assert image.dtype == np.float32 and (image == 0).all()

@@ -16,10 +16,11 @@ from spike4dgs.method.fit import Parts, RecipeMethod, Start, choose_ticks, film,
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.schedule import choose_time, stages
 from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.supervision import SUPERVISIONS
-from spike4dgs.method.trainer import Trainer, choose_time, seeded, stages
+from spike4dgs.method.trainer import Trainer, seeded
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)
 
@@ -228,24 +229,25 @@ def test_device_that_is_not_there_is_refused():
 def test_budget_scales_steps_only():
     s = TrainSettings()
     half = s.scaled(0.5)
-    assert (half.coarse_steps, half.fine_steps) == (s.coarse_steps // 2, s.fine_steps // 2)
-    assert replace(half, coarse_steps=s.coarse_steps, fine_steps=s.fine_steps) == s
+    steps = ("coarse_steps", "fine_steps", "piece_steps")
+    assert all(getattr(half, name) == getattr(s, name) // 2 for name in steps)
+    assert replace(half, **{name: getattr(s, name) for name in steps}) == s
 
 
 def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
     s = TrainSettings(coarse_steps=200, fine_steps=400, ramp=0.5, coarse_share=0.2)
     coarse, fine = stages(s, moves=True)
-    first = {choose_time(s, coarse, step, 100, True) for step in range(200)}
+    first = {choose_time(s, coarse, step, 100) for step in range(200)}
     assert min(first) >= 39 and max(first) <= 60 and len(first) > 15
-    opening = [[choose_time(s, fine, step, 100, True) for step in range(a, a + 40)] for a in (200, 260, 330)]
+    opening = [[choose_time(s, fine, step, 100) for step in range(a, a + 40)] for a in (200, 260, 330)]
     reach = [max(times) - min(times) for times in opening]
     assert reach[0] < 40 and reach[0] + 15 < reach[1] and reach[1] + 15 < reach[2]
-    whole = {choose_time(s, fine, step, 100, True) for step in range(400, 600)}
+    whole = {choose_time(s, fine, step, 100) for step in range(400, 600)}
     assert min(whole) <= 1 and max(whole) >= 98 and len(whole) > 80
     (throughout,) = stages(s, moves=True, rests_first=False)
     assert throughout.deforms and throughout.steps == 600
     (only,) = stages(s, moves=False)
-    assert len({choose_time(s, only, step, 100, False) for step in range(200)}) > 95
+    assert len({choose_time(s, only, step, 100) for step in range(200)}) > 95
 
 
 @pytest.mark.parametrize("n_ticks", [1, 5, 80, 400, 10000])

@@ -25,8 +25,9 @@ from spike4dgs.method.radiance_field.march import Rays, camera_rays
 from spike4dgs.method.radiance_field.model import DynamicField, FieldShape, RadianceModel, bounds_of
 from spike4dgs.method.radiance_field.occupancy import may_move
 from spike4dgs.method.radiance_field.spiking import Reset, firing_rate, spike_loss
+from spike4dgs.method.schedule import GOLDEN
 from spike4dgs.method.settings import TrainSettings
-from spike4dgs.method.trainer import GOLDEN, one_torch_thread, seeded
+from spike4dgs.method.trainer import one_torch_thread, seeded
 
 # SpikeNeRF's own values, for synthetic scenes (its rate falls by 0.1^(step / 500,000), its two networks are alike), and
 # for the deformation 4DGS's, for the settings of the same name.

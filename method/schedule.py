@@ -1,0 +1,74 @@
+"""When a fit sees what: stages of steps, each on a part of the clip that opens up while the stage goes on.
+
+A long clip may be fitted in pieces, each with Gaussians of its own: the middle one first, from the static stage; then,
+outwards, every other one from where its neighbour ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spike4dgs.method.settings import TrainSettings
+
+GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
+
+Interval = tuple[float, float]  # of the clip, which is [0, 1]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stretch of steps with its own optimiser and schedule."""
+
+    first: int
+    steps: int
+    deforms: bool
+    span: Interval = (0.0, 1.0)  # the part of the clip that the stage fits
+    begin: Interval = (0.0, 1.0)  # what it sees of that at its first step
+    piece: int = 0
+    neighbour: int | None = None  # the piece that this one continues
+
+    def fraction(self, step: int) -> float:
+        """Position of a step within the stage, in [0, 1)."""
+        return (step - self.first) / self.steps
+
+    def within(self, t: float) -> float:
+        """A time of the clip as a time of the stage's span, which is [0, 1]."""
+        return (t - self.span[0]) / (self.span[1] - self.span[0])
+
+
+def stages(settings: TrainSettings, moves: bool, rests_first: bool = True, pieces: int = 1) -> list[Stage]:
+    """The static stage, followed by deforming ones where the motion model moves; or one that deforms throughout.
+
+    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd.
+    """
+    s = settings
+    if moves and not rests_first:
+        share = s.coarse_share / 2
+        return [Stage(0, s.coarse_steps + s.fine_steps, deforms=True, begin=(0.5 - share, 0.5 + share))]
+    if not moves:
+        return [Stage(0, s.coarse_steps, deforms=False)]
+    share, middle = s.coarse_share / (2 * pieces), pieces // 2
+    center = (0.5 - share, 0.5 + share)
+    plan = [Stage(0, s.coarse_steps, deforms=False, span=center, begin=center)]
+    for piece in sorted(range(pieces), key=lambda p: abs(p - middle)):
+        first, span = plan[-1].first + plan[-1].steps, (piece / pieces, (piece + 1) / pieces)
+        if piece == middle:
+            plan.append(Stage(first, s.fine_steps, True, span, center, piece))
+        elif piece > middle:
+            begin = (span[0], span[0] + 2 * share)
+            plan.append(Stage(first, s.piece_steps, True, span, begin, piece, piece - 1))
+        else:
+            begin = (span[1] - 2 * share, span[1])
+            plan.append(Stage(first, s.piece_steps, True, span, begin, piece, piece + 1))
+    return plan
+
+
+def choose_time(settings: TrainSettings, stage: Stage, step: int, times: int) -> int:
+    """Index of the step's time among `times`: in what the stage begins with, and then, as that opens up, in its span.
+
+    Motion is followed from known into unknown times. A static scene sees all times throughout.
+    """
+    opened = min(1.0, stage.fraction(step) / settings.ramp) if settings.ramp else 1.0
+    low, high = (a + (b - a) * opened for a, b in zip(stage.begin, stage.span, strict=True))
+    at = low + (high - low) * ((step * GOLDEN) % 1.0)
+    return min(times - 1, int(at * times))
