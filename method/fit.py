@@ -193,7 +193,8 @@ def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, super
     """Run the trainer on Gaussians that start at the job's points."""
     settings, start = job.settings, job.start
     motion = make_motion(spec.extent, spec.settings, seeded(job.seed, -1)).to(job.device)
-    first = from_points(start.points, start.values, opacity=settings.initial_opacity, device=job.device)
+    look = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
+    first = from_points(start.points, start.values, **look, device=job.device)
     first = motion.attach(first, job.footage)
     supervision = supervise(settings, job.scene).to(job.device)
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)

@@ -81,9 +81,14 @@ def concatenate(parts: list[Gaussians]) -> Gaussians:
 
 
 def from_points(
-    points: NDArray[np.float32], values: NDArray[np.float32], *, opacity: float, device: str = "cpu"
+    points: NDArray[np.float32],
+    values: NDArray[np.float32],
+    *,
+    opacity: float,
+    scale: float = 1.0,
+    device: str = "cpu",
 ) -> Gaussians:
-    """Round Gaussians at points [N, 3] with gray values [N], as wide as the mean distance of their 3 nearest points.
+    """Round Gaussians at points [N, 3] with gray values [N], `scale` x the mean distance of a point's 3 nearest wide.
 
     Raises UserError for fewer than 4 points or values that are not finite.
     """
@@ -101,7 +106,7 @@ def from_points(
 
     return Gaussians(
         means=tensor(points),
-        log_scales=tensor(np.repeat(np.log(distance)[:, None], 3, axis=1)),
+        log_scales=tensor(np.repeat(np.log(scale * distance)[:, None], 3, axis=1)),
         quats=tensor(np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (n, 1))),
         logits=tensor(np.full(n, math.log(opacity / (1 - opacity)))),
         colors=tensor(values[:, None]),

@@ -40,6 +40,7 @@ class TrainSettings:
 
     # Gaussians.
     initial_opacity: float = 0.5  # points from a plane sweep lie on surfaces; 0.1 suits sparse clouds
+    initial_scale: float = 1.0  # x the mean distance of a point's 3 nearest ones, 3DGS's
     means_rate: float = 1.6e-4  # x scene scale, as 3DGS
     means_rate_last: float = 1.6e-5
     scales_rate: float = 1e-2
