@@ -88,8 +88,9 @@ BEYOND = (
             "flat_field": True,
             "freeze_still": True,
             "moving_change": 0.012,
+            "initial_scale": 0.5,
             "coarse_steps": 600,
-            "max_gaussians": 30_000,
+            "max_gaussians": 36_000,
         },
     ),
 )

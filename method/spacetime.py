@@ -111,7 +111,9 @@ class Paths(SpacetimeLite):
     """The motion part `paths`: gray values on polynomial paths that begin at rest in the middle of the clip.
 
     The static stage finds things where they are then; while the times open up, they are followed from there. One
-    Gaussian sees its thing for the whole clip, which averages the noise that a short life would keep.
+    Gaussian sees its thing for the whole clip, which averages the noise that a short life would keep. Clips much longer
+    than 20 ms are fitted in pieces: no cubic follows a wheel for longer, and what a Gaussian gets wrong at one time
+    would pull at all others.
     """
 
     rests_first = True

@@ -1,4 +1,4 @@
-"""The one trainer of all recipes: a static stage, then a deforming one; several views of one time per step.
+"""The one trainer of all recipes: the stages of `schedule`, static and deforming; several views of one time per step.
 
 Everything random is drawn from generators seeded by (seed, step), so that the step number is the whole random state
 and a fit that resumes from a checkpoint gives the bits of one that never stopped (on the CPU).
