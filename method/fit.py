@@ -193,14 +193,24 @@ def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, super
     """Run the trainer on Gaussians that start at the job's points."""
     settings, start = job.settings, job.start
     motion = make_motion(spec.extent, spec.settings, seeded(job.seed, -1)).to(job.device)
+    points, values = at_most(settings.max_gaussians, start, job.seed)
     look = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
-    first = from_points(start.points, start.values, **look, device=job.device)
+    first = from_points(points, values, **look, device=job.device)
     first = motion.attach(first, job.footage)
     supervision = supervise(settings, job.scene).to(job.device)
     trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
     cameras = trainer.poses.cameras(start.cameras)
     return FittedModel(trainer.pieces(), trainer.still, motion, job.scene.duration_us, job.device, spec, cameras)
+
+
+def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
+    """The points [N, 3] and gray values [N] of a start, or as many of them as a fit may have, drawn at random."""
+    points, values = start.points, start.values
+    if len(points) <= count:
+        return points, values
+    kept = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
+    return points[kept], values[kept]
 
 
 def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:

@@ -13,7 +13,7 @@ from toy_world import ToyWorld
 from spike4dgs.benchmark.recipes import Budget, Recipe
 from spike4dgs.benchmark.scene import TrainingScene
 from spike4dgs.method import spacetime
-from spike4dgs.method.fit import Parts, RecipeMethod, Start, film, measure
+from spike4dgs.method.fit import Parts, RecipeMethod, Start, at_most, film, measure
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians import from_points
 from spike4dgs.method.motion import MOTIONS, Extent
@@ -137,6 +137,17 @@ def test_a_cap_holds_whatever_the_pictures_size() -> None:
     fit.run(quiet)
     assert start < 1500 and len(fit.still) + 750 <= 2250
     assert all(len(g) <= max(750, start - len(fit.still)) for g in fit.pieces())
+
+
+def test_a_start_with_more_points_than_the_cap_is_thinned() -> None:
+    start = surfaces(WORLD.training, 0)
+    points, values = at_most(500, start, 7)
+    pairs = {(*p, v) for p, v in zip(start.points.tolist(), start.values.tolist(), strict=True)}
+    assert len(points) == len(values) == 500 < len(start.points)
+    assert (
+        len(kept := {(*p, v) for p, v in zip(points.tolist(), values.tolist(), strict=True)}) == 500 and kept <= pairs
+    )
+    assert not np.array_equal(points, at_most(500, start, 8)[0]) and at_most(10**6, start, 7)[0] is start.points
 
 
 def test_a_time_is_drawn_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
