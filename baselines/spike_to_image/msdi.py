@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
@@ -42,6 +44,15 @@ def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibrati
     return rate
 
 
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """A thread for each core that keeps to it: torch shares the work of a small network badly between cores."""
+    import torch
+
+    torch.get_num_threads()  # settles the caller's number: it would take over what these threads are told
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), "msdi", initializer=lambda: torch.set_num_threads(1))
+
+
 MSDI = ImageMaker(
     name="msdi",
     definition="MSDI's image generator on the 41 ticks around tick t",
@@ -49,4 +60,5 @@ MSDI = ImageMaker(
     rate=msdi_image,
     learned=partial(learned_from, weights_path, read_card),
     corrected=msdi_image,
+    pool=_pool,
 )
