@@ -42,6 +42,7 @@ from spike4dgs.method.splat import Splats, Views
 
 CUBIC = 9  # m1, m2, m3
 PIECE_TICKS = 400  # 20 ms at 20 kHz
+PIECE_PICTURES = 20  # at least about as many times of a view in each
 
 
 class SpacetimeLite(Motion):
@@ -120,8 +121,13 @@ class Paths(SpacetimeLite):
 
     @property
     def pieces(self) -> int:
-        """About 20 ms each: what a cubic can follow, at a cost of drawing that does not grow with the clip."""
-        return 2 * round((self.extent.n_ticks / PIECE_TICKS - 1) / 2) + 1
+        """About 20 ms each, what a cubic can follow, or longer where pictures are too far apart for that.
+
+        The cost of drawing does not grow with the clip.
+        """
+        s, ticks = self.settings, self.extent.n_ticks
+        pictures = min(s.max_times, ticks / s.time_spacing_ticks)
+        return 2 * round((min(ticks / PIECE_TICKS, pictures / PIECE_PICTURES) - 1) / 2) + 1
 
     def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
         """The Gaussians as they are at the piece's end, or beginning, going on straight at the speed that they have."""

@@ -45,7 +45,7 @@ def paths(n_ticks: int) -> spacetime.Paths:
 
 
 @pytest.mark.parametrize(
-    ("n_ticks", "pieces"), [(1, 1), (200, 1), (400, 1), (799, 1), (1200, 3), (2000, 5), (100_000, 249)]
+    ("n_ticks", "pieces"), [(1, 1), (200, 1), (400, 1), (799, 1), (1200, 3), (2000, 5), (100_000, 13)]
 )
 def test_pieces_are_about_20_ms_long_and_odd(n_ticks: int, pieces: int) -> None:
     assert paths(n_ticks).pieces == pieces
@@ -96,7 +96,7 @@ def trainer(**settings: float) -> Trainer:
     s = replace(
         TrainSettings(coarse_steps=6, fine_steps=8, piece_steps=8, refine_every=2, views_per_step=3), **settings
     )
-    s = replace(s, time_spacing_ticks=60, freeze_still=True)
+    s = replace(s, time_spacing_ticks=20, freeze_still=True)
     extent = measure(start, scene)
     motion = MOTIONS["paths"](extent, s, seeded(0, -1))
     footage = film(scene, start.cameras, pictures, s, "cpu")
