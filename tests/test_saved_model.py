@@ -110,7 +110,7 @@ def without(key: str) -> Any:
         (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"x": 1}}}}, "found 'x'; correct the name"),
         (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}}, "cannot read .Runtime"),
         (
-            lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "gaussians.means"}},
+            lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
             "cannot read .KeyError",
         ),
         (lambda f: {"provenance": provenance(cameras=())}, "expected method, scene, cameras and clock of a fit"),
