@@ -15,7 +15,6 @@ from toy_world import GAIN, ToyWorld
 from spike4dgs.baselines.msdi import Glance, block_means, completed, inverse_depth_line, look, msdi, shrunk, unposed
 from spike4dgs.baselines.rig import Cloud, matched, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
-from spike4dgs.baselines.spike_to_image.msdi import reconstruct
 from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError
@@ -26,7 +25,6 @@ from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.data import points_of
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.weights import VARIABLE, Card, load_network, save_weights
-from spike4dgs.method.trainer import one_torch_thread
 
 WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
 SCENE = WORLD.training
@@ -189,17 +187,6 @@ def test_pictures_are_the_networks_and_know_the_camera(drawn: Path) -> None:
     assert np.nanmean(np.abs(found - plain[0])) > 1e-3
     learned = maker.learned()
     assert learned is not None and learned.trained_on == ("toy-1",)
-
-
-def test_several_pictures_at_a_time_are_those_of_one_at_a_time(drawn: Path) -> None:
-    """In the order of their ticks; and the caller's torch keeps its threads."""
-    stream, ticks, threads = SCENE.streams[2], [70, 5, 40, 41, 12], torch.get_num_threads()
-    found = IMAGES["msdi"](stream, ticks, GAIN)
-    assert torch.get_num_threads() == threads
-    with one_torch_thread():
-        for picture, tick in zip(found, ticks, strict=True):
-            alone = reconstruct(load_network(drawn, "cpu"), stream, tick) / np.float32(GAIN)
-            np.testing.assert_array_equal(picture, alone)
 
 
 def test_without_weights_it_is_said_how_to_train_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,7 @@ class ImageMaker:
 
     A pixel's own rate can be corrected by its calibration afterwards. What looks at neighbours is better told before:
     `corrected` gives the rate that an ideal camera's pixels would have. `learned` tells of the weights in use; None
-    where nothing is learned or no weights are there. `pool`: where pictures are made several at a time.
+    where nothing is learned or no weights are there.
 
     >>> IMAGES["tfp"](stream, ticks=[100, 200], gain=0.6).shape  # doctest: +SKIP
     (2, 250, 400)
@@ -54,7 +53,6 @@ class ImageMaker:
     rate: Callable[[SpikeStream, int], Float32]
     learned: Callable[[], Learned | None] = lambda: None
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
-    pool: Callable[[], Executor] | None = None
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
@@ -64,17 +62,11 @@ class ImageMaker:
         `camera` corrects the pictures for what its pixels do to light; a dead pixel has seen nothing, which is not
         black but NaN. Raises UserError for a tick outside the clip.
         """
-        for tick in ticks:
+        images = np.empty((len(ticks), stream.height, stream.width), np.float32)
+        for image, tick in zip(images, ticks, strict=True):
             if not 0 <= tick < stream.n_ticks:
                 raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
-        images = np.empty((len(ticks), stream.height, stream.width), np.float32)
-
-        def make(tick: int) -> Float32:
-            return self.corrected(stream, tick, camera) if self.corrected and camera else self.rate(stream, tick)
-
-        in_order = self.pool().map if self.pool else map
-        for image, made in zip(images, in_order(make, ticks), strict=True):
-            image[:] = made
+            image[:] = self.corrected(stream, tick, camera) if self.corrected and camera else self.rate(stream, tick)
         if camera is None:
             images /= gain
             return images

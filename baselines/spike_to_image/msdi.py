@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
@@ -44,15 +42,6 @@ def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibrati
     return rate
 
 
-@cache
-def _pool() -> ThreadPoolExecutor:
-    """A thread for each core that keeps to it: torch shares the work of a small network badly between cores."""
-    import torch
-
-    torch.get_num_threads()  # settles the caller's number: it would take over what these threads are told
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), "msdi", initializer=lambda: torch.set_num_threads(1))
-
-
 MSDI = ImageMaker(
     name="msdi",
     definition="MSDI's image generator on the 41 ticks around tick t",
@@ -60,5 +49,4 @@ MSDI = ImageMaker(
     rate=msdi_image,
     learned=partial(learned_from, weights_path, read_card),
     corrected=msdi_image,
-    pool=_pool,
 )
