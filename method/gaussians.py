@@ -55,6 +55,10 @@ class Gaussians:
         """The Gaussians of `index` (integers or a mask), detached."""
         return Gaussians.from_tensors({k: v.detach()[index] for k, v in self.tensors().items()})
 
+    def detached(self) -> Gaussians:
+        """Copies that no gradient reaches and no optimiser changes."""
+        return Gaussians.from_tensors({k: v.detach().clone() for k, v in self.tensors().items()})
+
     def trainable(self) -> Gaussians:
         """Detached copies that require gradients."""
         leaves = {k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()}

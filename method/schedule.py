@@ -42,24 +42,20 @@ def stages(settings: TrainSettings, moves: bool, rests_first: bool = True, piece
     A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd.
     """
     s = settings
-    if moves and not rests_first:
-        share = s.coarse_share / 2
-        return [Stage(0, s.coarse_steps + s.fine_steps, deforms=True, begin=(0.5 - share, 0.5 + share))]
+    share, middle = s.coarse_share / pieces, pieces // 2
+    center = (0.5 - share / 2, 0.5 + share / 2)
     if not moves:
         return [Stage(0, s.coarse_steps, deforms=False)]
-    share, middle = s.coarse_share / (2 * pieces), pieces // 2
-    center = (0.5 - share, 0.5 + share)
+    if not rests_first:
+        return [Stage(0, s.coarse_steps + s.fine_steps, deforms=True, begin=center)]
     plan = [Stage(0, s.coarse_steps, deforms=False, span=center, begin=center)]
     for piece in sorted(range(pieces), key=lambda p: abs(p - middle)):
-        first, span = plan[-1].first + plan[-1].steps, (piece / pieces, (piece + 1) / pieces)
+        first, low, high = plan[-1].first + plan[-1].steps, piece / pieces, (piece + 1) / pieces
         if piece == middle:
-            plan.append(Stage(first, s.fine_steps, True, span, center, piece))
-        elif piece > middle:
-            begin = (span[0], span[0] + 2 * share)
-            plan.append(Stage(first, s.piece_steps, True, span, begin, piece, piece - 1))
-        else:
-            begin = (span[1] - 2 * share, span[1])
-            plan.append(Stage(first, s.piece_steps, True, span, begin, piece, piece + 1))
+            plan.append(Stage(first, s.fine_steps, True, (low, high), center, piece))
+            continue
+        begin, neighbour = ((low, low + share), piece - 1) if piece > middle else ((high - share, high), piece + 1)
+        plan.append(Stage(first, s.piece_steps, True, (low, high), begin, piece, neighbour))
     return plan
 
 

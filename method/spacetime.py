@@ -133,13 +133,11 @@ class Paths(SpacetimeLite):
         """The Gaussians as they are at the piece's end, or beginning, going on straight at the speed that they have."""
         end, ahead = (1.0, 0.5) if forward else (0.0, -0.5)
         with torch.no_grad():
-            d = (end - gaussians.extra["times"])[:, None]
-            m1, m2, m3 = gaussians.extra["paths"].view(-1, 3, 3).unbind(1)
-            means, quats, _, opacities = at_time(gaussians, end)
-            speed, spins = m1 + d * (2 * m2 + 3 * d * m3), gaussians.extra["spins"]
-            there = replace(gaussians, means=means + ahead * speed, quats=quats + ahead * spins,
-                            logits=torch.logit(opacities, 1e-6))  # fmt: skip
-            new = self.timed(there, torch.full_like(gaussians.logits, 0.5), self.settings.static_life)
+            g = move_to(gaussians, torch.full_like(gaussians.logits, end))
+            speed, spins = g.extra["paths"][:, :3], g.extra["spins"]
+            logits = torch.logit(at_time(gaussians, end)[3], 1e-6)  # as far as they have faded
+            there = replace(g, means=g.means + ahead * speed, quats=g.quats + ahead * spins, logits=logits)
+            new = self.timed(there, torch.full_like(logits, 0.5), self.settings.static_life)
             new.extra["paths"][:, :3], new.extra["spins"][:] = speed, spins
         return new
 

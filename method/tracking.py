@@ -170,7 +170,7 @@ def fit_first(job: FitJob) -> Gaussians:
     trainer = Trainer(still, start, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     total = s.first_steps + later_total(job)
     trainer.run(lambda done, _, note="": job.progress(done, total, note))
-    return trainer.gaussians.rows(torch.arange(len(trainer.gaussians), device=job.device))
+    return trainer.gaussians.detached()
 
 
 class Tracker:

@@ -110,14 +110,14 @@ class Trainer:
                 self._freeze()
             return
         before = self.plan[self.plan.index(stage) - 1]
-        self.ended[before.piece] = self.gaussians.rows(torch.arange(len(self.gaussians)))
+        self.ended[before.piece] = self.gaussians.detached()
         first = self.motion.continued(self.ended[stage.neighbour], forward=stage.piece > stage.neighbour)
         self.gaussians = first.trainable()
 
     def pieces(self) -> tuple[Gaussians, ...]:
         """What is fitted of each piece of the clip, in their order, once the fit is done."""
-        last = {self.stage.piece: self.gaussians.rows(torch.arange(len(self.gaussians)))}
-        return tuple(g for _, g in sorted({**self.ended, **last}.items()))
+        fitted = {**self.ended, self.stage.piece: self.gaussians.detached()}
+        return tuple(fitted[piece] for piece in sorted(fitted))
 
     def _freeze(self) -> None:
         """Make a backdrop of the Gaussians at whose places no view sees a change."""
