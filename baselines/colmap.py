@@ -1,4 +1,4 @@
-"""The initialisations `colmap` and `colmap-uncalibrated`: poses and points by structure from motion (COLMAP).
+"""The initialisations `colmap`, `colmap-flat` and `colmap-uncalibrated`: poses by structure from motion (COLMAP).
 
 SIFT features of one picture per training view, the mean of the whole clip: what moves is a blur there, and the static
 rest, where the spikes' quantisation noise has averaged out, carries the poses of a rig that stands still. Pictures are
@@ -7,7 +7,9 @@ positioning, bundle adjustment) solves for all views at once: an array is small 
 the pair that incremental mapping begins with is then easily placed in a wrong but locally best way.
 
 `colmap` keeps the calibrated intrinsics; `colmap-uncalibrated` knows nothing and refines one focal length for all
-views from a prior of 1.2 image widths. Poses come out in a frame of their own: the similarity that fits them to the
+views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` finds features in pictures corrected by
+the cameras' calibrations, of which there are nearly twice as many, and sweeps planes from the poses, as `rig-flat` does
+from given ones. Poses come out in a frame of their own: the similarity that fits them to the
 calibrated training poses (`benchmark.poses`) takes everything to the scene's frame, where held-out cameras are known.
 Calibrated poses serve for nothing else.
 """
@@ -25,7 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.rig import rig
+from spike4dgs.baselines.rig import rig, rig_flat, window_means
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.images import encode_srgb, write_png
@@ -68,14 +70,26 @@ def colmap_uncalibrated(scene: TrainingScene, seed: int) -> Start:
     return _start(scene, map_views(scene, clip_means(scene), seed, calibrated=False), seed)
 
 
+def colmap_flat(scene: TrainingScene, seed: int) -> Start:
+    """Poses from corrected pictures with the calibrated intrinsics, and points by plane sweep from there."""
+    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    found = _whole(scene, map_views(scene, pictures, seed, calibrated=True))
+    return rig_flat(replace(scene, cameras=found.cameras), seed)
+
+
 def _start(scene: TrainingScene, found: Mapping, seed: int) -> Start:
+    if len(_whole(scene, found).points) < MIN_POINTS:
+        return rig(replace(scene, cameras=found.cameras), seed)
+    return Start(found.cameras, found.points.astype(np.float32), found.values)
+
+
+def _whole(scene: TrainingScene, found: Mapping) -> Mapping:
+    """`found`, if it has all views. Raises UserError."""
     count, wanted = len(found.cameras), len(scene.cameras)
     if count < wanted:
         fix = "use rig, or a scene with more static texture"
         raise problem(f"COLMAP on {scene.id}", f"all {wanted} views registered", f"{count} of {wanted}", fix)
-    if len(found.points) < MIN_POINTS:
-        return rig(replace(scene, cameras=found.cameras), seed)
-    return Start(found.cameras, found.points.astype(np.float32), found.values)
+    return found
 
 
 def clip_means(scene: TrainingScene) -> Float32:

@@ -1,4 +1,4 @@
-"""The initialisations `msdi` and `msdi-uncalibrated`: poses and points by MSDI's network (section 3.3).
+"""The initialisations `msdi`, `msdi-poses` and `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
 
 The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
 was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
@@ -9,8 +9,9 @@ better than a network guesses it: those are the points of `rig-flat`. Where noth
 network's points take the place of the nearest depth; of view 0's, as inverse depths that a line brings to the matched
 ones.
 
-`msdi-uncalibrated` has the network alone: each view's pose follows from its points, by PnP (`method.msdi.pose`), with
-one focal length for all, and everything is moved to the scene's frame as COLMAP's result is.
+`msdi-poses` has the calibrated intrinsics and else the network alone: each view's pose follows from its points, by PnP
+(`method.msdi.pose`), and everything is moved to the scene's frame as COLMAP's result is. `msdi-uncalibrated` estimates
+one focal length for all views too.
 """
 
 from __future__ import annotations
@@ -73,6 +74,11 @@ def msdi(scene: TrainingScene, seed: int) -> Start:
     glance = look(scene, calibrated=True)
     cloud, mean = matched(scene, flat_field=True)
     return filled(scene, completed(cloud, glance), mean)
+
+
+def msdi_poses(scene: TrainingScene, seed: int) -> Start:
+    """Poses and points by the network; raises as `msdi`, and where a view gets no pose."""
+    return unposed(scene, look(scene, calibrated=True), seed, calibrated=True)
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:

@@ -7,12 +7,13 @@ with one `msdi` for pictures and points.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from spike4dgs.baselines.colmap import colmap, colmap_uncalibrated
+from spike4dgs.baselines.colmap import colmap, colmap_flat, colmap_uncalibrated
 from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.msdi import msdi, msdi_uncalibrated
+from spike4dgs.baselines.msdi import msdi, msdi_poses, msdi_uncalibrated
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.rig import rig, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
@@ -30,10 +31,12 @@ PARTS = Parts(
         "rig": rig,
         "rig-flat": rig_flat,
         "colmap": colmap,
+        "colmap-flat": colmap_flat,
         "colmap-uncalibrated": colmap_uncalibrated,
         "dust3r": dust3r,
         "dust3r-uncalibrated": dust3r_uncalibrated,
         "msdi": msdi,
+        "msdi-poses": msdi_poses,
         "msdi-uncalibrated": msdi_uncalibrated,
     },
     motion=MOTIONS,
@@ -100,15 +103,28 @@ SUPERVISED = tuple(
     Recipe(f"tfp+4dgs+{name}", "tfp", "rig", "hexplane", name) for name in ("spike", "pixel+spike", "spss")
 )
 
-# The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one.
+# The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one. First the rows
+# of the track `uncalibrated`, which are those of tables 1 and 2 with COLMAP's poses, or with the network's own.
+_BY_NAME = {recipe.name: recipe for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND)}
 POSED = (
-    Recipe("tfp+colmap+4dgs", "tfp", "colmap", "hexplane", "pixel"),
-    Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
-    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-uncalibrated", "hexplane", "spss", {**_MSDI, "refine_poses": True}),
+    *(
+        replace(_BY_NAME[f"{images}+{name}"], name=f"{images}+colmap+{name}", initialization="colmap")
+        for name, images in product(_MOTIONS, ("tfi", "tfp", "spk2img"))
+    ),
+    *(
+        replace(_BY_NAME[name], name=f"{name}+colmap", initialization=start)
+        for name, start in (
+            ("dy-spikegs", "colmap"),
+            ("dy-spikenerf", "colmap"),
+            ("spike4dgs", "colmap-flat"),
+            ("spike4dgs-x", "colmap-flat"),
+        )
+    ),
+    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-poses", "hexplane", "spss", {**_MSDI, "refine_poses": True}),
     # Tables 3 and 7.
+    Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
     Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI),
     Recipe("msdi+dust3r+4dgs", "msdi", "dust3r", "hexplane", "pixel", _MSDI),
-    Recipe("tfi+colmap+4dgs", "tfi", "colmap", "hexplane", "pixel"),
     Recipe("tfi+dust3r+4dgs", "tfi", "dust3r", "hexplane", "pixel"),
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),

@@ -63,7 +63,7 @@ def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} in one place"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
-    mean = _pictures(scene, 0, scene.n_ticks, flat_field)
+    mean = window_means(scene, 0, scene.n_ticks, flat_field)
     windows = _windows(scene.n_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
     moving = [_moving(np.stack(c)) for c in counts]
@@ -73,7 +73,7 @@ def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
     middle, last = len(windows) // 2, len(windows) - 1
     for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[place]
-        pictures = _pictures(scene, start, stop, flat_field)
+        pictures = window_means(scene, start, stop, flat_field)
         near = slice(max(0, place - 1), place + 2)
         quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
         short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
@@ -93,7 +93,7 @@ def rig_flat(scene: TrainingScene, seed: int) -> Start:
     return rig(scene, seed, flat_field=True)
 
 
-def _pictures(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
+def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
     """Mean radiance [C, H, W] of all views in a window."""
     rates = np.stack([_rate(s, start, stop) for s in scene.streams])
     if flat_field and scene.calibrations:

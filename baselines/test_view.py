@@ -27,6 +27,7 @@ from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.poses import rigid_motion
 from spike4dgs.method.splat import Views, render
+from spike4dgs.method.tracked_model import TrackedModel
 from spike4dgs.method.trainer import one_torch_thread
 
 Float32 = NDArray[np.float32]
@@ -43,12 +44,12 @@ class Refinement:
 
 
 class PosedRecipe(RecipeMethod):
-    """A recipe that asks for refined scores too, where its model is one of Gaussians that the trainer fits."""
+    """A recipe that asks for refined scores too, where its model is one of Gaussians."""
 
     def __init__(self, recipe: Recipe, parts: Parts, refinement: Refinement | None = None) -> None:
         super().__init__(recipe, parts)
         self.refinement = refinement or Refinement()
-        self.refines_views = recipe.motion not in parts.algorithms
+        self.refines_views = recipe.motion != "radiance-field"  # marching along rays has no gradient in the pose
         if self.refines_views:
             self.params["refinement"] = asdict(self.refinement)
 
@@ -63,14 +64,14 @@ class PosedRecipe(RecipeMethod):
     ) -> Model:
         """As `RecipeMethod.fit`; the model has `refine`."""
         model = super().fit(scene, budget, device, seed, progress, checkpoint)
-        return RefinableModel(model, self.refinement) if isinstance(model, FittedModel) else model
+        return RefinableModel(model, self.refinement) if isinstance(model, FittedModel | TrackedModel) else model
 
 
 @dataclass(frozen=True, eq=False)
 class RefinableModel:
     """A fitted model that can also say from where it sees a picture."""
 
-    model: FittedModel
+    model: FittedModel | TrackedModel
     refinement: Refinement
 
     @property

@@ -36,7 +36,7 @@ from spike4dgs.benchmark.run_display import RunDisplay
 from spike4dgs.benchmark.scene import Scene
 from spike4dgs.benchmark.score import open_for, open_scenes, score_scene
 from spike4dgs.benchmark.selection import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.tables import IMAGE_TABLE, published, table_scenes
+from spike4dgs.benchmark.tables import IMAGE_TABLE, TRACKS, published, table_scenes
 from spike4dgs.benchmark.weights import WeightsError
 
 
@@ -138,6 +138,7 @@ def run_benchmark(
     scenes: Positional[tuple[Path, ...]] = (),
     *,
     table: int | None = None,
+    track: str = TRACKS[0],
     data: Path = Path("data"),
     profile: str = "small",
     methods: tuple[str, ...] = (),
@@ -157,6 +158,7 @@ def run_benchmark(
         scenes: Scene folders.
         table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
             (number of views; drawn as views.png), 6 (pictures from spikes), 7 (MSDI without SPSS).
+        track: Of table 1 or 2: calibrated (methods are given the rig's poses) or uncalibrated (each estimates its own).
         data: Folder of the table's scenes.
         profile: Profile of the table's scenes.
         methods: Methods by name; all that are installed, or all rows of the table, if left out.
@@ -173,7 +175,9 @@ def run_benchmark(
     """
     if table == IMAGE_TABLE:
         return _image_table(scenes, data, profile, out, allow_gaps)
-    paper = None if table is None else published(table)
+    if track != TRACKS[0] and table is None:
+        raise problem("--track", "--table 1 or 2 beside it", "neither", "name the methods, such as tfp+colmap+4dgs")
+    paper = None if table is None else published(table, track)
     if paper and scenes:
         raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
     scenes = table_scenes(paper, data, profile) if paper else scenes

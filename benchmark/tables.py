@@ -23,6 +23,10 @@ from spike4dgs.benchmark.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
 IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
+TRACKS = ("calibrated", "uncalibrated")  # are methods given the rig's poses?
+UNCALIBRATED_NOTE = (
+    "How the published rows got their poses is not stated: the same values stand here and in the calibrated track."
+)
 MEAN = "mean"  # column of rows that are published without their scenes
 ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics
 
@@ -60,8 +64,11 @@ class PublishedTable:
 
 
 @cache
-def published(number: int) -> PublishedTable:
-    """A table as published. Raises UserError for a number that is none of those in `published_tables.json`."""
+def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
+    """A table as published; in the track `uncalibrated` its rows are methods that estimate poses themselves.
+
+    Raises UserError for a number that is none of those in `published_tables.json`, and for a table without that track.
+    """
     text = (package_files("spike4dgs.benchmark") / "published_tables.json").read_text(encoding="utf-8")
     tables = json.loads(text)
     if str(number) not in tables:
@@ -72,7 +79,23 @@ def published(number: int) -> PublishedTable:
     ids, names = zip(*table["metrics"], strict=True)
     rows = {m: {w: tuple(v) for w, v in r.items()} for m, r in table["rows"].items()}
     worlds, splits = tuple(table["worlds"]), tuple(table.get("splits", ()))
-    return PublishedTable(number, table["title"], tables["source"], table["note"], worlds, ids, names, rows, splits)
+    title, note = table["title"], table["note"]
+    if track != TRACKS[0]:
+        rows = _without_poses(number, track, rows, tables["uncalibrated"])
+        title, note = f"{title}, poses estimated", f"{note} {UNCALIBRATED_NOTE}"
+    return PublishedTable(number, title, tables["source"], note, worlds, ids, names, rows, splits)
+
+
+def _without_poses(
+    number: int, track: str, rows: Mapping[str, Any], partners: Mapping[str, str | None]
+) -> dict[str, Any]:
+    """The rows of the track `uncalibrated`, each with the published values of its partner."""
+    if track not in TRACKS:
+        raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
+    if not set(partners.values()) - {None} <= set(rows):
+        fix = "its rows say where each has its poses from; use --table 1 or 2"
+        raise problem("--track", f"calibrated for table {number}", track, fix)
+    return {name: rows[partner] if partner else {} for name, partner in partners.items()}
 
 
 def table_scenes(table: PublishedTable, data: Path, profile: str) -> tuple[Path, ...]:

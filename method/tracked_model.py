@@ -87,6 +87,11 @@ class TrackedModel:
     duration_us: float
 
     @property
+    def device(self) -> str:
+        """Where the model lies."""
+        return str(self.gaussians.means.device)
+
+    @property
     def size_bytes(self) -> int:
         """Bytes of the Gaussians and of the tracks."""
         return count_bytes([*self.gaussians.tensors().values(), *self.tracks.tensors().values()])
@@ -103,7 +108,7 @@ class TrackedModel:
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
-        views = Views.from_cameras([camera], device=self.gaussians.means.device)
+        views = Views.from_cameras([camera], device=self.device)
         image = render(self.splats(t_us), views).image
         return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
 

@@ -7,12 +7,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from toy_world import ToyWorld
+from numpy.typing import NDArray
+from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines import colmap as module
-from spike4dgs.baselines.colmap import Mapping, clip_means, colmap, map_views
+from spike4dgs.baselines.colmap import Mapping, clip_means, colmap, colmap_flat, map_views
+from spike4dgs.baselines.rig import rig_flat
+from spike4dgs.benchmark.calibration import Recordings
+from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.poses import pose_errors
+from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.benchmark.spikes import SpikeStream, pack
 
 WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
 
@@ -81,3 +87,50 @@ def test_few_points_are_replaced_by_a_plane_sweep_with_the_estimated_cameras(mon
         start = colmap(scene, 0)
         assert start.cameras == moved
         assert (len(start.points) > 500) == (count < module.MIN_POINTS)
+
+
+def test_points_of_corrected_pictures_come_from_a_plane_sweep_at_the_estimated_poses() -> None:
+    scene = WORLD.training
+    start = colmap_flat(scene, 0)
+    summary = pose_errors(start.cameras, scene.cameras).summary()
+    assert 0 < summary["rotation_max_deg"] < 0.5 and summary["translation_of_array"] < 0.05, summary
+    given = rig_flat(scene, 0)
+    assert len(start.points) > 0.8 * len(given.points) > 500
+    assert not np.array_equal(start.points[:100], given.points[:100])
+
+
+class UnevenWorld(ToyWorld):
+    """The world seen by sensors whose pixels' gains spread by 8 %: a pattern that stands still in every view."""
+
+    def gains(self, camera: Camera) -> NDArray[np.float64]:
+        rng = np.random.default_rng([7, int(camera.id[-2:])])
+        return 1 + 0.08 * rng.standard_normal((camera.height, camera.width)).clip(-3, 3)
+
+    def look(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        image, depth, board = super().look(camera, t)
+        return image * self.gains(camera), depth, board
+
+    def recordings(self, camera: Camera) -> Recordings:
+        """500 ticks of a flat field of 0.7 and of darkness."""
+        gains = self.gains(camera)
+        rate, start = 0.7 * GAIN * gains, np.random.default_rng(8).random(gains.shape)
+        ticks = np.floor(start + rate * np.arange(501)[:, None, None])
+        flat = pack(np.diff(ticks, axis=0).astype(bool))
+        streams = (SpikeStream(p, camera.width, camera.height, RATE_HZ) for p in (flat, np.zeros_like(flat)))
+        return Recordings(*streams, 0.7)
+
+
+def test_features_are_sought_in_pictures_without_the_pixels_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, even = (kind(width=120, height=76, n_ticks=96, travel=0.0, seed=1) for kind in (UnevenWorld, ToyWorld))
+    scene = replace(world.training, recordings=tuple(world.recordings(c) for c in world.training.cameras))
+    seen: list[NDArray[np.float32]] = []
+
+    def watched(scene: TrainingScene, pictures: NDArray[np.float32], seed: int, *, calibrated: bool) -> Mapping:
+        seen.append(pictures)
+        return map_views(scene, pictures, seed, calibrated=calibrated)
+
+    monkeypatch.setattr(module, "map_views", watched)
+    assert len(colmap_flat(scene, 0).cameras) == 8
+    truth = np.stack([even.look(camera, 0.5)[0] for camera in scene.cameras])
+    corrected, plain = (np.sqrt(np.mean((p - truth) ** 2)) for p in (seen[0], clip_means(scene)))
+    assert corrected < 0.012 < 0.03 < plain

@@ -62,7 +62,7 @@ def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
     scenes = {name: seen_as(open_scene(path), name) for name in ("views-3", "views-4")}
     table = replace(published(5), splits=tuple(scenes))
     methods = {"tfi+4dgs": CountMethod("tfi+4dgs"), "tfi+stg": FailingMethod("tfi+stg", ValueError("no views"))}
-    monkeypatch.setattr(run, "published", lambda number: table)
+    monkeypatch.setattr(run, "published", lambda number, track: table)
     monkeypatch.setattr(run, "table_scenes", lambda table, data, profile: (path,))
     monkeypatch.setattr(run, "find_methods", lambda: methods)
     monkeypatch.setattr(run, "open_scenes", lambda paths, gaps, split: [scenes[split]])

@@ -50,6 +50,25 @@ def test_published_numbers_are_the_papers() -> None:
         assert all(0 < v[1] < 1 for r in outdoor.rows.values() for v in r.values()), "SSIM as a fraction"
 
 
+def test_the_track_without_given_poses_has_a_row_for_every_row() -> None:
+    for number in (1, 2):
+        given, own = published(number), published(number, "uncalibrated")
+        assert (own.worlds, own.metrics) == (given.worlds, given.metrics)
+        partners = {name.replace("+colmap", "").replace("-uncalibrated", "") for name in own.rows}
+        assert partners == set(given.rows) and not set(own.rows) & set(given.rows)
+        assert own.rows["tfp+colmap+4dgs"] == given.rows["tfp+4dgs"]
+        assert own.rows["spike4dgs-uncalibrated"] == given.rows["spike4dgs"]
+        assert own.rows["spike4dgs+colmap"] == own.rows["spike4dgs-x+colmap"] == {}, "one of ours is the paper's"
+
+
+def test_tables_that_mix_poses_have_one_track() -> None:
+    for number in (3, 4, 5, 7):
+        with pytest.raises(UserError, match=f"--track: expected calibrated for table {number}, found uncalibrated"):
+            published(number, "uncalibrated")
+    with pytest.raises(UserError, match="--track: expected one of calibrated, uncalibrated, found 'own'"):
+        published(1, "own")
+
+
 def test_rows_that_the_paper_prints_twice_are_named_in_the_note() -> None:
     table = published(2)
     for a, b in (("tfp+stg", "tfp+4dgs"), ("spk2img+stg", "spk2img+4dgs")):
