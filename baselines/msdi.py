@@ -1,4 +1,4 @@
-"""The initialisations `msdi`, `msdi-poses` and `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
+"""The initialisations `msdi`, `msdi-matched`, `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
 
 The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
 was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
@@ -9,9 +9,11 @@ better than a network guesses it: those are the points of `rig-flat`. Where noth
 network's points take the place of the nearest depth; of view 0's, as inverse depths that a line brings to the matched
 ones.
 
-`msdi-poses` has the calibrated intrinsics and else the network alone: each view's pose follows from its points, by PnP
-(`method.msdi.pose`), and everything is moved to the scene's frame as COLMAP's result is. `msdi-uncalibrated` estimates
-one focal length for all views too.
+`msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
+views match in corrected means of the clip (`bundle`). From there on it is `msdi`.
+
+`msdi-uncalibrated` has the network alone: each view's pose follows from its own points, by PnP (`method.msdi.pose`),
+with one focal length for all. In both everything is moved to the scene's frame as COLMAP's result is.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
-from spike4dgs.baselines.rig import HOLE_PX, Cloud, fill, filled, matched, thin
+from spike4dgs.baselines.bundle import bundle
+from spike4dgs.baselines.features import Mapping
+from spike4dgs.baselines.rig import HOLE_PX, Cloud, fill, filled, matched, thin, window_means
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.cameras import Camera
@@ -71,14 +75,30 @@ def msdi(scene: TrainingScene, seed: int) -> Start:
 
     Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
     """
-    glance = look(scene, calibrated=True)
+    return _given(scene, look(scene, calibrated=True))
+
+
+def _given(scene: TrainingScene, glance: Glance) -> Start:
     cloud, mean = matched(scene, flat_field=True)
     return filled(scene, completed(cloud, glance), mean)
 
 
-def msdi_poses(scene: TrainingScene, seed: int) -> Start:
-    """Poses and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, look(scene, calibrated=True), seed, calibrated=True)
+def msdi_matched(scene: TrainingScene, seed: int) -> Start:
+    """Poses by the network's points of view 0 and by matches, and points there; raises as `msdi`, and `place` does."""
+    glance = look(scene, calibrated=True)
+    cameras = place(scene, glance, seed).cameras
+    small = tuple(shrunk(camera, glance.factor) for camera in cameras)
+    return _given(replace(scene, cameras=cameras), replace(glance, cameras=small))
+
+
+def place(scene: TrainingScene, glance: Glance, seed: int) -> Mapping:
+    """The training cameras, whose intrinsics are known, and the points that they match.
+
+    Raises UserError unless all have poses.
+    """
+    guess = np.where(glance.sure[0][..., None], glance.points[0], np.nan)
+    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    return bundle(scene, guess, glance.factor, pictures, seed).of_all(scene, "MSDI")
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:

@@ -13,9 +13,9 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.colmap import clip_means, map_views
 from spike4dgs.baselines.dust3r import estimate as estimate_dust3r
-from spike4dgs.baselines.msdi import look, unposed
+from spike4dgs.baselines.msdi import look, place, unposed
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.rig import rig
+from spike4dgs.baselines.rig import rig, window_means
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError, problem
@@ -30,7 +30,8 @@ from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 
 Row = dict[str, float | int | str | None]
-CLIP = "clip"  # the pictures that the initialisations take: means of the whole clip
+CLIP = "clip"  # means of the whole clip, as they are
+FLAT = "flat"  # the same, corrected by the cameras' calibrations
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,13 @@ def _msdi(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) 
     return Estimate(start.cameras, len(start.points))
 
 
+def _msdi_matched(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+    if not calibrated:
+        raise problem("msdi-matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
+    found = place(scene, look(scene, calibrated=True), seed)
+    return Estimate(found.cameras, len(found.points))
+
+
 def _dust3r(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
     start = estimate_dust3r(scene, pictures, seed, calibrated=calibrated)
     return Estimate(start.cameras, len(start.points))
@@ -66,6 +74,7 @@ ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Estimate]] =
     "colmap": _colmap,
     "dust3r": _dust3r,
     "msdi": _msdi,
+    "msdi-matched": _msdi_matched,
 }
 COLUMNS = {  # key of the row -> heading, format
     "registered": ("views", "{}"),
@@ -102,8 +111,10 @@ def poses(
 
     Args:
         scenes: Scene folders.
-        initialization: What estimates: rig, colmap, dust3r, msdi.
-        images: clip (means of the whole clip, what recipes take), or pictures of the clip's middle, such as tfp.
+        initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
+            view, and what views match).
+        images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
+            calibrations: what `colmap-flat` sees), or pictures of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
         refine: Also fit 4DGS to TFP pictures from these poses, poses included, and measure what they became.
         seed: Seed of everything random.
@@ -114,8 +125,8 @@ def poses(
     if unknown := [name for name in initialization if name not in ESTIMATORS]:
         expected = f"names among {', '.join(ESTIMATORS)}"
         raise problem("--initialization", expected, ", ".join(unknown), "correct the names")
-    if images not in (CLIP, *IMAGES):
-        raise problem("--images", f"one of {', '.join((CLIP, *IMAGES))}", repr(images), "correct the name")
+    if images not in (CLIP, FLAT, *IMAGES):
+        raise problem("--images", f"one of {', '.join((CLIP, FLAT, *IMAGES))}", repr(images), "correct the name")
     rows = []
     for path in scenes:
         scene = open_scene(path, allow_gaps, split).training
@@ -134,6 +145,8 @@ def _pictures(scene: TrainingScene, images: str) -> Float32:
     """One picture of each training view [C, H, W], linear radiance."""
     if images == CLIP:
         return clip_means(scene)
+    if images == FLAT:
+        return window_means(scene, 0, scene.n_ticks, flat_field=True)
     return np.concatenate([IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams])
 
 

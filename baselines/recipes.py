@@ -13,7 +13,7 @@ from typing import Any
 
 from spike4dgs.baselines.colmap import colmap, colmap_flat, colmap_uncalibrated
 from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.msdi import msdi, msdi_poses, msdi_uncalibrated
+from spike4dgs.baselines.msdi import msdi, msdi_matched, msdi_uncalibrated
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.rig import rig, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
@@ -36,7 +36,7 @@ PARTS = Parts(
         "dust3r": dust3r,
         "dust3r-uncalibrated": dust3r_uncalibrated,
         "msdi": msdi,
-        "msdi-poses": msdi_poses,
+        "msdi-matched": msdi_matched,
         "msdi-uncalibrated": msdi_uncalibrated,
     },
     motion=MOTIONS,
@@ -104,7 +104,7 @@ SUPERVISED = tuple(
 )
 
 # The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one. First the rows
-# of the track `uncalibrated`, which are those of tables 1 and 2 with COLMAP's poses, or with the network's own.
+# of the track `uncalibrated`: those of tables 1 and 2 with COLMAP's poses, or with those that MSDI's points begin.
 _BY_NAME = {recipe.name: recipe for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND)}
 POSED = (
     *(
@@ -120,7 +120,7 @@ POSED = (
             ("spike4dgs-x", "colmap-flat"),
         )
     ),
-    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-poses", "hexplane", "spss", {**_MSDI, "refine_poses": True}),
+    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-matched", "hexplane", "spss", _MSDI),
     # Tables 3 and 7.
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
     Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI),

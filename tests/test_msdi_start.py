@@ -12,7 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.msdi import Glance, block_means, completed, inverse_depth_line, look, msdi, shrunk, unposed
+from spike4dgs.baselines.msdi import (
+    Glance,
+    block_means,
+    completed,
+    inverse_depth_line,
+    look,
+    msdi,
+    msdi_matched,
+    shrunk,
+    unposed,
+)
 from spike4dgs.baselines.rig import Cloud, matched, rig_flat
 from spike4dgs.baselines.spike_to_image import IMAGES
 from spike4dgs.benchmark.calibration import Calibration
@@ -125,6 +135,25 @@ def test_without_poses_the_rig_is_found_again(perfect: Glance) -> None:
         assert found.fx == pytest.approx(true.fx, rel=0.01)
     error = depth_errors(start, SCENE.cameras[3])
     assert len(error) > 1000 and np.median(error) < 0.01
+
+
+def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
+    scene, camera = world.training, world.training.cameras[0]
+    truth, depth, _ = world.look(camera, 0.5)
+    v, u = np.mgrid[:76, :120] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    points, sure = (rays * depth[..., None] / SCALE)[None].repeat(8, axis=0), np.full((8, 76, 120), 9.0)
+    glance = Glance(1, scene.cameras, truth[None].repeat(8, axis=0).astype(np.float32), points, sure)
+    monkeypatch.setattr("spike4dgs.baselines.msdi.look", lambda scene, calibrated: glance)
+    start = msdi_matched(scene, 0)
+    for found, true in zip(start.cameras, scene.cameras, strict=True):
+        assert angle_deg(found.R @ true.R.T) < 0.3 and found.fx == true.fx
+    uv, z = world.held_out.project(start.points.astype(np.float64))
+    u, v = np.floor(uv).astype(int).T
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 120) & (v < 76)
+    expected = world.look(world.held_out, 0.5)[1][v[inside], u[inside]]
+    assert inside.sum() > 2000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
 
 
 def test_a_view_without_a_pose_is_named(perfect: Glance) -> None:

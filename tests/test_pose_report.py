@@ -54,7 +54,7 @@ def test_refined_poses_are_a_row_of_their_own() -> None:
 
 
 def test_unknown_names_are_refused(small_scene: Path) -> None:
-    with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, found sift"):
+    with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, msdi-matched, found sift"):
         poses((small_scene,), initialization=("sift",))
-    with pytest.raises(UserError, match="one of clip, tfp"):
+    with pytest.raises(UserError, match="one of clip, flat, tfp"):
         poses((small_scene,), images="photo")
