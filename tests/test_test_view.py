@@ -16,7 +16,7 @@ from splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from torch import Tensor
 
 from spike4dgs.baselines.rig import rig
-from spike4dgs.baselines.test_view import PosedRecipe, Refinement, refine_pose
+from spike4dgs.baselines.test_view import PosedRecipe, RefinableModel, Refinement, refine_pose
 from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.images import read_exr
@@ -30,6 +30,7 @@ from spike4dgs.method.motion import MOTIONS
 from spike4dgs.method.poses import rigid_motion
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision import SUPERVISIONS
+from spike4dgs.method.tracking import TRACKING
 
 DEPTH_M = 3.5
 
@@ -158,7 +159,8 @@ def test_a_failure_fails_both_records_and_absent_weights_skip_them(small_scene: 
         assert [r["scenes"]["pattern-0"]["status"] for r in records] == [status] * 2
 
 
-def test_a_recipe_on_shifted_poses_scores_better_refined(small_scene: Path) -> None:
+@pytest.mark.parametrize("motion", ["static", "tracking"])
+def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
     """All training poses are shifted by the same: at the calibrated held-out pose the picture is off, refined not."""
     shift = np.array([0.02, 0.0, 0.0])
 
@@ -168,8 +170,9 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(small_scene: Path) -> N
 
     from spike4dgs.baselines.spike_to_image import IMAGES
 
-    parts = Parts(IMAGES, {"shifted": shifted}, MOTIONS, SUPERVISIONS)
-    recipe = Recipe("posed", "tfp", "shifted", "static", "pixel", {"coarse_steps": 60})
+    parts = Parts(IMAGES, {"shifted": shifted}, MOTIONS, SUPERVISIONS, {"tracking": TRACKING})
+    steps = {"coarse_steps": 60} if motion == "static" else {"first_steps": 60, "later_steps": 2}
+    recipe = Recipe("posed", "tfp", "shifted", motion, "pixel", steps)
     method = PosedRecipe(recipe, parts)
     assert method.refines_views and method.params["refinement"]["steps"] == 100
 
@@ -180,6 +183,7 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(small_scene: Path) -> N
     world = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1)
     model = method.fit(world.training, Budget(), "cpu", 0, lambda *a: None)
     truth = world.look(world.held_out, 0.5)[0].astype(np.float32)
+    assert isinstance(model, RefinableModel)
     found = model.refine(world.held_out, truth, np.ones_like(truth, bool), 3000.0)
     assert np.linalg.norm(found.center - world.held_out.center - shift) < 0.5 * np.linalg.norm(shift)
     before, after = (np.abs(model.render(c, 3000.0) - truth).mean() for c in (world.held_out, found))
