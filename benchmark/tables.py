@@ -18,6 +18,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.image_pair import ImagePair
 from spike4dgs.benchmark.measure import measure
 from spike4dgs.benchmark.metrics import METRICS, Metric
+from spike4dgs.benchmark.refinement import SUFFIX
 from spike4dgs.benchmark.result import COSTS, Record
 from spike4dgs.benchmark.scene import Scene
 
@@ -143,7 +144,8 @@ def build_table(
     """
     rows = [_row(table, record, worlds) for record in records]
     for metric in table_columns(table):
-        measured = [r["mean"][metric]["value"] for r in rows]
+        # A method has one rank: that of its own record, not of the one with refined held-out poses.
+        measured = [None if r["method"].endswith(SUFFIX) else r["mean"][metric]["value"] for r in rows]
         printed = [r["mean"][metric]["published"] for r in rows]
         both = [p if v is not None else None for v, p in zip(measured, printed, strict=True)]
         ours, theirs = ranks(measured, METRICS[metric]), ranks(both, METRICS[metric])

@@ -132,6 +132,17 @@ def test_every_cell_is_a_number_or_a_reason(table: dict[str, Any]) -> None:
     }
 
 
+def test_refined_rows_take_no_rank_from_others(small_scene: Path, tmp_path: Path) -> None:
+    methods = (CountMethod("tfi+4dgs"), CountMethod("tfi+4dgs.refined"), CountMethod("tfp+4dgs"))
+    records = run(tmp_path / "out", [small_scene], *methods)
+    table = build_table(published(1), records, {scene: "car" for scene in records[0]["scenes"]})
+    found = {row["method"]: row["mean"]["psnr"]["rank"] for row in table["rows"]}
+    assert found == {"tfi+4dgs": 1, "tfi+4dgs.refined": None, "tfp+4dgs": 1}, "the same pictures share a rank"
+    last = {**records[2], "mean": {**records[2]["mean"], "psnr": records[2]["mean"]["psnr"] - 1}}
+    rows = build_table(published(1), [*records[:2], last], {scene: "car" for scene in last["scenes"]})["rows"]
+    assert rows[2]["mean"]["psnr"]["rank"] == 2
+
+
 def test_files_say_the_same(table: dict[str, Any], tmp_path: Path) -> None:
     write_table(tmp_path, table)
     assert json.loads((tmp_path / "table.json").read_text())["rows"] == json.loads(json.dumps(table["rows"]))
