@@ -173,10 +173,11 @@ def run_benchmark(
         replace: Replace entries of the same name in that leaderboard.
         allow_gaps: Accept recordings with gaps.
     """
+    if track != TRACKS[0] and table in (None, IMAGE_TABLE):
+        fix = "without a table, name the methods, such as tfp+colmap+4dgs"
+        raise problem("--track", "--table 1 or 2 beside it", f"--table {table}" if table else "no table", fix)
     if table == IMAGE_TABLE:
         return _image_table(scenes, data, profile, out, allow_gaps)
-    if track != TRACKS[0] and table is None:
-        raise problem("--track", "--table 1 or 2 beside it", "neither", "name the methods, such as tfp+colmap+4dgs")
     paper = None if table is None else published(table, track)
     if paper and scenes:
         raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")

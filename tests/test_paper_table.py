@@ -13,6 +13,7 @@ from PIL import Image
 
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark import run
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene import Scene, open_scene
 from spike4dgs.benchmark.tables import published
 
@@ -48,6 +49,13 @@ def test_rows_without_msdi_are_methods_and_rows_of_ours_have_no_published_values
         assert name in METHODS or name == "spike4dgs" or name.startswith("msdi+")
         assert bool(values) or name.startswith("tfp+")
         assert values or table.mean(name, table.metrics[0]) is None
+
+
+@pytest.mark.parametrize("number", [None, 6, 4])
+def test_a_track_belongs_to_tables_1_and_2(number: int | None, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--track: expected (--table 1 or 2 beside it|calibrated for table 4)"):
+        run.run_benchmark(table=number, track="uncalibrated", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def seen_as(scene: Scene, split: str) -> Scene:
