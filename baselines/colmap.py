@@ -7,11 +7,13 @@ beside its distance to the scene, and the pair that incremental mapping begins w
 locally best way.
 
 `colmap` keeps the calibrated intrinsics; `colmap-uncalibrated` knows nothing and refines one focal length for all
-views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` finds features in pictures corrected by
-the cameras' calibrations, of which there are nearly twice as many, and sweeps planes from the poses, as `rig-flat` does
-from given ones. Poses come out in a frame of their own: the similarity that fits them to the
-calibrated training poses (`benchmark.poses`) takes everything to the scene's frame, where held-out cameras are known.
-Calibrated poses serve for nothing else.
+views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` sees pictures corrected by the cameras'
+calibrations, in which views have up to twice as many points in common, and sweeps planes from the poses found, as
+`rig-flat` does from given ones.
+
+Poses come out in a frame of their own: the similarity that fits them to the calibrated training poses
+(`benchmark.poses`) takes everything to the scene's frame, where held-out cameras are known. Calibrated poses serve for
+nothing else.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ def colmap_uncalibrated(scene: TrainingScene, seed: int) -> Start:
 
 
 def colmap_flat(scene: TrainingScene, seed: int) -> Start:
-    """Poses from corrected pictures with the calibrated intrinsics, and points by plane sweep from there."""
+    """Poses from corrected pictures with the calibrated intrinsics, and points by plane sweep; raises as `colmap`."""
     pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
     found = map_views(scene, pictures, seed, calibrated=True).of_all(scene, WHO)
     return rig_flat(replace(scene, cameras=found.cameras), seed)

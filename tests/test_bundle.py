@@ -16,8 +16,10 @@ from spike4dgs.baselines import bundle as module
 from spike4dgs.baselines.bundle import Pose, Seen, bundle
 from spike4dgs.baselines.colmap import clip_means
 from spike4dgs.baselines.features import Mapping
+from spike4dgs.baselines.msdi import shrunk
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.poses import PoseErrors, pose_errors
+from spike4dgs.method.msdi.data import points_of
 from spike4dgs.method.poses import rigid_motion
 
 WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
@@ -27,12 +29,10 @@ FACTOR, SCALE = 2, 3.7
 
 def guess(error: float) -> NDArray[np.float64]:
     """What view 0 sees, at half the size and another scale, depths wrong by `error`; nothing is known of some rows."""
-    camera = SCENE.cameras[0]
-    depth = WORLD.look(camera, 0.5)[1][::FACTOR, ::FACTOR]
+    camera = shrunk(SCENE.cameras[0], FACTOR)
+    depth = WORLD.look(camera, 0.5)[1]
     depth = depth * np.exp(error * np.random.default_rng(0).standard_normal(depth.shape))
-    v, u = FACTOR * np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    points = rays * depth[..., None] / SCALE
+    points = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None])[0].astype(np.float64) / SCALE
     points[10:16] = np.nan
     return points
 

@@ -141,10 +141,8 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     world = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
     scene, camera = world.training, world.training.cameras[0]
     truth, depth, _ = world.look(camera, 0.5)
-    v, u = np.mgrid[:76, :120] + 0.5
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    points, sure = (rays * depth[..., None] / SCALE)[None].repeat(8, axis=0), np.full((8, 76, 120), 9.0)
-    glance = Glance(1, scene.cameras, truth[None].repeat(8, axis=0).astype(np.float32), points, sure)
+    seen = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None]).astype(np.float64) / SCALE
+    glance = Glance(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
     monkeypatch.setattr("spike4dgs.baselines.msdi.look", lambda scene, calibrated: glance)
     start = msdi_matched(scene, 0)
     for found, true in zip(start.cameras, scene.cameras, strict=True):
