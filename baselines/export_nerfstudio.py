@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from tyro.conf import Positional
 
-from spike4dgs.baselines.spike_to_image import IMAGES
-from spike4dgs.baselines.spike_to_image.images import Float32
-from spike4dgs.benchmark.cameras import Camera, to_nerfstudio
+from spike4dgs.baselines.spike_to_image.base import Float32
+from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_json
-from spike4dgs.benchmark.images import encode_srgb, write_png
-from spike4dgs.benchmark.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
+from spike4dgs.benchmark.scene.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 
 _TOLERANCE_PX = 0.005  # of what one focal length and a principal point in the middle may move a pixel
 _VAL_EVERY = 5  # one picture between training times for so many training pictures

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
-from spike4dgs.baselines.spike_to_image import IMAGES
+from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.gaps import present
-from spike4dgs.benchmark.images import encode_srgb
-from spike4dgs.benchmark.scene import open_scene
-from spike4dgs.benchmark.spikes import SpikeStream, open_stream
-from spike4dgs.benchmark.stream_folder import NAME as STREAM_FOLDER
-from spike4dgs.benchmark.stream_folder import open_stream_folder
+from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 Mask = NDArray[np.bool_]
 HOT_SIGMA = 6.0  # robust standard deviations above the neighbours' median, from which a pixel is called hot

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.recipes import Budget, Progress
-from spike4dgs.benchmark.scene import TrainingScene
+from spike4dgs.benchmark.method import Budget, Progress
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import ImageMaker
 
 

@@ -11,21 +11,21 @@ import numpy as np
 from rich.table import Table
 from tyro.conf import Positional
 
-from spike4dgs.baselines.colmap import clip_means, map_views
-from spike4dgs.baselines.dust3r import estimate as estimate_dust3r
-from spike4dgs.baselines.msdi import look, place, unposed
+from spike4dgs.baselines.initialization.colmap import clip_means, map_views
+from spike4dgs.baselines.initialization.dust3r import estimate as estimate_dust3r
+from spike4dgs.baselines.initialization.msdi import look, place, unposed
+from spike4dgs.baselines.initialization.rig import rig, window_means
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.rig import rig, window_means
-from spike4dgs.baselines.spike_to_image import IMAGES
-from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.images import Float32
-from spike4dgs.benchmark.poses import pose_errors
-from spike4dgs.benchmark.recipes import Budget, Recipe
-from spike4dgs.benchmark.report import make_console
-from spike4dgs.benchmark.run_display import RunDisplay
-from spike4dgs.benchmark.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.benchmark.reports.figures import make_console
+from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 

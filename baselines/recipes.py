@@ -11,19 +11,19 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from spike4dgs.baselines.colmap import colmap, colmap_flat, colmap_uncalibrated
-from spike4dgs.baselines.dust3r import dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.msdi import msdi, msdi_matched, msdi_uncalibrated
+from spike4dgs.baselines.held_out_pose import PosedRecipe
+from spike4dgs.baselines.initialization.colmap import colmap, colmap_flat, colmap_uncalibrated
+from spike4dgs.baselines.initialization.dust3r import dust3r, dust3r_uncalibrated
+from spike4dgs.baselines.initialization.msdi import msdi, msdi_matched, msdi_uncalibrated
+from spike4dgs.baselines.initialization.rig import rig, rig_flat
 from spike4dgs.baselines.nearest_view import NearestView
-from spike4dgs.baselines.rig import rig, rig_flat
-from spike4dgs.baselines.spike_to_image import IMAGES
-from spike4dgs.baselines.test_view import PosedRecipe
-from spike4dgs.benchmark.recipes import Method, Recipe
+from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.motion import MOTIONS
+from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.radiance_field import RADIANCE_FIELD
-from spike4dgs.method.supervision import SUPERVISIONS
-from spike4dgs.method.tracking import TRACKING
+from spike4dgs.method.supervision.table import SUPERVISIONS
+from spike4dgs.method.tracking.fit import TRACKING
 
 PARTS = Parts(
     images=IMAGES,

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from spike4dgs.baselines.spike_to_image.images import Float32
+from spike4dgs.baselines.spike_to_image.base import Float32
 from spike4dgs.baselines.spike_to_image.tfi import tfi_stack
 from spike4dgs.baselines.spike_to_image.tfp import HALF_WINDOW, count_stack, tfp_stack
-from spike4dgs.benchmark.speed_decode import unpack_plainly
-from spike4dgs.benchmark.spikes import SpikeStream, pack
-from spike4dgs.benchmark.timing import show_table, time_ms
+from spike4dgs.benchmark.speed.decode import unpack_plainly
+from spike4dgs.benchmark.speed.timing import show_table, time_ms
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 COLUMNS = ("pictures", "by", "min ms", "median ms", "times as fast", "largest error")
 

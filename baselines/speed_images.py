@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.speed import fired_stream
-from spike4dgs.baselines.spike_to_image import IMAGES, ImageMaker
+from spike4dgs.baselines.spike_to_image.table import IMAGES, ImageMaker
 from spike4dgs.baselines.spike_to_image.tfstp import D_TICKS, F_TICKS, JUMP, U0, tfstp_image
-from spike4dgs.benchmark.calibration import estimate
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.image_pair import ImagePair, check_images
-from spike4dgs.benchmark.images import encode_srgb
-from spike4dgs.benchmark.metrics import METRICS
-from spike4dgs.benchmark.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.spikes import SpikeStream
-from spike4dgs.benchmark.timing import module_of, show_table, time_ms
+from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.scene.calibration import estimate
+from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.speed.timing import module_of, show_table, time_ms
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 Float32 = NDArray[np.float32]
 Draw = Callable[[], Float32]  # makes one picture, [H, W] linear radiance

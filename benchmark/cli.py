@@ -34,12 +34,12 @@ COMMANDS: dict[str, Command] = {
         "make-dataset --all --profile small --out data",
     ),
     "worlds": Command(
-        "spike4dgs.generators.world_table:worlds",
+        "spike4dgs.generators.reports.world_table:worlds",
         "list the worlds: speeds, moving pixels, depths, key spacing",
         "worlds",
     ),
     "calibrate": Command(
-        "spike4dgs.generators.calibration:calibrate",
+        "spike4dgs.generators.sensor.calibration:calibrate",
         "estimate gain and dark maps from flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
@@ -49,12 +49,12 @@ COMMANDS: dict[str, Command] = {
         "record rig.toml --seconds 0.5 --out captures/first",
     ),
     "board-clip": Command(
-        "spike4dgs.generators.recorder.board_clip:board_clip",
+        "spike4dgs.generators.recorder.rig_calibration.board_clip:board_clip",
         "simulate a chessboard that moves before an array, to record and to calibrate with",
         "board-clip --out runs/board --seconds 1",
     ),
     "calibrate-rig": Command(
-        "spike4dgs.generators.recorder.calibrate_rig:calibrate_rig",
+        "spike4dgs.generators.recorder.rig_calibration.calibrate_rig:calibrate_rig",
         "find an array's intrinsics and poses from clips of a moving chessboard",
         "calibrate-rig captures/board --columns 8 --rows 5 --square-m 0.04 --out rig",
     ),
@@ -64,22 +64,22 @@ COMMANDS: dict[str, Command] = {
         "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
     ),
     "make-msdi-data": Command(
-        "spike4dgs.generators.msdi_data:make_msdi_data",
+        "spike4dgs.generators.bursts.make_msdi_data:make_msdi_data",
         "render training data of MSDI: many variants of the worlds, seen by many rigs",
         "make-msdi-data --variants 40 --out data/msdi",
     ),
     "train-msdi": Command(
-        "spike4dgs.method.msdi.train:train_msdi",
+        "spike4dgs.method.msdi.training.train:train_msdi",
         "train the network that finds points, poses and pictures from spikes",
         "train-msdi --data data/msdi --out runs/msdi",
     ),
     "run-benchmark": Command(
-        "spike4dgs.benchmark.run:run_benchmark",
+        "spike4dgs.benchmark.runs.run:run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
     ),
     "score": Command(
-        "spike4dgs.benchmark.score:score",
+        "spike4dgs.benchmark.runs.score_command:score",
         "score a predictions folder of any program",
         "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
     ),
@@ -104,17 +104,17 @@ COMMANDS: dict[str, Command] = {
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "verify": Command(
-        "spike4dgs.benchmark.verify:verify",
+        "spike4dgs.benchmark.scene.verify:verify",
         "check every file of a scene against its manifest",
         "verify data/car-0-small",
     ),
     "import-spikecv": Command(
-        "spike4dgs.benchmark.spikecv:import_spikecv",
+        "spike4dgs.benchmark.scene.spikecv:import_spikecv",
         "make a scene folder from a SpikeCV folder",
         "import-spikecv motVidarReal2020/rotation1 --out data/rotation1 --rate-hz 20000",
     ),
     "export-spikecv": Command(
-        "spike4dgs.benchmark.spikecv:export_spikecv",
+        "spike4dgs.benchmark.scene.spikecv:export_spikecv",
         "write a scene's streams as a SpikeCV folder",
         "export-spikecv data/car-0-small --out car-spikecv",
     ),
@@ -129,12 +129,12 @@ COMMANDS: dict[str, Command] = {
         "export-nerfstudio data/car-0-small --out car-nerfstudio",
     ),
     "tradeoff": Command(
-        "spike4dgs.generators.tradeoff:tradeoff",
+        "spike4dgs.generators.reports.tradeoff:tradeoff",
         "report render time against error for several settings",
         "tradeoff car --profile paper",
     ),
     "spacing": Command(
-        "spike4dgs.generators.spacing:spacing",
+        "spike4dgs.generators.reports.spacing:spacing",
         "report key-frame spacing against error and render time",
         "spacing --help",
     ),
@@ -152,7 +152,7 @@ SPEED: dict[str, Command] = {
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
     "simulate": Command(
-        "spike4dgs.generators.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
+        "spike4dgs.generators.reports.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
     ),
     "record": Command(
         "spike4dgs.generators.recorder.speed:record",
@@ -160,9 +160,9 @@ SPEED: dict[str, Command] = {
         "speed record",
     ),
     "decode": Command(
-        "spike4dgs.benchmark.speed_decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
+        "spike4dgs.benchmark.speed.decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
     ),
-    "metrics": Command("spike4dgs.benchmark.speed_metrics:metrics", "every metric for one image", "speed metrics"),
+    "metrics": Command("spike4dgs.benchmark.speed.metrics:metrics", "every metric for one image", "speed metrics"),
     "tfi": Command("spike4dgs.baselines.speed:tfi", "pictures from spike intervals, whole stack", "speed tfi"),
     "tfp": Command("spike4dgs.baselines.speed:tfp", "pictures from spike counts, whole stack", "speed tfp"),
     "images": Command(

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from spike4dgs.generators.sensor import Float32
+from spike4dgs.generators.sensor.model import Float32
 
 FPS = 60
 EXPOSURE_S = 1 / 120  # a shutter of 180 degrees

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.bits import kernel
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.generators.sensor import Float32
+from spike4dgs.benchmark.spikes.bits import kernel
+from spike4dgs.generators.sensor.model import Float32
 
 THRESHOLD = 0.2  # of log radiance
 _DARKEST = 1e-3  # radiance below which log radiance does not fall

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
-from spike4dgs.benchmark.images import gray, write_exr, write_geometry, write_mask
-from spike4dgs.benchmark.scene import Target
+from spike4dgs.benchmark.scene.images import gray, write_exr, write_geometry, write_mask
+from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.tasks import Truth
 

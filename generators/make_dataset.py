@@ -17,7 +17,7 @@ from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from spike4dgs.generators.executors import Run
+    from spike4dgs.benchmark.runs.executors import Run
 
 T = TypeVar("T")
 _LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
@@ -72,8 +72,8 @@ def make_dataset(
     """
     from rich.console import Console
 
-    from spike4dgs.generators.executors import executor
-    from spike4dgs.generators.mitsuba_variant import choose_device, pick_variant
+    from spike4dgs.benchmark.runs.executors import executor
+    from spike4dgs.generators.rendering.mitsuba_variant import choose_device, pick_variant
 
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:
@@ -151,8 +151,8 @@ def _is_done(job: Job, out: Path, replace: bool) -> bool:
     Raises UserError where something else has its name, and, unless `replace`, for a damaged scene or other settings.
     """
     from spike4dgs.benchmark.files import read_json
-    from spike4dgs.benchmark.manifest import read_manifest
-    from spike4dgs.benchmark.scene import SCHEMA
+    from spike4dgs.benchmark.scene.manifest import read_manifest
+    from spike4dgs.benchmark.scene.scene import SCHEMA
 
     folder = out / job.id
     if not folder.exists():

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spike4dgs.benchmark.cameras import Camera, look_at
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.generators.worlds import WorldScene
 
 HELD_OUT_VIEW = 4

@@ -23,26 +23,26 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json, writing
-from spike4dgs.benchmark.manifest import write_manifest
-from spike4dgs.benchmark.scene import Target, open_scene
-from spike4dgs.benchmark.scene_writer import SceneDescription, finish_scene
-from spike4dgs.benchmark.spikes import bytes_per_tick
-from spike4dgs.benchmark.splits import standard_splits
+from spike4dgs.benchmark.runs.executors import Run, chunked, here
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import Target, open_scene
+from spike4dgs.benchmark.scene.splits import standard_splits
+from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
+from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import streams, tasks
 from spike4dgs.generators.audit import audit
-from spike4dgs.generators.contact_sheet import contact_sheet
-from spike4dgs.generators.executors import Run, chunked, here
 from spike4dgs.generators.ground_truth import mask_file, write_truth
-from spike4dgs.generators.keyframes import KeyStore, read_arrays, write_arrays
-from spike4dgs.generators.mitsuba_variant import load_mitsuba
-from spike4dgs.generators.motion import KeyPlan
-from spike4dgs.generators.preview import preview
 from spike4dgs.generators.profiles import RATE_HZ, Job
-from spike4dgs.generators.render import Still
-from spike4dgs.generators.sensor import Sensor
+from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
+from spike4dgs.generators.rendering.render import Still
+from spike4dgs.generators.reports.contact_sheet import contact_sheet
+from spike4dgs.generators.reports.preview import preview
+from spike4dgs.generators.sensor.model import Sensor
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 LICENCE = "CC0-1.0"

@@ -8,17 +8,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.images import encode_srgb, write_png
-from spike4dgs.benchmark.scene import Target
-from spike4dgs.benchmark.scene_writer import stream_name
-from spike4dgs.benchmark.spikes import SpikeWriter
-from spike4dgs.generators import calibration, conventional, events
-from spike4dgs.generators.keyframes import KeyStore
-from spike4dgs.generators.motion import KeyPlan
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene.scene import Target
+from spike4dgs.benchmark.scene.writer import stream_name
+from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.generators import conventional, events
 from spike4dgs.generators.profiles import RATE_HZ, Job
-from spike4dgs.generators.sensor import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
-from spike4dgs.generators.sensor_maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.keyframes import KeyStore
+from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
 
 CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
 

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.generators.motion import KeyPlan, key_plan
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
-from spike4dgs.generators.render import MultiViewRenderer, Still
+from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
+from spike4dgs.generators.rendering.render import MultiViewRenderer, Still
 from spike4dgs.generators.rig import HELD_OUT_VIEW, cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 

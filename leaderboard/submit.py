@@ -23,13 +23,13 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.metrics import METRICS, PRIMARY
-from spike4dgs.benchmark.result import COSTS, Cell, Record, check_record, is_complete, read_record, same_value
-from spike4dgs.benchmark.scene import Scene
+from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.results.record import COSTS, Cell, Record, check_record, is_complete, read_record, same_value
+from spike4dgs.benchmark.results.score import open_for, prediction_folders, score_scene
+from spike4dgs.benchmark.scene.scene import Scene, open_scenes
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.benchmark.score import open_for, open_scenes, prediction_folders, score_scene
-from spike4dgs.benchmark.selection import select_metrics
-from spike4dgs.benchmark.splits import DEFAULT_SPLIT
 
 ENTRY, BOARD = "spike4dgs-entry/1", "spike4dgs-leaderboard/1"
 GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ

@@ -12,20 +12,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spike4dgs.benchmark.calibration import Calibration
-from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.recipes import Budget, Model, Progress, Recipe
-from spike4dgs.benchmark.scene import TrainingScene
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.method import Budget, Model, Progress, Recipe
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
-from spike4dgs.method.footage import Footage
-from spike4dgs.method.gaussians import from_points
-from spike4dgs.method.motion import PUBLISHED, Extent, Motion
+from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.motion.table import PUBLISHED, Extent, Motion
+from spike4dgs.method.observations.training_images import Footage
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Views
-from spike4dgs.method.supervision_model import Supervision
+from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.trainer import Trainer, seeded
 
 Float32 = NDArray[np.float32]

@@ -11,15 +11,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.images import Float32
-from spike4dgs.benchmark.provenance import Provenance
-from spike4dgs.method.gaussians import Gaussians
-from spike4dgs.method.model_file import ModelFile, group, write_model
-from spike4dgs.method.motion import MOTIONS, Extent, Motion
+from spike4dgs.benchmark.results.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.splat.backdrop import join
+from spike4dgs.method.splat.background import join
 from spike4dgs.method.trainer import one_torch_thread
 
 

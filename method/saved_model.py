@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.provenance import Provenance
-from spike4dgs.benchmark.recipes import Model
+from spike4dgs.benchmark.method import Model
+from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.method.fit import check_device
 from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.model_file import FIX, ModelFile, read_model
+from spike4dgs.method.model_files.model_file import FIX, ModelFile, read_model
 from spike4dgs.method.radiance_field.model import RadianceModel
-from spike4dgs.method.tracked_model import TrackedModel
+from spike4dgs.method.tracking.model import TrackedModel
 
 # What reads the tensors of each kind: file, device -> model. Its class writes that kind in `save`.
 KINDS: dict[str, Callable[[ModelFile, str], Model]] = {

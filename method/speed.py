@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.timing import show_table, time_ms
+from spike4dgs.benchmark.speed.timing import show_table, time_ms
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.ssim import C1, C2, RADIUS, ssim_reference
 from spike4dgs.method.splat.ssim import ssim as fused_ssim

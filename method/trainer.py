@@ -15,20 +15,20 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.recipes import Progress
+from spike4dgs.benchmark.method import Progress
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from spike4dgs.method.density import Pressure, refine
-from spike4dgs.method.footage import Footage
-from spike4dgs.method.gaussians import Edit, Gaussians
-from spike4dgs.method.motion_model import Motion
-from spike4dgs.method.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
-from spike4dgs.method.poses import Poses
+from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.gaussians.parameters import Edit, Gaussians
+from spike4dgs.method.motion.base import Motion
+from spike4dgs.method.observations.lookup import moving
+from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.pose_refinement import Poses
 from spike4dgs.method.schedule import Stage, choose_time, stages
-from spike4dgs.method.seen import moving
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
-from spike4dgs.method.splat.backdrop import Backdrop
-from spike4dgs.method.supervision_model import Sample, Supervision
+from spike4dgs.method.splat.background import Backdrop
+from spike4dgs.method.supervision.base import Sample, Supervision
 
 
 def seeded(seed: int, step: int) -> torch.Generator:

@@ -27,9 +27,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker
-from spike4dgs.benchmark.bits import UInt8, in_threads, kernel, rows
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
+from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 SHORTEST = 2.0  # ticks on either side
 GROWTH = math.sqrt(2)

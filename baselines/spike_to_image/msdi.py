@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker, learned_from
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.windows import window
-from spike4dgs.benchmark.calibration import Calibration
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.msdi.weights import load_network, read_card, weights_path
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker
-from spike4dgs.benchmark.bits import UInt8, UInt64, expand, in_threads, kernel, lanes, rows
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
+from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, expand, in_threads, kernel, lanes, rows
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 _BLOCK = 128  # bytes of a tick done at a time in the stack: 1024 pixels
 

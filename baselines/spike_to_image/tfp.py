@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker
-from spike4dgs.benchmark.bits import UInt8, UInt64, in_threads, kernel, lanes, rows
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, in_threads, kernel, lanes, rows
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 Array = NDArray[Any]
 HALF_WINDOW = 20  # ticks on each side; 41 ticks in all are customary for this camera

@@ -36,10 +36,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.images import Float32, ImageMaker
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
 from spike4dgs.baselines.spike_to_image.tfi import find_spike
-from spike4dgs.benchmark.bits import UInt8, in_threads, kernel, rows
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 Float64 = NDArray[np.float64]
 U0, JUMP = 0.15, 0.15  # utilisation at rest; share of the rest of it that a spike adds (f)

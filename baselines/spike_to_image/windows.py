@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 WINDOW = 41  # ticks, of Spk2ImgNet
 HALF_WINDOW = WINDOW // 2

@@ -14,10 +14,10 @@ from rich.live import Live
 from rich.table import Table
 
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.gaps import present
-from spike4dgs.benchmark.images import encode_srgb
-from spike4dgs.benchmark.spikes import SpikeStream
-from spike4dgs.generators.recorder.profile import RigProfile
+from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.generators.recorder.profile.profile import RigProfile
 from spike4dgs.generators.recorder.rates import Rate
 
 WINDOW_TICKS = 32  # of a picture on the sheet

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.recorder.layouts import Layout
-from spike4dgs.generators.recorder.reader import Reader
-from spike4dgs.generators.recorder.ring import Block
+from spike4dgs.generators.recorder.frames.layouts import Layout
+from spike4dgs.generators.recorder.frames.ring import Block
+from spike4dgs.generators.recorder.usb.reader import Reader
 
 _EVERY_S = 0.2
 _FRAMES = 4  # whose spikes are counted

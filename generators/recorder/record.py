@@ -15,16 +15,16 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.manifest import NAME as MANIFEST
-from spike4dgs.benchmark.manifest import write_manifest
-from spike4dgs.generators.recorder.board_views import open_recording
+from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
-from spike4dgs.generators.recorder.clip import Clip, Sink
-from spike4dgs.generators.recorder.clip_files import ClipRecord, StreamFiles
-from spike4dgs.generators.recorder.layouts import UInt8
+from spike4dgs.generators.recorder.files.clip_files import ClipRecord, StreamFiles
+from spike4dgs.generators.recorder.frames.clip import Clip, Sink
+from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
-from spike4dgs.generators.recorder.profile import RigProfile
+from spike4dgs.generators.recorder.profile.profile import RigProfile
+from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording
 from spike4dgs.generators.recorder.sources import (
     CLIP,
     Source,
@@ -35,7 +35,7 @@ from spike4dgs.generators.recorder.sources import (
     truth,
 )
 from spike4dgs.generators.recorder.sync import SyncReport, fit_arrival
-from spike4dgs.generators.recorder.transport import Link, open_link
+from spike4dgs.generators.recorder.usb.transport import Link, open_link
 
 LOST_DATA = 3  # exit code
 _PATIENCE = 3  # presses of Ctrl-C after which even the writing of what was captured is given up

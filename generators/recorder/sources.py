@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.stream_folder import open_stream_folder
-from spike4dgs.generators.recorder.emulated_array import EmulatedArray, scene_profile, scene_streams
-from spike4dgs.generators.recorder.emulator import EmulatedBackend
-from spike4dgs.generators.recorder.layouts import PLAIN, UInt8, make_layout, orient
-from spike4dgs.generators.recorder.profile import PACKET_BYTES, RigProfile, load_profile
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
+from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8, make_layout, orient
+from spike4dgs.generators.recorder.profile.profile import PACKET_BYTES, RigProfile, load_profile
 
 CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")
 SECONDS = 0.5  # that are recorded where nothing else is asked for

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spike4dgs.benchmark.timing import show_table
+from spike4dgs.benchmark.speed.timing import show_table
 from spike4dgs.generators.recorder.speed_runs import FRAME_BYTES, Load, Outcome, disk_rate, run
 
 COLUMNS = (

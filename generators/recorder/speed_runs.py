@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.gaps import present
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.generators.recorder.capture import DRAIN, TRIGGERED, capture
 from spike4dgs.generators.recorder.checks import find_cameras
-from spike4dgs.generators.recorder.clip import Clip
-from spike4dgs.generators.recorder.clip_files import StreamFiles
-from spike4dgs.generators.recorder.disk import BUFFER_BYTES, PER_FILE, Buffers, DiskFile
-from spike4dgs.generators.recorder.emulated_array import EmulatedArray, camera_profile
-from spike4dgs.generators.recorder.emulated_camera import EmulatedCamera
-from spike4dgs.generators.recorder.emulator import EmulatedBackend
-from spike4dgs.generators.recorder.layouts import PLAIN, UInt8
-from spike4dgs.generators.recorder.profile import PRIMARY, SECONDARY, RigProfile
+from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_profile
+from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
+from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles
+from spike4dgs.generators.recorder.files.disk import BUFFER_BYTES, PER_FILE, Buffers, DiskFile
+from spike4dgs.generators.recorder.frames.clip import Clip
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8
+from spike4dgs.generators.recorder.profile.profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.rates import Rate
-from spike4dgs.generators.recorder.reads import Completion, Transfers
-from spike4dgs.generators.recorder.transport import UsbLink, open_link
+from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
+from spike4dgs.generators.recorder.usb.transport import UsbLink, open_link
 
 FRAME_BYTES = 12500
 _WIDTH, _HEIGHT = 400, 250

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spike4dgs.generators.worlds.materials import Material
-from spike4dgs.generators.worlds.meshes import Mesh
+from spike4dgs.generators.worlds.primitives.materials import Material
+from spike4dgs.generators.worlds.primitives.meshes import Mesh
 
 
 class Part(NamedTuple):

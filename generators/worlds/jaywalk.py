@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds import figure, street
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.parts import figure, street
 
 _CLOTHES = (
     figure.Clothes(

@@ -8,8 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.model_files.network_weights import (
+    WeightKind,
+    fill_network,
+    read_weights_card,
+    weights_in_use,
+    write_weights,
+)
 from spike4dgs.method.msdi.config import CONFIGS
-from spike4dgs.method.network_weights import WeightKind, fill_network, read_weights_card, weights_in_use, write_weights
 
 if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Msdi

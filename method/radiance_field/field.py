@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from spike4dgs.method.hexplane import HexPlane, HexPlaneShape
-from spike4dgs.method.mlp import perceptron
+from spike4dgs.method.motion.hexplane import HexPlane, HexPlaneShape
+from spike4dgs.method.motion.mlp import perceptron
 
 THIN = 3.0  # at first a path of one unit is 5 % opaque
 

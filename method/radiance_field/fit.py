@@ -18,15 +18,15 @@ from torch import Tensor
 
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
-from spike4dgs.method.hexplane import plane_tv, time_smoothness, time_sparsity
-from spike4dgs.method.motion import hexplane_shape
-from spike4dgs.method.optimizer import Decay, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.gaussians.optimizer import Decay, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.motion.hexplane import plane_tv, time_smoothness, time_sparsity
+from spike4dgs.method.motion.table import hexplane_shape
 from spike4dgs.method.radiance_field.march import Rays, camera_rays
 from spike4dgs.method.radiance_field.model import DynamicField, FieldShape, RadianceModel, bounds_of
 from spike4dgs.method.radiance_field.occupancy import may_move
-from spike4dgs.method.radiance_field.spiking import Reset, firing_rate, spike_loss
 from spike4dgs.method.schedule import GOLDEN
 from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.supervision.spike_neuron import Reset, firing_rate, spike_loss
 from spike4dgs.method.trainer import one_torch_thread, seeded
 
 # SpikeNeRF's own values, for synthetic scenes (its rate falls by 0.1^(step / 500,000), its two networks are alike), and

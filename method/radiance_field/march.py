@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera
 
 
 @dataclass(frozen=True, eq=False)

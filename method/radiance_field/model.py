@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.images import Float32
-from spike4dgs.benchmark.provenance import Provenance
+from spike4dgs.benchmark.results.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.method.fitted_model import count_bytes
-from spike4dgs.method.hexplane import HexPlaneShape
-from spike4dgs.method.model_file import ModelFile, group, write_model
+from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.motion.hexplane import HexPlaneShape
 from spike4dgs.method.radiance_field.blocks import in_blocks
 from spike4dgs.method.radiance_field.field import Deformation, Field, encode_position
 from spike4dgs.method.radiance_field.march import Rays, camera_rays, resample, spread, weigh

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from spike4dgs.benchmark.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera
 
 DECAY = 0.8  # of the remembered density at each look at a cell: matter that has gone is forgotten after a few looks
 

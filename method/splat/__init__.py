@@ -1,7 +1,7 @@
 """Gaussian splatting: one `render` call over a float64 reference, a CPU kernel and gsplat on CUDA."""
 
 from spike4dgs.method.splat.api import render
-from spike4dgs.method.splat.threads import set_threads
+from spike4dgs.method.splat.kernels.threads import set_threads
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views
 
 __all__ = ["RenderOutput", "Splats", "Views", "render", "set_threads"]

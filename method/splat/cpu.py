@@ -15,13 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat import project_gradient, project_kernels, tile_kernels
-from spike4dgs.method.splat.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
-from spike4dgs.method.splat.jit import announce_compilation
-from spike4dgs.method.splat.raster_kernels import AHEAD, MAX_BLOCKS, raster_kernels, record_width
-from spike4dgs.method.splat.threads import aligned, get_threads, run
+from spike4dgs.method.splat.kernels import project as project_kernels
+from spike4dgs.method.splat.kernels import project_gradient
+from spike4dgs.method.splat.kernels import tiles as tile_kernels
+from spike4dgs.method.splat.kernels.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
+from spike4dgs.method.splat.kernels.jit import announce_compilation
+from spike4dgs.method.splat.kernels.raster import AHEAD, MAX_BLOCKS, raster_kernels, record_width
+from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run
+from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
-from spike4dgs.method.splat.vector_ir import host_lanes
 
 Array = np.ndarray
 busy = threading.Lock()  # the scratch memory is shared by all renders of the process

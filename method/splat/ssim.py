@@ -8,7 +8,7 @@ pixels and images. The windows are separable and stay in the cache; the gradient
     dS/dimage = blur(dS/dm1) + 2 image blur(dS/dq1) + target blur(dS/dq12)
 
 with m the blurred images, q the blurred squares and product. This is the training loss; scores come from
-`spike4dgs.benchmark.metrics`, which leaves out the border instead of padding it.
+`spike4dgs.benchmark.metrics.table`, which leaves out the border instead of padding it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.splat import threads
-from spike4dgs.method.splat.jit import announce_compilation, helper, kernel
-from spike4dgs.method.splat.vector_ir import fetch_add
+from spike4dgs.method.splat.kernels import threads
+from spike4dgs.method.splat.kernels.jit import announce_compilation, helper, kernel
+from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 RADIUS = 5
 C1, C2 = 0.01**2, 0.03**2

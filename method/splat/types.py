@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.scene.cameras import Camera
 
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becomes 0

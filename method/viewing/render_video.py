@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.images import UInt8, encode_srgb, write_png
+from spike4dgs.benchmark.scene.images import UInt8, encode_srgb, write_png
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing import camera_paths
 from spike4dgs.method.viewing.camera_paths import PathName, make_path, resized

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.cameras import Camera
-from spike4dgs.benchmark.images import Float32
-from spike4dgs.benchmark.timing import show_table
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.speed.timing import show_table
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat import render as rasterise

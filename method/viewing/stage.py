@@ -11,10 +11,10 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.images import Float32, UInt8, encode_srgb
-from spike4dgs.benchmark.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32, UInt8, encode_srgb
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.saved_model import SavedModel
 
 Mode = Literal["rendered", "spike rate", "error"]

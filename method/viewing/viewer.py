@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.cameras import Camera
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.saved_model import load_model
 from spike4dgs.method.trainer import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import focus, resized, still

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.windows import HALF_WINDOW, WINDOW, window
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.spikes import SpikeStream
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 Float32 = NDArray[np.float32]
 PUBLIC_VARIANT = 0

@@ -16,7 +16,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from spike4dgs.method.splat.vector_ir import Lanes, array_data, offset
+from spike4dgs.method.splat.kernels.vector_ir import Lanes, array_data, offset
 
 TAPS = 9
 GROUP = 8  # channels of a group, which the kernel knows when it is compiled: one vector

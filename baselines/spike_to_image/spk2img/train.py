@@ -18,18 +18,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.baselines.spike_to_image.spk2img import reconstruct
 from spike4dgs.baselines.spike_to_image.spk2img.data import Batch, Example, draw, open_for_training, read_examples
+from spike4dgs.baselines.spike_to_image.spk2img.maker import reconstruct
 from spike4dgs.baselines.spike_to_image.spk2img.network import BLOCK_STARTS, MIDDLE, Reconstruction, Spk2ImgNet
 from spike4dgs.baselines.spike_to_image.spk2img.weights import Card, save_weights
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.image_pair import ImagePair
-from spike4dgs.benchmark.metrics import METRICS
-from spike4dgs.benchmark.scene import Scene
+from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.optimizer import WarmCosine, make_adam, set_rate
+from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_rate
 
 # Width 64; Adam at 1e-4, a tenth of it after epoch 20 of 61; batches of 16 patches of 40x40 pixels.
 PUBLISHED: dict[str, int] = {"width": 64, "epochs": 61, "batch": 16, "patch": 40}

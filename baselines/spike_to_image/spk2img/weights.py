@@ -7,7 +7,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spike4dgs.method.network_weights import WeightKind, fill_network, read_weights_card, weights_in_use, write_weights
+from spike4dgs.method.model_files.network_weights import (
+    WeightKind,
+    fill_network,
+    read_weights_card,
+    weights_in_use,
+    write_weights,
+)
 
 if TYPE_CHECKING:
     from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet

@@ -1,0 +1,1 @@
+"""The initialisation part of a recipe: camera poses and first points."""

@@ -1,0 +1,99 @@
+"""The initialisations `colmap`, `colmap-flat` and `colmap-uncalibrated`: poses by structure from motion (COLMAP).
+
+SIFT features of one picture per training view, the mean of the whole clip: what moves is a blur there, and the static
+rest, where the spikes' quantisation noise has averaged out, carries the poses of a rig that stands still. One global
+mapping (rotation averaging, global positioning, bundle adjustment) solves for all views at once: an array is small
+beside its distance to the scene, and the pair that incremental mapping begins with is then easily placed in a wrong but
+locally best way.
+
+`colmap` keeps the calibrated intrinsics; `colmap-uncalibrated` knows nothing and refines one focal length for all
+views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` sees pictures corrected by the cameras'
+calibrations, in which views have up to twice as many points in common, and sweeps planes from the poses found, as
+`rig-flat` does from given ones.
+
+Poses come out in a frame of their own: the similarity that fits them to the calibrated training poses
+(`benchmark.poses`) takes everything to the scene's frame, where held-out cameras are known. Calibrated poses serve for
+nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.baselines.initialization.features import MIN_ANGLE_DEG, NOTHING, Mapping, find_features, in_scene
+from spike4dgs.baselines.initialization.rig import rig, rig_flat, window_means
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.fit import Start
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Float32 = NDArray[np.float32]
+
+WHO = "COLMAP"
+MIN_POINTS = 100  # fewer are no start for Gaussians: they come from a plane sweep with the estimated cameras
+
+
+def colmap(scene: TrainingScene, seed: int) -> Start:
+    """Poses and points with the calibrated intrinsics; see the module.
+
+    Raises UserError unless all training views are registered.
+    """
+    return _start(scene, map_views(scene, clip_means(scene), seed, calibrated=True), seed)
+
+
+def colmap_uncalibrated(scene: TrainingScene, seed: int) -> Start:
+    """The same, with intrinsics unknown."""
+    return _start(scene, map_views(scene, clip_means(scene), seed, calibrated=False), seed)
+
+
+def colmap_flat(scene: TrainingScene, seed: int) -> Start:
+    """Poses from corrected pictures with the calibrated intrinsics, and points by plane sweep; raises as `colmap`."""
+    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    found = map_views(scene, pictures, seed, calibrated=True).of_all(scene, WHO)
+    return rig_flat(replace(scene, cameras=found.cameras), seed)
+
+
+def _start(scene: TrainingScene, found: Mapping, seed: int) -> Start:
+    if len(found.of_all(scene, WHO).points) < MIN_POINTS:
+        return rig(replace(scene, cameras=found.cameras), seed)
+    return Start(found.cameras, found.points.astype(np.float32), found.values)
+
+
+def clip_means(scene: TrainingScene) -> Float32:
+    """The mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
+    ticks = min(scene.n_ticks, 65535)
+    counts = np.stack([s.counts(0, ticks) for s in scene.streams]).astype(np.float32)
+    return counts / np.float32(ticks * scene.radiance_gain)
+
+
+def map_views(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Mapping:
+    """Structure from motion on one picture of each training view [C, H, W], linear radiance.
+
+    The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
+    nothing can be aligned and the mapping is empty.
+    """
+    import pycolmap
+
+    with find_features(scene.cameras, pictures, seed, calibrated=calibrated) as found:
+        models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", _options(seed, calibrated))
+        if not models:
+            return NOTHING
+        return in_scene(max(models.values(), key=lambda m: m.num_reg_images()), scene.cameras, found.names, pictures)
+
+
+def _options(seed: int, calibrated: bool) -> pycolmap.GlobalPipelineOptions:
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = 1, seed
+    options.mapper.num_threads, options.mapper.random_seed = 1, seed
+    options.mapper.min_tri_angle_deg = MIN_ANGLE_DEG
+    options.mapper.retriangulation.min_angle = MIN_ANGLE_DEG
+    options.mapper.bundle_adjustment.refine_focal_length = not calibrated
+    options.mapper.bundle_adjustment.refine_extra_params = False
+    return options

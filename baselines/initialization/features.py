@@ -1,0 +1,172 @@
+"""What views have in common: SIFT features of one picture per view, and their matches, in a database of COLMAP's.
+
+Pictures are enlarged before features are found, and all pairs are matched. Everything runs in one thread, so that the
+same seed gives the same matches.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.pose_error import align_cameras
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene.scene import TrainingScene
+
+if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
+    import pycolmap
+
+Float32 = NDArray[np.float32]
+
+ENLARGE = 2  # of pictures 200 px wide; at their own size SIFT finds about 400 features a view, at twice it 2,700
+PEAK_THRESHOLD = 0.002  # of SIFT's contrast, a third of COLMAP's: gray pictures of dim scenes are soft
+PAIR_ERROR_PX = 2.0  # of a match in an enlarged picture to its epipolar line
+MIN_ANGLE_DEG = 0.5  # between a point's rays: the array is narrow
+FOCAL_PRIOR = 1.2  # image widths, COLMAP's own
+
+
+@dataclass(frozen=True)
+class Features:
+    """Where COLMAP finds pictures and matches; `names` are the pictures', in the views' order."""
+
+    folder: Path
+    database: Path
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Mapping:
+    """What structure from motion found, in the frame of the calibrated training cameras."""
+
+    cameras: tuple[Camera, ...]  # those registered, in the scene's order
+    points: NDArray[np.float64]  # [N, 3] m
+    values: Float32  # [N] gray radiance
+
+    def of_all(self, scene: TrainingScene, who: str) -> Mapping:
+        """The same, if it has all training views of `scene`. Raises UserError."""
+        count, wanted = len(self.cameras), len(scene.cameras)
+        if count < wanted:
+            fix = "use rig, or a scene with more static texture"
+            raise problem(f"{who} on {scene.id}", f"all {wanted} views registered", f"{count} of {wanted}", fix)
+        return self
+
+
+NOTHING = Mapping((), np.zeros((0, 3)), np.zeros(0, np.float32))
+
+
+@contextmanager
+def find_features(cameras: Sequence[Camera], pictures: Float32, seed: int, *, calibrated: bool) -> Iterator[Features]:
+    """Features and matches of pictures [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
+
+    All views share one camera: the calibrated one, or one whose focal length is a guess.
+    """
+    import pycolmap
+
+    with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
+        names = _write_pictures(Path(folder), cameras, pictures)
+        database = Path(folder) / "database.db"
+        pycolmap.set_random_seed(seed)
+        _match(database, Path(folder), cameras[0], seed, calibrated)
+        yield Features(Path(folder), database, tuple(names))
+
+
+def _write_pictures(folder: Path, cameras: Sequence[Camera], pictures: Float32) -> list[str]:
+    names = [f"{camera.id}.png" for camera in cameras]
+    for name, picture in zip(names, pictures, strict=True):
+        image = cv2.resize(encode_srgb(picture), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
+        write_png(folder / name, np.asarray(image, np.uint8))
+    return names
+
+
+def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: bool) -> None:
+    """Features and matches of all pairs into the database; all views share one camera."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    size = (camera.width * ENLARGE / 2, camera.height * ENLARGE / 2)
+    if calibrated:
+        reader.camera_model = "PINHOLE"
+        intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+        reader.camera_params = ",".join(repr(float(x) * ENLARGE) for x in intrinsics)
+    else:
+        reader.camera_model = "SIMPLE_PINHOLE"
+        reader.camera_params = f"{FOCAL_PRIOR * camera.width * ENLARGE},{size[0]},{size[1]}"
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = 1
+    extraction.sift.peak_threshold = PEAK_THRESHOLD
+    cpu = pycolmap.Device.cpu
+    pycolmap.extract_features(
+        database,
+        folder,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=cpu,
+    )
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads = 1
+    verification.ransac.random_seed = seed
+    verification.ransac.max_error = PAIR_ERROR_PX
+    pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification, device=cpu)
+
+
+def in_scene(
+    model: pycolmap.Reconstruction, cameras: Sequence[Camera], names: Sequence[str], pictures: Float32
+) -> Mapping:
+    """The model's views and points, moved by the similarity that fits its views to the calibrated ones.
+
+    With fewer than two views nothing can be aligned: then it is `NOTHING`.
+    """
+    images = {i.name: i for i in model.images.values() if i.has_pose}
+    camera = next(iter(model.cameras.values()))  # all views share it
+    places = [k for k, name in enumerate(names) if name in images]
+    if len(places) < 2:
+        return NOTHING
+    K = camera.calibration_matrix() / ENLARGE
+    estimated = [_camera(images[names[k]], K, cameras[k]) for k in places]
+    move = align_cameras(estimated, [cameras[k] for k in places])
+    view = {images[names[k]].image_id: k for k in places}
+    points, values = [], []
+    for point in model.points3D.values():
+        points.append(point.xyz)
+        seen = [(view[e.image_id], model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
+        values.append(np.mean([_at(pictures[k], xy / ENLARGE) for k, xy in seen]))
+    return Mapping(
+        tuple(move.camera(c) for c in estimated),
+        move(np.asarray(points, np.float64).reshape(-1, 3)),
+        np.asarray(values, np.float32),
+    )
+
+
+def _camera(image: pycolmap.Image, K: NDArray[np.float64], like: Camera) -> Camera:
+    """The view as COLMAP places it, with the intrinsics K that it used."""
+    pose = image.cam_from_world().matrix()
+    return replace(like, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], R=pose[:, :3], t=pose[:, 3])
+
+
+def _at(picture: Float32, xy: NDArray[np.float64]) -> float:
+    u, v = np.clip(xy.astype(int), 0, [picture.shape[1] - 1, picture.shape[0] - 1])
+    return float(picture[v, u])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep COLMAP's log off the terminal; what matters is raised or returned."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

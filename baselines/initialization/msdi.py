@@ -1,0 +1,214 @@
+"""The initialisations `msdi`, `msdi-matched`, `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
+
+The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
+was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
+view 0's frame, at a scale of its own.
+
+`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, what views match is measured
+better than a network guesses it: those are the points of `rig-flat`. Where nothing matches, for lack of texture, the
+network's points take the place of the nearest depth; of view 0's, as inverse depths that a line brings to the matched
+ones.
+
+`msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
+views match in corrected means of the clip (`bundle`). From there on it is `msdi`.
+
+`msdi-uncalibrated` has the network alone: each view's pose follows from its own points, by PnP (`method.msdi.pose`),
+with one focal length for all. In both everything is moved to the scene's frame as COLMAP's result is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch.nn import functional
+
+from spike4dgs.baselines.initialization.features import Mapping
+from spike4dgs.baselines.initialization.matched_poses import bundle
+from spike4dgs.baselines.initialization.rig import HOLE_PX, Cloud, fill, filled, matched, thin, window_means
+from spike4dgs.baselines.spike_to_image.windows import window
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.pose_error import align_cameras
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.fit import Start
+from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
+from spike4dgs.method.msdi.shrink import shrink
+from spike4dgs.method.msdi.weights import load_network, weights_path
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+TRAINED_PX = 104  # longer side of the training pictures
+LEAST_CONFIDENCE = 0.3  # quantile of a view's confidence below which its points are left out
+LEAST_MATCHES = 50  # for a line through inverse depths
+LINE_ROUNDS = 10
+FARTHEST = 2.0  # times the farthest match
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """What the network made of V views of h x w pixels."""
+
+    factor: int  # the cameras' pixels are blocks of so many by so many
+    cameras: tuple[Camera, ...]  # the training cameras at this size
+    pictures: Float32  # [V, h, w] radiance
+    points: Float64  # [V, h, w, 3] in view 0's frame, at any scale
+    confidence: Float64  # [V, h, w]
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """Pixels [V, h, w] whose points are used."""
+        least = np.quantile(self.confidence, LEAST_CONFIDENCE, axis=(1, 2), keepdims=True)
+        return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
+
+
+def msdi(scene: TrainingScene, seed: int) -> Start:
+    """Points at the calibrated poses; see the module. Nothing is random, `seed` is not used.
+
+    Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
+    """
+    return _given(scene, look(scene, calibrated=True))
+
+
+def _given(scene: TrainingScene, glance: Glance) -> Start:
+    cloud, mean = matched(scene, flat_field=True)
+    return filled(scene, completed(cloud, glance), mean)
+
+
+def msdi_matched(scene: TrainingScene, seed: int) -> Start:
+    """Poses by the network's points of view 0 and by matches, and points there; raises as `msdi`, and `place` does."""
+    glance = look(scene, calibrated=True)
+    cameras = place(scene, glance, seed).cameras
+    small = tuple(shrunk(camera, glance.factor) for camera in cameras)
+    return _given(replace(scene, cameras=cameras), replace(glance, cameras=small))
+
+
+def place(scene: TrainingScene, glance: Glance, seed: int) -> Mapping:
+    """The training cameras, whose intrinsics are known, and the points that they match.
+
+    Raises UserError unless all have poses.
+    """
+    guess = np.where(glance.sure[0][..., None], glance.points[0], np.nan)
+    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    return bundle(scene, guess, glance.factor, pictures, seed).of_all(scene, "MSDI")
+
+
+def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
+    """Poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
+    return unposed(scene, look(scene, calibrated=False), seed, calibrated=False)
+
+
+def look(scene: TrainingScene, *, calibrated: bool) -> Glance:
+    """What the network in use makes of the middle of the clip, told the intrinsics or not; raises as `msdi`."""
+    device = choose_device("auto")
+    network = load_network(weights_path(), device)
+    factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
+    spikes = np.stack([window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams])
+    small = shrink(torch.from_numpy(spikes), factor)[None]
+    cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)
+    K = torch.from_numpy(np.stack([c.K for c in cameras])[None].astype(np.float32))
+    sensors, gain = None, scene.radiance_gain
+    if calibrations := scene.calibrations:
+        sensors = block_means(calibrations, factor, device)
+        gain = float(np.mean([c.radiance_gain for c in calibrations]))
+    with torch.inference_mode():
+        found = network(small.to(device), K.to(device) if calibrated else None, sensors)
+    pictures = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
+    points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
+    return Glance(factor, cameras, pictures, points, confidence)
+
+
+def shrunk(camera: Camera, factor: int) -> Camera:
+    """The view of a sensor whose pixels are blocks of `factor` x `factor`, sides rounded up."""
+    width, height = -(-camera.width // factor), -(-camera.height // factor)
+    fx, fy, cx, cy = (x / factor for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -> Sensors:
+    """The maps [1, V, h, w] of sensors with larger pixels."""
+
+    def small(maps: list[Float32]) -> torch.Tensor:
+        whole = torch.from_numpy(np.stack(maps)).to(device)[None]
+        return functional.avg_pool2d(whole, factor, ceil_mode=True, count_include_pad=False)
+
+    return Sensors(small([c.gain for c in calibrations]), small([c.dark for c in calibrations]))
+
+
+def completed(cloud: Cloud, glance: Glance) -> Cloud:
+    """The matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
+    camera, depth, sure = glance.cameras[0], glance.points[0, :, :, 2], glance.sure[0]
+    uv, z = camera.project(cloud.points)
+    uv, z = uv[z > 0], z[z > 0]
+    line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z)
+    if line is None:
+        return cloud
+    v, u = np.nonzero(sure & (depth > 0))
+    at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
+    hole = (cKDTree(uv).query(at)[0] > HOLE_PX / glance.factor) & (inverse * z.max() * FARTHEST > 1)
+    points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
+    return Cloud(points, np.concatenate([cloud.values, glance.pictures[0, v[hole], u[hole]]]))
+
+
+def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | None:
+    """(a, b) of the line a / depth + b that comes closest to the inverse depths 1 / z of points seen at pixels uv.
+
+    The sum of the absolute differences is made smallest, by least squares that the last residuals weigh. `depth` [h, w]
+    is NaN where nothing is known. None for fewer than `LEAST_MATCHES` points, or where the line does not rise.
+    """
+    inside = (uv >= 0).all(axis=1) & (uv < depth.shape[::-1]).all(axis=1)
+    u, v = uv[inside].astype(np.int64).T
+    known = depth[v, u] > 0
+    if known.sum() < LEAST_MATCHES:
+        return None
+    x, y = 1 / depth[v, u][known], 1 / z[inside][known]
+    if np.ptp(x) == 0:
+        return None
+    weights, line = np.ones(len(x)), np.zeros(2)
+    for _ in range(LINE_ROUNDS):
+        line = np.polyfit(x, y, 1, w=np.sqrt(weights))
+        weights = 1 / np.maximum(np.abs(np.polyval(line, x) - y), 1e-6 * y.mean())
+    return line if line[0] > 0 else None
+
+
+def unposed(scene: TrainingScene, glance: Glance, seed: int, *, calibrated: bool) -> Start:
+    """Poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
+
+    Raises UserError where a view has no pose.
+    """
+    first, f = scene.cameras[0], glance.factor
+    cameras = list(scene.cameras) if calibrated else _one_focal(scene, glance)
+    K = np.stack([shrunk(camera, f).K for camera in cameras])
+    poses = solve_poses(glance.points, glance.confidence, K, seed)
+    if bad := [f"{c.id} ({p.reason})" for c, p in zip(glance.cameras, poses, strict=True) if not p.found]:
+        fix = "use rig or colmap"
+        raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
+    known = [pose.w2c for pose in poses if pose.w2c is not None]
+    placed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
+    move = align_cameras(placed, scene.cameras)
+    moved = tuple(move.camera(c) for c in placed)
+    cloud = thin(moved, Cloud(move(glance.points[glance.sure]), glance.pictures[glance.sure]))
+    pictures = glance.pictures.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = fill(moved, pictures, cloud)
+    return Start(moved, cloud.points.astype(np.float32), cloud.values)
+
+
+def _one_focal(scene: TrainingScene, glance: Glance) -> list[Camera]:
+    """The cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
+    first, f = scene.cameras[0], glance.factor
+    middle = first.width / 2, first.height / 2
+    v, u = np.nonzero(glance.sure[0])
+    offsets = np.stack([u + 0.5, v + 0.5], axis=-1) - np.divide(middle, f)
+    focal = focal_from_points(glance.points[0, v, u], offsets)
+    if focal is None:
+        fix = "use rig or colmap"
+        raise problem(f"MSDI on {scene.id}", "points that give a focal length", "none before the camera", fix)
+    return [replace(c, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]) for c in scene.cameras]

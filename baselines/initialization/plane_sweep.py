@@ -1,0 +1,186 @@
+"""Depth maps of a calibrated array by plane sweep, and the points on which several views agree.
+
+For a reference view, planes parallel to its image are swept over inverse depth; the other views' pictures are warped
+onto each plane and compared by zero-mean normalised cross-correlation. No depth range is given: it is found by a
+coarse sweep from infinity to the parallax at which the views would hardly overlap any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.scene.cameras import Camera
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WINDOW = 5  # px, side of the correlation window: small enough for thin things at 125x200
+NOISE = 4e-4  # variance of a picture's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
+PARALLAX_STEP = 1.0  # px of parallax of the widest pair between planes; peaks are refined below it
+MAX_PARALLAX = 0.6  # of the image's width, of the widest pair: nearer things are seen by too few views to match
+MIN_SCORE = 0.4  # mean correlation over the other views below which a depth is not believed
+AGREE_PX = 1.5  # px of parallax between two views' depths of one point that still counts as agreement
+MIN_AGREE = 2  # other views that must agree
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A reference view's inverse depth [H, W] in 1/m and how well the other views match there [H, W], -1 to 1."""
+
+    inverse: Float32
+    score: Float32
+
+
+def widest_baseline(cameras: Sequence[Camera]) -> float:
+    """Largest distance between two cameras, m."""
+    centers = np.stack([c.center for c in cameras])
+    return float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+
+
+def inverse_depth_step(cameras: Sequence[Camera]) -> float:
+    """Difference of inverse depth, 1/m, that shifts a point by `PARALLAX_STEP` px in the widest pair."""
+    return PARALLAX_STEP / (cameras[0].fx * widest_baseline(cameras))
+
+
+def full_range(cameras: Sequence[Camera]) -> Float64:
+    """Inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
+    step = inverse_depth_step(cameras)
+    planes = int(MAX_PARALLAX * cameras[0].width / PARALLAX_STEP)
+    return step * np.arange(planes + 1, dtype=np.float64)
+
+
+def find_range(cameras: Sequence[Camera], pictures: Float32) -> Float64:
+    """The inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
+
+    Everything is kept where nothing matches.
+    """
+    planes, step = full_range(cameras), inverse_depth_step(cameras)
+    half = [half_size(c) for c in cameras]
+    small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in pictures])
+    maps = [sweep(half, small, i, planes[::2]) for i in range(len(cameras))]
+    found = np.concatenate([m.inverse[agreed(half, maps, i)] for i, m in enumerate(maps)])
+    if not len(found):
+        return planes
+    low, high = np.quantile(found, [0.002, 0.998])
+    return planes[(planes >= low - 6 * step) & (planes <= high + 6 * step)]
+
+
+def half_size(camera: Camera) -> Camera:
+    """The same view with half as many pixels each way."""
+    c, width, height = camera, camera.width // 2, camera.height // 2
+    x, y = width / c.width, height / c.height
+    return Camera(c.id, width, height, c.fx * x, c.fy * y, c.cx * x, c.cy * y, c.R, c.t)
+
+
+def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> Float64:
+    """Pixels of `reference`, seen on the plane z = 1 / inverse_depth of its frame, to pixels of `other`: [3, 3].
+
+    x' ~ K' (R + t w n^T) K^-1 x with the relative pose (R, t), w the inverse depth and n the optical axis.
+    Coordinates have pixel centres at +0.5.
+    """
+    R = other.R @ reference.R.T
+    t = other.t - R @ reference.t
+    return np.asarray(other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K))
+
+
+def sweep(
+    cameras: Sequence[Camera], pictures: Float32, index: int, planes: Float64, pixels: Mask | None = None
+) -> DepthMap:
+    """Depth of view `index` from all other views; pictures [C, H, W], inverse depths `planes` ascending.
+
+    With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
+    """
+    top, left, bottom, right = _rectangle(pixels) if pixels is not None else (0, 0, *pictures.shape[1:])
+    reference = np.ascontiguousarray(pictures[index, top:bottom, left:right])
+    height, width = reference.shape
+    mean = _box(reference)
+    variance = _box(reference * reference) - mean * mean
+    scores = np.zeros((len(planes), height, width), np.float32)
+    here = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
+    there = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # and back
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    for plane, w in enumerate(planes):
+        total, seen = scores[plane], np.zeros((height, width), np.float32)
+        for other in range(len(cameras)):
+            if other == index:
+                continue
+            H = there @ plane_homography(cameras[index], cameras[other], float(w)) @ here
+            warped = cv2.warpPerspective(
+                pictures[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
+            )
+            inside = warped >= 0
+            total += np.maximum(_correlation(reference, mean, variance, warped), 0) * inside
+            seen += inside
+        total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
+    found = _peak(scores, planes)
+    whole = DepthMap(np.zeros(pictures.shape[1:], np.float32), np.full(pictures.shape[1:], -1, np.float32))
+    whole.inverse[top:bottom, left:right], whole.score[top:bottom, left:right] = found.inverse, found.score
+    return whole
+
+
+def _rectangle(pixels: Mask) -> tuple[int, int, int, int]:
+    """Top, left, bottom, right of the smallest rectangle that holds a mask and a margin of one window."""
+    rows, columns = np.nonzero(pixels.any(axis=1))[0], np.nonzero(pixels.any(axis=0))[0]
+    if not len(rows):
+        return 0, 0, 1, 1
+    top, left = max(0, int(rows[0]) - WINDOW), max(0, int(columns[0]) - WINDOW)
+    return top, left, int(rows[-1]) + 1 + WINDOW, int(columns[-1]) + 1 + WINDOW
+
+
+def _box(image: Float32) -> Float32:
+    return np.asarray(cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT), np.float32)
+
+
+def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32) -> Float32:
+    mean_b = _box(b)
+    variance_b = _box(b * b) - mean_b * mean_b
+    both = _box(a * b) - mean_a * mean_b
+    return np.asarray(both / np.sqrt((variance_a + NOISE) * (variance_b + NOISE)), np.float32)
+
+
+def _peak(scores: Float32, planes: Float64) -> DepthMap:
+    """Best plane per pixel with a parabola through its neighbours."""
+    best = scores.argmax(axis=0)
+    inner = np.clip(best, 1, len(planes) - 2)
+
+    def at(i: NDArray[np.intp]) -> Float32:
+        return np.take_along_axis(scores, i[None], axis=0)[0]
+
+    left, middle, right = at(inner - 1), at(inner), at(inner + 1)
+    curvature = left - 2 * middle + right
+    shift = np.where(curvature < -1e-6, 0.5 * (left - right) / np.minimum(curvature, -1e-6), 0.0)
+    position = np.where(inner == best, inner + np.clip(shift, -0.5, 0.5), best)
+    inverse = planes[0] + position * (planes[1] - planes[0])
+    return DepthMap(inverse.astype(np.float32), at(best))
+
+
+def lift(camera: Camera, inverse: Float32, pixels: Mask) -> Float64:
+    """World points [N, 3] of the masked pixels, at their inverse depths."""
+    v, u = np.nonzero(pixels)
+    depth = 1 / np.maximum(inverse[v, u].astype(np.float64), 1e-9)
+    return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
+
+
+def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> Mask:
+    """Pixels [H, W] of view `index` whose depth at least `MIN_AGREE` other views see at the same place."""
+    camera, own = cameras[index], maps[index]
+    believed = (own.score > MIN_SCORE) & (own.inverse > 0)
+    points = lift(camera, own.inverse, believed)
+    votes = np.zeros(len(points), np.int64)
+    tolerance = AGREE_PX / PARALLAX_STEP * inverse_depth_step(cameras)
+    for other, other_map in enumerate(maps):
+        if other == index:
+            continue
+        uv, z = cameras[other].project(points)
+        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [cameras[other].width, cameras[other].height]).all(axis=1)
+        u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+        inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+        votes += inside & (np.abs(other_map.inverse[v, u] - inverse) < tolerance)
+    believed[believed] = votes >= MIN_AGREE
+    return believed

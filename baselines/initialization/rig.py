@@ -1,0 +1,191 @@
+"""The initialisation `rig`: the calibrated poses, and points by plane sweep over the training views.
+
+Static pixels are matched on the mean of the whole clip, where the spikes' quantisation noise has averaged out. Pixels
+that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
+ends those that are quiet just then, which is the background that something moving hides in the middle.
+
+`rig-flat` corrects every picture by its camera's calibrated gain and dark rate, where a scene has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from spike4dgs.baselines.initialization.plane_sweep import (
+    DepthMap,
+    Mask,
+    agreed,
+    find_range,
+    inverse_depth_step,
+    lift,
+    sweep,
+    widest_baseline,
+)
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.fit import Start
+
+Float32 = NDArray[np.float32]
+
+WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
+CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
+CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
+HOLE_PX = 2.0  # from the nearest point: further away it is empty
+NEIGHBOURS = 5  # points that tell the depth of a place without any
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points [N, 3] in the world and their gray values [N]."""
+
+    points: NDArray[np.float64]
+    values: Float32
+
+
+def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
+    """First points of a scene; see the module. Nothing is random, `seed` is not used.
+
+    Raises UserError where all cameras stand in one place.
+    """
+    return filled(scene, *matched(scene, flat_field))
+
+
+def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
+    """The points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
+    if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
+        found = f"{len(scene.cameras)} in one place"
+        raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
+    mean = window_means(scene, 0, scene.n_ticks, flat_field)
+    windows = _windows(scene.n_ticks)
+    counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
+    moving = [_moving(np.stack(c)) for c in counts]
+    planes = find_range(scene.cameras, mean)
+    maps = [sweep(scene.cameras, mean, i, planes) for i in range(len(scene.cameras))]
+    clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
+    middle, last = len(windows) // 2, len(windows) - 1
+    for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
+        start, stop = windows[place]
+        pictures = window_means(scene, start, stop, flat_field)
+        near = slice(max(0, place - 1), place + 2)
+        quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
+        short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
+        clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
+    points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
+    return thin(scene.cameras, Cloud(points, values)), mean
+
+
+def filled(scene: TrainingScene, cloud: Cloud, mean: Float32) -> Start:
+    """The start from a cloud, with points where it leaves the picture empty, coloured by the clip's means [C, H, W]."""
+    cloud = fill(scene.cameras, mean, cloud)
+    return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
+
+
+def rig_flat(scene: TrainingScene, seed: int) -> Start:
+    """`rig` on corrected pictures."""
+    return rig(scene, seed, flat_field=True)
+
+
+def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
+    """Mean radiance [C, H, W] of all views in a window."""
+    rates = np.stack([_rate(s, start, stop) for s in scene.streams])
+    if flat_field and scene.calibrations:
+        return np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
+    return rates / np.float32(scene.radiance_gain)
+
+
+def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
+    """Mean spikes per tick [H, W]; clips of any length are counted in parts."""
+    parts = range(start, stop, 65535)
+    total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
+    return np.asarray(total / (stop - start), np.float32)
+
+
+def _windows(n_ticks: int) -> list[tuple[int, int]]:
+    count = max(1, n_ticks // WINDOW_TICKS)
+    return [(i * WINDOW_TICKS, min((i + 1) * WINDOW_TICKS, n_ticks)) for i in range(count)]
+
+
+def _moving(counts: NDArray[np.int64]) -> Mask:
+    """Pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
+    changed = (counts.max(axis=0) - counts.min(axis=0) >= CHANGE).astype(np.uint8)
+    opened = cv2.medianBlur(changed, 3)  # single pixels are noise
+    return cv2.dilate(opened, np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def _points(
+    cameras: Sequence[Camera], maps: Sequence[DepthMap], pictures: Float32, pixels: Sequence[Mask]
+) -> tuple[NDArray[np.float64], Float32]:
+    """World points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
+    points, values = [], []
+    for i, camera in enumerate(cameras):
+        chosen = agreed(cameras, maps, i) & pixels[i]
+        points.append(lift(camera, maps[i].inverse, chosen))
+        values.append(pictures[i][chosen])
+    return np.concatenate(points), np.concatenate(values)
+
+
+def middle_camera(cameras: Sequence[Camera]) -> Camera:
+    """A camera between all others: their mean centre and the rotation nearest to their mean rotation."""
+    u, _, vt = np.linalg.svd(np.mean([c.R for c in cameras], axis=0))
+    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    first = cameras[0]
+    center = np.mean([c.center for c in cameras], axis=0)
+    return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
+
+
+def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
+    """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
+    uv, z = middle_camera(cameras).project(cloud.points)
+    step = inverse_depth_step(cameras) * 2  # 2 px of parallax in the widest pair
+    keep = z > 0
+    cells = np.column_stack([np.floor(uv[keep] / CELL_PX), np.floor(1 / (z[keep] * step))]).astype(np.int64)
+    _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+
+    def mean(x: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.bincount(inverse, weights=x, minlength=len(count)) / count
+
+    merged = np.stack([mean(axis) for axis in cloud.points[keep].T], axis=-1)
+    believed = count >= 2  # seen from one view only: not worth a Gaussian
+    return Cloud(merged[believed], mean(cloud.values[keep])[believed].astype(np.float32))
+
+
+def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
+    """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.
+
+    Fewer points than that are chance: all of the picture is then laid far away.
+    """
+    camera = middle_camera(cameras)
+    uv, z = camera.project(cloud.points)
+    # The picture's border too: outer views see beyond the middle one.
+    margin = 0.1 * np.array([camera.width, camera.height])
+    axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    if len(cloud.points) < NEIGHBOURS:
+        far = 1 / inverse_depth_step(cameras)
+        return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32))
+    distance, nearest = cKDTree(uv).query(grid, k=NEIGHBOURS)
+    empty = distance[:, 0] > HOLE_PX
+    depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
+    added = camera.unproject(grid[empty], depth)
+    seen = np.stack([_look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
+    visible = np.isfinite(seen).any(axis=0)
+    added, seen = added[visible], seen[:, visible]
+    values = np.concatenate([cloud.values, np.nanmedian(seen, axis=0).astype(np.float32)])
+    return Cloud(np.concatenate([cloud.points, added]), values)
+
+
+def _look_up(camera: Camera, picture: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gray value [N] of the pixel that sees each point; NaN outside the picture."""
+    uv, z = camera.project(points)
+    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+    u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    return np.where(inside, picture[v, u], np.nan)

@@ -1,6 +1,0 @@
-"""Image quality without a reference picture: BRISQUE and NIQE, with LIVE's published parameters (see NOTICE)."""
-
-from spike4dgs.benchmark.iqa.brisque import brisque
-from spike4dgs.benchmark.iqa.niqe import niqe
-
-__all__ = ["brisque", "niqe"]

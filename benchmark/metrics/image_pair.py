@@ -1,0 +1,93 @@
+"""What a metric sees of one target: truth, prediction and moving region, checked, in the form that it takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+
+Image = NDArray[np.floating]
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+WINDOW = 11  # pixels; the side of SSIM's Gaussian window (sigma 1.5, cut off at 3.5 sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """Linear radiance of truth and prediction [H, W] (1.0 = white), and the moving region [H, W] bool.
+
+    `where` names the image for errors; the prediction is multiplied by `gain` before anything else. `earlier` is the
+    target of the same camera before this one, `since_ms` the time between them.
+    """
+
+    truth_radiance: Image
+    predicted_radiance: Image
+    moving: Mask
+    where: str
+    gain: float = 1.0
+    earlier: ImagePair | None = None
+    since_ms: float = math.nan
+
+    @cached_property
+    def truth(self) -> Float64:
+        """Linear truth clipped to [0, 1]."""
+        return np.clip(self.truth_radiance.astype(np.float64), 0, 1)
+
+    @cached_property
+    def prediction(self) -> Float64:
+        """Linear prediction times the gain, clipped to [0, 1]."""
+        return np.clip(self.gain * self.predicted_radiance.astype(np.float64), 0, 1)
+
+    @cached_property
+    def truth8(self) -> UInt8:
+        """Truth as people see it: sRGB-encoded, 8 bit (computed in float64: the same on every machine)."""
+        return encode_srgb(self.truth)
+
+    @cached_property
+    def prediction8(self) -> UInt8:
+        """Prediction as people see it: sRGB-encoded, 8 bit."""
+        return encode_srgb(self.prediction)
+
+    @cached_property
+    def ssim(self) -> tuple[float, Float64]:
+        """Mean SSIM and the map [H, W] it comes from (the mean leaves out a border of half a window)."""
+        from skimage.metrics import structural_similarity
+
+        value, ssim_map = structural_similarity(  # type: ignore[no-untyped-call]
+            self.truth,
+            self.prediction,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1,
+            full=True,
+        )
+        return float(value), np.asarray(ssim_map)
+
+    def check_picture(self) -> None:
+        """Raise UserError for a prediction that shows nothing: one level everywhere, such as a black image."""
+        if self.prediction8.min() == self.prediction8.max():
+            found = f"the level {self.prediction8.flat[0]} of 255 everywhere"
+            raise problem(self.where, "a picture of something", found, "correct the method's fit or render")
+
+
+def check_images(truth: Image, prediction: Image, moving: Mask, where: str) -> None:
+    """Raise UserError unless the arrays are finite float images of one size, at least SSIM's window, and a mask."""
+    if prediction.ndim != 2 or prediction.shape != truth.shape:
+        raise problem(where, f"a gray image of shape {truth.shape}", f"shape {prediction.shape}", "render that size")
+    if min(truth.shape) < WINDOW:
+        raise problem(where, f"at least {WINDOW}x{WINDOW} pixels", f"{truth.shape}", "use a larger image")
+    for name, image in (("truth", truth), ("prediction", prediction)):
+        if not np.issubdtype(image.dtype, np.floating):
+            raise problem(where, f"a {name} in floating point", str(image.dtype), "store linear radiance, 1.0 = white")
+        if bad := int(np.count_nonzero(~np.isfinite(image))):
+            raise problem(where, f"a finite {name}", f"{bad} pixels that are not", "correct the program that wrote it")
+    if moving.shape != truth.shape or moving.dtype != np.bool_:
+        found = f"{moving.dtype} {moving.shape}"
+        raise problem(where, f"a bool mask of shape {truth.shape}", found, "restore the scene's mask")

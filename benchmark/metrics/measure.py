@@ -1,0 +1,133 @@
+"""From images to values: all metrics of an image, and a scene's value of each.
+
+A scene's value is the mean of the per-image values; squared errors are never pooled over images. Images for which the
+dataset defines no value (no moving region, no earlier target) are not part of the mean: they are the same for all
+methods. A prediction that a metric refuses (a black image, say) takes the scene's value away, so that no method gains
+by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair
+from spike4dgs.benchmark.metrics.selection import Selection
+from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, Images, Metric
+
+Values = dict[str, float | None]  # metric id -> value, None where there is none
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Values of one image for every metric of the table, and the reasons of those that refused it."""
+
+    values: Values
+    refused: dict[str, str]
+
+
+def measure(pair: ImagePair, gain: float | None, metrics: Iterable[Metric]) -> Measured:
+    """Compute metrics of one image; the others are None. `gain` is the scene's (None: unknown).
+
+    >>> truth = np.full((16, 16), 0.5)
+    >>> pair = ImagePair(truth, truth + 0.1, np.ones((16, 16), bool), "example")
+    >>> round(measure(pair, 1.0, [METRICS["psnr"]]).values["psnr"], 6)
+    20.0
+    """
+    aligned = None if gain is None else replace(pair, gain=gain)
+    values: Values = dict.fromkeys(METRICS)
+    refused: dict[str, str] = {}
+    for m in metrics:
+        seen = aligned if m.aligned else pair
+        try:
+            values[m.id] = None if seen is None else m.measure(seen)
+        except UserError as e:
+            refused[m.id] = str(e).removeprefix(f"{pair.where}: ")
+    return Measured(values, refused)
+
+
+def fit_gain(pairs: Iterable[tuple[Image, Image]]) -> float | None:
+    """The gain g that minimises sum (g * prediction - truth)^2 over a scene's (truth, prediction), before clipping.
+
+    None where no positive gain does (predictions all zero, or of the wrong sign).
+    """
+    cross = power = 0.0
+    for truth, prediction in pairs:
+        p = prediction.astype(np.float64)
+        cross += float(np.sum(p * truth))
+        power += float(np.sum(p * p))
+    return cross / power if power > 0 and cross > 0 else None
+
+
+def scene_means(per_image: Mapping[str, Mapping[str, float | None]]) -> Values:
+    """Mean of each metric over the images (camera/tick) where the dataset defines it; None where one has no value."""
+    means: Values = {}
+    later = _later(per_image)
+    for m in METRICS.values():
+        values = {name: image[m.id] for name, image in per_image.items()}
+        if m.images is Images.MOVING:  # these metrics refuse nothing: no value means no moving region
+            values = {name: v for name, v in values.items() if v is not None}
+        elif m.images is Images.LATER:
+            values = {name: v for name, v in values.items() if name in later}
+        known = [v for v in values.values() if v is not None]
+        means[m.id] = math.fsum(known) / len(known) if known and len(known) == len(values) else None
+    return means
+
+
+def scene_notes(
+    per_image: Mapping[str, Mapping[str, float | None]],
+    refused: Mapping[str, Mapping[str, str]],
+    selection: Selection,
+) -> dict[str, str]:
+    """A note for every scene value that needs one: why it is null, which images it stands for, which were capped.
+
+    `refused` has the reasons by image name and metric. Where users choose the weights, the note has their hash.
+    """
+    notes: dict[str, str] = {}
+    for m in METRICS.values():
+        if m.id in selection.absent:
+            notes[m.id] = f"not computed: {selection.absent[m.id]}"
+            continue
+        reasons = {name: r[m.id] for name, r in refused.items() if m.id in r}
+        values = {name: v for name, image in per_image.items() if (v := image[m.id]) is not None}
+        free = m.weights is not None and m.weights.sha256 is None
+        weights = f"weights with sha256 {selection.weights[m.id]}" if free else ""
+        if text := "; ".join(filter(None, (_coverage(m, per_image, values, reasons), _capped(m, values), weights))):
+            notes[m.id] = text
+    return notes
+
+
+def _coverage(
+    m: Metric,
+    per_image: Mapping[str, Mapping[str, float | None]],
+    values: Mapping[str, float],
+    reasons: Mapping[str, str],
+) -> str:
+    """Why there is no value, or for which images there is one; empty where it is the mean over all."""
+    if reasons:
+        name, reason = next(iter(reasons.items()))
+        return f"{len(reasons)} of {len(per_image)} images refused, the first {name}: {reason}"
+    if values:
+        everything = len(values) == len(per_image)
+        return "" if everything else f"mean over the {len(values)} of {len(per_image)} {m.images.value}"
+    if m.aligned and any(image[m.id.removesuffix("_aligned")] is not None for image in per_image.values()):
+        return "no positive gain fits the predictions"
+    return "no image has a moving region" if m.images is Images.MOVING else "no camera has two targets"
+
+
+def _capped(m: Metric, values: Mapping[str, float]) -> str:
+    capped = [name for name, v in values.items() if m.unit == "dB" and v >= MAX_PSNR_DB]
+    return f"{len(capped)} without any error count as {MAX_PSNR_DB:g} dB, the first {capped[0]}" if capped else ""
+
+
+def _later(names: Iterable[str]) -> set[str]:
+    """Names (camera/tick) without the first of each camera."""
+    everything = set(names)
+    cameras: dict[str, list[str]] = {}
+    for name in everything:
+        cameras.setdefault(name.rpartition("/")[0], []).append(name)
+    return everything - {min(group, key=lambda n: (len(n), n)) for group in cameras.values()}

@@ -1,0 +1,51 @@
+"""From a run's records to the files of one of the paper's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from spike4dgs.benchmark.metrics.table import Metric
+from spike4dgs.benchmark.reports.figures import write_views
+from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
+from spike4dgs.benchmark.reports.table_files import write_table
+from spike4dgs.benchmark.results.record import Record, dataset_means
+from spike4dgs.benchmark.scene.scene import Scene
+
+Run = tuple[Sequence[Scene], Sequence[Record]]  # scenes seen through one split, and the records of all methods on them
+
+
+def write_paper_table(
+    table: PublishedTable, runs: Sequence[Run], worlds: Mapping[str, str], metrics: Sequence[Metric], folder: Path
+) -> None:
+    """Write table.* to `folder`: a column for each world, or for each split where the table compares numbers of views.
+
+    runs: one for each split; worlds: scene id -> world. A table of several splits is also drawn, as views.png.
+    """
+    if not table.splits:
+        ((scenes, records),) = runs
+        columns, truths = worlds, {s.id: truth_scores(s, metrics) for s in scenes}
+    else:
+        records = join_splits([records for _, records in runs])
+        opened = {column_of(s.id, s.split): s for scenes, _ in runs for s in scenes}
+        columns = {name: scene.split for name, scene in opened.items()}
+        truths = {name: truth_scores(scene, metrics) for name, scene in opened.items()}
+    content = build_table(table, records, columns, truths)
+    write_table(folder, content)
+    if len(runs) > 1:
+        write_views(folder / "views.png", content)
+
+
+def join_splits(runs: Sequence[Sequence[Record]]) -> list[Record]:
+    """Records of the same methods on several splits as one for each method, whose scenes are `column_of` both."""
+    joined = []
+    for records in zip(*runs, strict=True):
+        cells = {column_of(s, r["dataset"]["split"]): cell for r in records for s, cell in r["scenes"].items()}
+        dataset = records[0]["dataset"] | {"split": ", ".join(r["dataset"]["split"] for r in records)}
+        joined.append(records[0] | {"dataset": dataset, "scenes": cells, "mean": dataset_means(cells)})
+    return joined
+
+
+def column_of(scene: str, split: str) -> str:
+    """Name of a scene as seen through a split."""
+    return f"{scene}, {split}"

@@ -1,0 +1,218 @@
+"""The tables of the Spike4DGS paper: which methods on which worlds, the published numbers, and ranks beside ranks.
+
+The published scenes are not available, so the published values never mix with measured ones: they stand in columns of
+their own, and what is compared is the order of the methods.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.metrics.measure import measure
+from spike4dgs.benchmark.metrics.table import METRICS, Metric
+from spike4dgs.benchmark.results.record import COSTS, Record
+from spike4dgs.benchmark.results.refinement import SUFFIX
+from spike4dgs.benchmark.scene.scene import Scene
+
+SCHEMA = "spike4dgs-table/1"
+IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
+TRACKS = ("calibrated", "uncalibrated")  # are methods given the rig's poses?
+UNCALIBRATED_NOTE = (
+    "How the published rows got their poses is not stated: the same values stand here and in the calibrated track."
+)
+MEAN = "mean"  # column of rows that are published without their scenes
+ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics
+
+
+@dataclass(frozen=True)
+class PublishedTable:
+    """A table of the paper. `rows`: method -> column -> values, one for each of `metrics`.
+
+    Columns are worlds, or, where the table compares numbers of views, `splits` of its worlds. A row that is published
+    as a mean over the worlds has the one column MEAN; a row that we add has none.
+    """
+
+    number: int
+    title: str
+    source: str
+    note: str
+    worlds: tuple[str, ...]
+    metrics: tuple[str, ...]  # ids in our metric table
+    names: tuple[str, ...]  # what the paper calls them
+    rows: Mapping[str, Mapping[str, tuple[float, ...]]]
+    splits: tuple[str, ...] = ()
+
+    def value(self, method: str, column: str, metric: str) -> float | None:
+        """A published value; None where there is none."""
+        values = self.rows.get(method, {}).get(column)
+        return values[self.metrics.index(metric)] if values and metric in self.metrics else None
+
+    def mean(self, method: str, metric: str) -> float | None:
+        """The mean over the table's columns, or what is published as such."""
+        if (published_mean := self.value(method, MEAN, metric)) is not None:
+            return published_mean
+        values = [self.value(method, column, metric) for column in self.splits or self.worlds]
+        known = [v for v in values if v is not None]
+        return sum(known) / len(known) if len(known) == len(values) else None
+
+
+@cache
+def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
+    """A table as published; in the track `uncalibrated` its rows are methods that estimate poses themselves.
+
+    Raises UserError for a number that is none of those in `published_tables.json`, and for a table without that track.
+    """
+    text = (package_files("spike4dgs.benchmark.reports") / "published_tables.json").read_text(encoding="utf-8")
+    tables = json.loads(text)
+    if str(number) not in tables:
+        known = [f"{n} ({tables[n]['title'].lower()})" for n in tables if n.isdecimal()]
+        expected = ", ".join([*known, f"{IMAGE_TABLE} (pictures from spikes)"])
+        raise problem("--table", expected, str(number), "choose one of them")
+    table = tables[str(number)]
+    ids, names = zip(*table["metrics"], strict=True)
+    rows = {m: {w: tuple(v) for w, v in r.items()} for m, r in table["rows"].items()}
+    worlds, splits = tuple(table["worlds"]), tuple(table.get("splits", ()))
+    title, note = table["title"], table["note"]
+    if track != TRACKS[0]:
+        rows = _without_poses(number, track, rows, tables["uncalibrated"])
+        title, note = f"{title}, poses estimated", f"{note} {UNCALIBRATED_NOTE}"
+    return PublishedTable(number, title, tables["source"], note, worlds, ids, names, rows, splits)
+
+
+def _without_poses(
+    number: int, track: str, rows: Mapping[str, Any], partners: Mapping[str, str | None]
+) -> dict[str, Any]:
+    """The rows of the track `uncalibrated`, each with the published values of its partner."""
+    if track not in TRACKS:
+        raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
+    if not set(partners.values()) - {None} <= set(rows):
+        fix = "its rows say where each has its poses from; use --table 1 or 2"
+        raise problem("--track", f"calibrated for table {number}", track, fix)
+    return {name: rows[partner] if partner else {} for name, partner in partners.items()}
+
+
+def table_scenes(table: PublishedTable, data: Path, profile: str) -> tuple[Path, ...]:
+    """The scene folders of a table: variant 0 of its worlds. Raises UserError where one is missing."""
+    paths = tuple(data / f"{world}-0-{profile}" for world in table.worlds)
+    if missing := [p.name for p in paths if not p.is_dir()]:
+        fix = f"spike4dgs make-dataset {' '.join(table.worlds)} --profile {profile} --out {data}"
+        raise problem(data, f"the scenes of table {table.number}", f"no {', '.join(missing)}", fix)
+    return paths
+
+
+def table_columns(table: PublishedTable) -> tuple[str, ...]:
+    """Metric ids of a table's columns: the published ones, then those that are measured besides."""
+    return (*table.metrics, *(m for m in ALSO if m not in table.metrics))
+
+
+def truth_scores(scene: Scene, metrics: Sequence[Metric]) -> dict[str, float | None]:
+    """What those of `metrics` that look at one image only say of the ground truth: means over a scene's targets.
+
+    The measure of such a metric on a scene: methods that score better than the truth did not come nearer to it.
+    """
+    found: dict[str, list[float | None]] = {m.id: [] for m in metrics if m.blind}
+    for target in scene.targets if found else ():
+        truth = scene.ground_truth(target)
+        pair = ImagePair(truth, truth, scene.moving(target), f"{scene.id}, {target.name}")
+        values = measure(pair, None, [METRICS[m] for m in found]).values
+        for metric, gathered in found.items():
+            gathered.append(values[metric])
+    means = {}
+    for metric, gathered in found.items():
+        known = [v for v in gathered if v is not None]
+        means[metric] = sum(known) / len(known) if known and len(known) == len(gathered) else None
+    return means
+
+
+def build_table(
+    table: PublishedTable,
+    records: Sequence[Record],
+    worlds: Mapping[str, str],
+    truths: Mapping[str, Mapping[str, float | None]] | None = None,
+) -> dict[str, Any]:
+    """A table's content: every cell a number or a reason, published values beside.
+
+    worlds: scene id -> column; truths: scene id -> what `truth_scores` says of it.
+    """
+    rows = [_row(table, record, worlds) for record in records]
+    for metric in table_columns(table):
+        # A method has one rank: that of its own record, not of the one with refined held-out poses.
+        measured = [None if r["method"].endswith(SUFFIX) else r["mean"][metric]["value"] for r in rows]
+        printed = [r["mean"][metric]["published"] for r in rows]
+        both = [p if v is not None else None for v, p in zip(measured, printed, strict=True)]
+        ours, theirs = ranks(measured, METRICS[metric]), ranks(both, METRICS[metric])
+        for row, rank, published_rank in zip(rows, ours, theirs, strict=True):
+            row["mean"][metric] |= {"rank": rank, "published_rank": published_rank}
+    return {
+        "schema": SCHEMA,
+        "table": table.number,
+        "title": table.title,
+        "published_source": table.source,
+        "published_note": table.note,
+        "scenes": {scene: worlds[scene] for scene in records[0]["scenes"]},
+        "dataset": records[0]["dataset"],
+        "metrics": [
+            {"id": m, "title": METRICS[m].title, "higher_is_better": METRICS[m].higher_is_better}
+            for m in table_columns(table)
+        ],
+        "agreement": {m: kendall_tau(rows, m) for m in table.metrics},
+        "rows": rows,
+        "truth": {scene: dict(values) for scene, values in (truths or {}).items()},
+        "harness": records[0]["harness"],
+        "environment": records[0]["environment"],
+    }
+
+
+def _row(table: PublishedTable, record: Record, worlds: Mapping[str, str]) -> dict[str, Any]:
+    name, columns = record["method"]["name"], table_columns(table)
+    scenes = {}
+    for scene, cell in record["scenes"].items():
+        values = {}
+        for metric in columns:
+            value = cell["metrics"][metric]
+            reason = None if value is not None else cell["error"] or cell["notes"].get(metric, "no value")
+            values[metric] = {
+                "value": value,
+                "reason": reason,
+                "published": table.value(name, worlds[scene], metric),
+            }
+        scenes[scene] = {"status": cell["status"], "values": values, **{k: cell.get(k) for k in COSTS}}
+    mean = {m: {"value": record["mean"][m], "published": table.mean(name, m)} for m in columns}
+    return {"method": name, "scenes": scenes, "mean": mean, "costs": {k: _mean_cost(record, k) for k in COSTS}}
+
+
+def _mean_cost(record: Record, cost: str) -> float | None:
+    values = [cell.get(cost) for cell in record["scenes"].values()]
+    known = [v for v in values if v is not None]
+    return sum(known) / len(known) if known else None
+
+
+def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:
+    """1 for the best; equal values share the better rank; None has none.
+
+    >>> ranks([20.0, None, 30.0, 20.0], METRICS["psnr"])
+    [2, None, 1, 2]
+    """
+    sign = -1 if metric.higher_is_better else 1
+    order = sorted(sign * v for v in values if v is not None)
+    return [None if v is None else order.index(sign * v) + 1 for v in values]
+
+
+def kendall_tau(rows: Sequence[Mapping[str, Any]], metric: str) -> float | None:
+    """Kendall's tau-b between the measured and the published order of the methods; None for fewer than two."""
+    from scipy.stats import kendalltau
+
+    pairs = [(r["mean"][metric]["value"], r["mean"][metric]["published"]) for r in rows]
+    known = [(a, b) for a, b in pairs if a is not None and b is not None]
+    if len(known) < 2:
+        return None
+    tau = float(kendalltau(*zip(*known, strict=True)).statistic)
+    return None if tau != tau else tau

@@ -1,0 +1,68 @@
+"""Where a saved model comes from: method, scene, cameras, clock, commit. The runner writes it, programs that show
+models read it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio, to_nerfstudio
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """What a model was fitted to, and by what."""
+
+    method: dict[str, Any]  # name, version, params (recipe and settings), seed, trained_on
+    scene: str
+    scene_revision: str
+    split: str
+    cameras: tuple[Camera, ...]  # the training cameras, calibrated
+    rate_hz: float
+    n_ticks: int
+    radiance_gain: float
+    budget: float | str
+    device: str
+    fit_seconds: float
+    harness: dict[str, Any]  # version, commit and dirty flag of this package
+    created: str
+
+    @property
+    def name(self) -> str:
+        """The method's name."""
+        return str(self.method["name"])
+
+    @property
+    def duration_us(self) -> float:
+        """Length of the clip in microseconds."""
+        return self.n_ticks * 1e6 / self.rate_hz
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; cameras in nerfstudio's keys, as in a scene folder."""
+        cameras = [{"camera": c.id, **to_nerfstudio(c)} for c in self.cameras]
+        return {k: v for k, v in asdict(self).items() if k != "cameras"} | {"cameras": cameras}
+
+
+def read_provenance(value: Mapping[str, Any], where: str, fix: str) -> Provenance:
+    """What `as_dict` gave. Raises UserError where something is missing or of another type."""
+    try:
+        cameras = tuple(from_nerfstudio(str(c["camera"]), c, where) for c in value["cameras"])
+        found = Provenance(**{**value, "cameras": cameras})
+        wrong = [k for k in ("rate_hz", "n_ticks", "radiance_gain") if not 0 < float(getattr(found, k)) < float("inf")]
+        if wrong or not cameras or not isinstance(found.method["name"], str):
+            raise ValueError(f"bad {wrong or 'cameras or method'}")
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise problem(where, "method, scene, cameras and clock of a fit", repr(e), fix) from None
+    return found
+
+
+@runtime_checkable
+class Savable(Protocol):
+    """A model that can be written to a file and rendered later."""
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model atomically to one file, with where it comes from."""
+        ...

@@ -1,0 +1,201 @@
+"""One cell of the benchmark: fit one method on one scene, render the targets, write the predictions folder.
+
+The predictions are what a run keeps and resumes by; scores are always computed again from the files.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.environment import (
+    device_type,
+    environment,
+    harness,
+    peak_memory_mb,
+    reset_peak_memory,
+    utc_now,
+)
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.results.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
+from spike4dgs.benchmark.results.provenance import Provenance, Savable
+from spike4dgs.benchmark.method import Budget, Method, Model, Progress
+from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
+from spike4dgs.benchmark.results.record import PROTOCOL
+from spike4dgs.benchmark.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Job:
+    """A method on a scene, and everything that decides what comes out."""
+
+    method: Method
+    scene: Scene
+    seed: int
+    device: str
+    budget: Budget
+
+    @property
+    def info(self) -> MethodInfo:
+        """The method as records name it."""
+        m = self.method
+        version = getattr(m, "version", None) or harness()["version"]
+        return MethodInfo(m.name, version, dict(m.params), self.seed, tuple(getattr(m, "trained_on", ())))
+
+    @property
+    def variants(self) -> tuple[MethodInfo, ...]:
+        """The method as it is, and with refined held-out cameras where it asks for that: one record each."""
+        refined = replace(self.info, name=self.method.name + SUFFIX)
+        return (self.info, refined) if getattr(self.method, "refines_views", False) else (self.info,)
+
+    @property
+    def key(self) -> str:
+        """The content key under which predictions are found again."""
+        return sha256_json(
+            {
+                "method": self.info.as_dict(),
+                "harness": harness()["version"],
+                "scene": self.scene.id,
+                "revision": self.scene.revision,
+                "split": self.scene.split,
+                "protocol": PROTOCOL,
+                "budget": self.budget.label,
+                "device": device_type(self.device),
+            }
+        )
+
+
+def is_done(job: Job, folder: Path) -> bool:
+    """Whether `folder` holds this job's predictions, whole and undamaged."""
+    if not (folder / INFO).is_file():
+        return False
+    try:
+        predictions = open_predictions(folder, job.scene.targets)
+        predictions.verify()
+    except UserError:
+        return False  # damaged since: made again
+    return predictions.info.key == job.key
+
+
+def run_job(
+    job: Job, folders: Sequence[Path], model_path: Path, work: Path, progress: Progress, note: Callable[[str], None]
+) -> None:
+    """Fit, save the model to `model_path` if it can be saved, and render the predictions of the job's variants.
+
+    They go to `folders`; `work` holds the checkpoint until these are whole. Only the fit sees `scene.training`;
+    held-out cameras appear only in the calls to render, and refined ones are found after the fit.
+    """
+    work.mkdir(parents=True, exist_ok=True)
+    checkpoint = work / "checkpoint.safetensors"
+    reset_peak_memory(job.device)
+    clock = FitClock(work / "fit_clock.json", checkpoint)
+    if clock.before > 0:
+        note(f"resuming after {clock.before:.0f} s of fitting")
+    model = job.method.fit(job.scene.training, job.budget, job.device, job.seed, progress, checkpoint)
+    fit_seconds = clock.seconds()
+    if isinstance(model, Savable):
+        model.save(model_path, _provenance(job, fit_seconds))
+    cameras = job.scene.cameras
+    for method, folder in zip(job.variants, folders, strict=True):
+        if method != job.info:
+            cameras = {**cameras, **refined_cameras(cast(Refinable, model), job.scene)}
+        _predict(job, method, model, cameras, fit_seconds, folder)
+    shutil.rmtree(work)
+
+
+def _predict(
+    job: Job, method: MethodInfo, model: Model, cameras: Mapping[str, Camera], fit_seconds: float, folder: Path
+) -> None:
+    """Render the targets as `cameras` see them into a predictions folder."""
+    render_seconds = 0.0
+    with PredictionWriter(folder) as writer:
+        for target in job.scene.targets:
+            camera, t_us = cameras[target.camera], job.scene.t_us(target.tick)
+            start = time.perf_counter()
+            image = _render(model, camera, t_us, f"{method.name} on {job.scene.id}, {target.name}")
+            render_seconds += time.perf_counter() - start
+            writer.add(target, image, t_us)
+        writer.finish(
+            PredictionInfo(
+                method=method,
+                scene=job.scene.id,
+                scene_revision=job.scene.revision,
+                split=job.scene.split,
+                budget=job.budget.label,
+                device=job.device,
+                fit_seconds=fit_seconds,
+                render_fps=len(job.scene.targets) / render_seconds,
+                peak_memory_mb=peak_memory_mb(job.device),
+                model_mb=_megabytes(model),
+                environment=environment(job.device),
+                harness=harness(),
+                key=job.key,
+                created=utc_now(),
+            )
+        )
+
+
+def _provenance(job: Job, fit_seconds: float) -> Provenance:
+    scene = job.scene
+    return Provenance(
+        method=job.info.as_dict(),
+        scene=scene.id,
+        scene_revision=scene.revision,
+        split=scene.split,
+        cameras=scene.training.cameras,
+        rate_hz=scene.rate_hz,
+        n_ticks=scene.n_ticks,
+        radiance_gain=scene.radiance_gain,
+        budget=job.budget.label,
+        device=job.device,
+        fit_seconds=fit_seconds,
+        harness=harness(),
+        created=utc_now(),
+    )
+
+
+def _megabytes(model: Model) -> float | None:
+    size = getattr(model, "size_bytes", None)
+    return None if size is None else int(size) / 1e6
+
+
+def _render(model: Model, camera: Camera, t_us: float, where: str) -> NDArray[np.float32]:
+    image: Any = model.render(camera, t_us)
+    shape = (camera.height, camera.width)
+    if not isinstance(image, np.ndarray) or image.shape != shape or not np.issubdtype(image.dtype, np.floating):
+        kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise problem(where, f"a floating-point array of shape {shape}", kind, "correct the method's render")
+    if not np.isfinite(image).all():
+        raise problem(where, "finite radiance", "NaN or infinity", "correct the method's fit or render")
+    return image.astype(np.float32)
+
+
+class FitClock:
+    """Seconds that went into a fit, over all its parts when it was killed and resumed.
+
+    Each part writes one small file as it starts: the seconds before it, and the time of its start. When it is killed,
+    the part counts up to the checkpoint's time of writing; work after that is lost, done again, and counted then.
+    """
+
+    def __init__(self, path: Path, checkpoint: Path) -> None:
+        self.path = path
+        self.before = self._seconds_in(checkpoint) if path.is_file() and checkpoint.is_file() else 0.0
+        self._start = time.perf_counter()
+        write_json(path, {"seconds_before": self.before, "started_unix": time.time()})
+
+    def seconds(self) -> float:
+        """Seconds of all parts up to now."""
+        return self.before + time.perf_counter() - self._start
+
+    def _seconds_in(self, checkpoint: Path) -> float:
+        last = read_json(self.path, "the times of an unfinished fit")
+        return float(last["seconds_before"]) + max(0.0, checkpoint.stat().st_mtime - float(last["started_unix"]))

@@ -1,0 +1,273 @@
+"""The scene folder, format `spike4dgs-scene/1`: what every method reads and every generator writes.
+
+Orientation, rate and camera identity come from scene.json, never from a guess. Every file is checked against the
+manifest before it is used, so a damaged stream is refused by whoever reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate
+from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
+from spike4dgs.benchmark.scene.images import read_exr, read_mask, read_rgb
+from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
+from spike4dgs.benchmark.scene.splits import Split
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps, refuse_gaps
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
+
+SCHEMA = "spike4dgs-scene/1"
+
+
+@dataclass(frozen=True, order=True)
+class Target:
+    """One scored image: a held-out camera at a tick."""
+
+    camera: str
+    tick: int
+
+    @property
+    def name(self) -> str:
+        """The image's path below `images/` or a predictions folder, without suffix: `cam_04/000120`."""
+        return f"{self.camera}/{self.tick:06d}"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingScene:
+    """What a method may see: the training cameras and their streams, and the clock. No ground truth, no test stream."""
+
+    id: str
+    revision: str
+    cameras: tuple[Camera, ...]
+    streams: tuple[SpikeStream, ...]
+    rate_hz: float
+    n_ticks: int
+    radiance_gain: float  # spikes per tick of a pixel that sees radiance 1 (white)
+    recordings: tuple[Recordings | None, ...] = ()  # calibration recordings of each camera, if there are any
+
+    @cached_property
+    def calibrations(self) -> tuple[Calibration, ...] | None:
+        """What each camera does to light, estimated from its recordings; None unless all cameras have some."""
+        known = [r for r in self.recordings if r is not None]
+        return tuple(estimate(r) for r in known) if known and len(known) == len(self.cameras) else None
+
+    @property
+    def duration_us(self) -> float:
+        """Length of the clip in microseconds."""
+        return self.n_ticks * 1e6 / self.rate_hz
+
+    def tick(self, t_us: float) -> int:
+        """The tick that contains the time `t_us`, clipped to the clip."""
+        return int(min(max(t_us * self.rate_hz * 1e-6, 0), self.n_ticks - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An opened scene folder, seen through one of its splits: it decides `train`, `test`, `targets` and `training`.
+
+    Images are gray linear radiance, [H, W] float32, 1.0 = white.
+    """
+
+    root: Path
+    meta: dict[str, Any]  # scene.json
+    cameras: dict[str, Camera]
+    split: str
+    targets: tuple[Target, ...]
+    manifest: Manifest
+
+    @property
+    def id(self) -> str:
+        """Identifier, such as `car-0-small`."""
+        return str(self.meta["id"])
+
+    @property
+    def revision(self) -> str:
+        """SHA-256 of the manifest: it changes whenever any file of the scene changes."""
+        return self.manifest.revision
+
+    @property
+    def n_ticks(self) -> int:
+        """Length of the clip in ticks."""
+        return int(self.meta["n_ticks"])
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks per second."""
+        return float(self.meta["rate_hz"])
+
+    @property
+    def radiance_gain(self) -> float:
+        """Spikes per tick of a pixel that sees radiance 1 (white)."""
+        return float(self.meta["radiance_gain"])
+
+    @property
+    def train(self) -> tuple[str, ...]:
+        """Training cameras."""
+        return tuple(self.meta["splits"][self.split]["train"])
+
+    @property
+    def test(self) -> tuple[str, ...]:
+        """Held-out cameras."""
+        return tuple(self.meta["splits"][self.split]["test"])
+
+    @property
+    def is_default_split(self) -> bool:
+        """Whether this is the split that is meant where none is named."""
+        return bool(self.split == self.meta["default_split"])
+
+    def t_us(self, tick: int) -> float:
+        """Time at which a tick starts, in microseconds."""
+        return tick * 1e6 / self.rate_hz
+
+    def stream(self, camera: str) -> SpikeStream:
+        """The packed stream of a camera, checked and memory-mapped."""
+        path = self.manifest.path(self.meta["streams"][camera])
+        c = self.cameras[camera]
+        bottom_up, gaps = bool(self.meta["sensor"]["rows_bottom_up"]), tuple(g for g in self.gaps if g.camera == camera)
+        size = (c.width, c.height)
+        return open_stream(path, *size, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks, gaps=gaps)
+
+    def recordings(self, camera: str) -> Recordings | None:
+        """A camera's recordings before uniform light and in the dark; None where the scene has none."""
+        facts, c = self.meta.get("calibration", {}), self.cameras[camera]
+        if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
+            return None
+        bottom_up, streams = bool(self.meta["sensor"]["rows_bottom_up"]), []
+        for name in ("flat", "dark"):
+            path, ticks = self.manifest.path(f"calibration/{name}/{camera}.dat"), int(facts[f"{name}_ticks"])
+            streams.append(open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=ticks))
+        return Recordings(streams[0], streams[1], float(facts["flat_radiance"]))
+
+    def ground_truth(self, target: Target) -> NDArray[np.float32]:
+        """Radiance of a target, [H, W] float32."""
+        return read_exr(self.manifest.path(f"images/{target.name}.exr"))
+
+    def ground_truth_rgb(self, target: Target) -> NDArray[np.float32]:
+        """The same in colour, [H, W, 3]. Raises UserError where the scene has gray images only."""
+        return read_rgb(self.manifest.path(f"images/{target.name}.exr"))
+
+    def moving(self, target: Target) -> NDArray[np.bool_]:
+        """The moving region of a target, [H, W] bool: where the `*_dynamic` metrics look."""
+        return read_mask(self.manifest.path(f"masks/{target.name}.png"))
+
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Ticks that a recording lacks, in order of camera and tick. Raises UserError where scene.json is damaged."""
+        return read_gaps(self.meta["gaps"], dict.fromkeys(self.meta["streams"], self.n_ticks), self.root / "scene.json")
+
+    @cached_property
+    def training(self) -> TrainingScene:
+        """The part of the scene that methods see."""
+        cameras = tuple(self.cameras[c] for c in self.train)
+        streams = tuple(self.stream(c) for c in self.train)
+        clock = self.rate_hz, self.n_ticks, self.radiance_gain
+        recordings = tuple(self.recordings(c) for c in self.train)
+        return TrainingScene(self.id, self.revision, cameras, streams, *clock, recordings)
+
+
+def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = None) -> Scene:
+    """Read and validate a scene folder, and see it through a split: the scene's default one if None.
+
+    Raises UserError where the folder, scene.json, the cameras or the targets are missing, foreign, damaged or
+    inconsistent, where there is no such split, and where a recording has gaps unless `allow_gaps`.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise problem(root, "a scene folder", "no such folder", "make one with `spike4dgs make-dataset`")
+    meta = read_json(root / "scene.json", f"a {SCHEMA} description")
+    check_meta(meta, root / "scene.json")
+    manifest = read_manifest(root)
+    for name in ("scene.json", "transforms_train.json", "transforms_test.json", "targets.json"):
+        manifest.path(name)
+    cameras = _read_cameras(root)
+    _check_splits(meta, cameras, root / "scene.json")
+    targets = _read_targets(root / "targets.json", meta)
+    chosen = meta["default_split"] if split is None else split
+    if chosen not in targets:
+        raise problem(
+            root / "scene.json", f"a split among {', '.join(meta['splits'])}", repr(chosen), "name one of them"
+        )
+    scene = Scene(root, meta, cameras, chosen, targets[chosen], manifest)
+    refuse_gaps(scene.gaps, root / "scene.json", allow_gaps)
+    return scene
+
+
+def check_meta(meta: dict[str, Any], path: Path) -> None:
+    """Validate scene.json against the shipped JSON Schema. Raises UserError with the first difference."""
+    if meta.get("schema") != SCHEMA:
+        found = f"schema {meta.get('schema')!r}"
+        raise problem(path, f"schema '{SCHEMA}'", found, "it is not a scene of this format: make or import one")
+    check_schema(meta, load_schema("spike4dgs.benchmark", "scene.schema.json"), path, "make or import the scene again")
+
+
+def _read_cameras(root: Path) -> dict[str, Camera]:
+    cameras: dict[str, Camera] = {}
+    for name in ("transforms_train.json", "transforms_test.json"):
+        frames = read_json(root / name, "camera poses").get("frames")
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise problem(root / name, "a list `frames` of objects", "none", "make or import the scene again")
+        for frame in frames:
+            camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
+            cameras.setdefault(camera.id, camera)
+    return cameras
+
+
+def _check_splits(meta: dict[str, Any], cameras: dict[str, Camera], path: Path) -> None:
+    if meta["default_split"] not in meta["splits"]:
+        raise problem(path, "default_split among the splits", repr(meta["default_split"]), "correct scene.json")
+    for split, parts in meta["splits"].items():
+        both = set(parts["train"]) & set(parts["test"])
+        unknown = (set(parts["train"]) | set(parts["test"])) - (set(cameras) & set(meta["streams"]))
+        if both or unknown:
+            found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
+            raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
+
+
+def _read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
+    """The targets of every split: a split that holds out what the default one does has the same."""
+    data = read_json(path, "the scored images")
+    splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
+    held_out = splits[meta["default_split"]].test
+    try:
+        default = _parse_targets(data["targets"])
+        others = {str(name): _parse_targets(targets) for name, targets in data.get("splits", {}).items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise problem(path, "lists of {camera, tick}", repr(e), "restore it or make the scene again") from None
+    needed = {name for name, s in splits.items() if set(s.test) != set(held_out)}
+    if set(others) != needed:
+        found = ", ".join(sorted(others)) or "none"
+        raise problem(path, f"targets of the splits {', '.join(sorted(needed)) or '(none)'}", found, "restore the file")
+    targets = {name: others.get(name, default) for name in splits}
+    for name, of_split in targets.items():
+        _check_targets(path, of_split, splits[name].test, meta["n_ticks"])
+    return targets
+
+
+def _parse_targets(items: list[dict[str, Any]]) -> tuple[Target, ...]:
+    return tuple(Target(str(t["camera"]), int(t["tick"])) for t in items)
+
+
+def _check_targets(path: Path, targets: tuple[Target, ...], held_out: tuple[str, ...], n_ticks: int) -> None:
+    for i, t in enumerate(targets):
+        found = f"{t.camera} at tick {t.tick}"
+        if t.camera not in held_out or not 0 <= t.tick < n_ticks:
+            raise problem(path, "held-out cameras and ticks of this scene", found, "restore the file")
+        if t in targets[:i]:
+            raise problem(path, "distinct targets", f"{found} twice", "restore the file")
+
+
+def open_scenes(paths: Sequence[Path], allow_gaps: bool = False, split: str | None = None) -> list[Scene]:
+    """Open the scenes of a command line through a split. Raises UserError where there is none."""
+    if not paths:
+        raise problem("scenes", "at least one scene folder", "none", "make one with `spike4dgs make-dataset`")
+    return [open_scene(p, allow_gaps, split) for p in paths]

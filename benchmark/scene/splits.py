@@ -1,0 +1,64 @@
+"""Splits: which cameras of a scene train, and which are held out. The standard ones of an array."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
+
+DEFAULT_SPLIT = "center"
+_FEWEST, _MOST = 3, 8  # training views of the splits views-N
+
+
+class Split(NamedTuple):
+    """Cameras by id."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+def standard_splits(cameras: Sequence[Camera], held_out: str) -> dict[str, Split]:
+    """The splits of an array by name, as far as it has enough cameras; `held_out` is the camera in its middle.
+
+    - `center`: test on `held_out`, train on all others (interpolation; the default).
+    - `corner`: test on the camera farthest from `held_out`, train on all others (extrapolation); from 3 cameras on.
+    - `views-3` .. `views-8`: test on `held_out`, train on the first so many cameras of `spread_order`.
+
+    In a 3x3 array named row by row around cam_04, `corner` holds out cam_00, and the order is 0, 8, 2, 6 (the
+    corners), then the middles of the long sides, then of the short ones: `views-8` trains on what `center` does.
+    Raises UserError where `held_out` is none of the cameras, or the only one.
+    """
+    ids = tuple(c.id for c in cameras)
+    if held_out not in ids or len(ids) < 2:
+        raise problem("cameras", f"{held_out} and others", ", ".join(ids) or "none", "name a camera of the array")
+    order = spread_order(cameras, held_out)
+
+    def split(test: str, train: Sequence[str]) -> Split:
+        return Split(tuple(c for c in ids if c in train), (test,))
+
+    splits = {DEFAULT_SPLIT: split(held_out, order)}
+    if len(ids) > 2:
+        splits["corner"] = split(order[0], [c for c in ids if c != order[0]])
+    for n in range(_FEWEST, min(_MOST, len(order)) + 1):
+        splits[f"views-{n}"] = split(held_out, order[:n])
+    return splits
+
+
+def spread_order(cameras: Sequence[Camera], held_out: str) -> tuple[str, ...]:
+    """The cameras other than `held_out`, such that the first ones are spread over the array, for every number of them.
+
+    First the camera that is farthest from `held_out`, then always the one whose nearest camera among those already
+    taken is farthest away. Of equally far ones (to 1e-6 of the array's extent) the first in `cameras` is taken.
+    """
+    left = [c for c in cameras if c.id != held_out]
+    taken = [c for c in cameras if c.id == held_out]
+    extent = max(float(np.linalg.norm(a.center - b.center)) for a in cameras for b in cameras) or 1.0
+    order: list[Camera] = []
+    while left:
+        near = [min(float(np.linalg.norm(c.center - o.center)) for o in order or taken) for c in left]
+        order.append(left.pop(int(np.argmax(np.round(np.array(near) / extent, 6)))))
+    return tuple(c.id for c in order)

@@ -1,0 +1,231 @@
+"""Write the description files of a scene folder around streams and images that a generator or recorder has written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import write_json, write_text, writing
+from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
+from spike4dgs.benchmark.scene.croissant import write_croissant
+from spike4dgs.benchmark.scene.manifest import Manifest, write_manifest
+from spike4dgs.benchmark.scene.scene import SCHEMA, Target, check_meta
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Split
+
+_POSES = (
+    "transforms_*.json: camera to world, OpenGL axes; sparse/0: world to camera, OpenCV axes; pixel centres at +0.5"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDescription:
+    """Everything in scene.json, transforms, targets and the COLMAP model that is not a stream or an image.
+
+    `train` and `test` are the default split and name every camera once. `targets` are those of all splits: a split
+    has those of its held-out cameras. `extras` become the optional top-level objects of scene.json.
+    """
+
+    id: str
+    title: str
+    licence: str
+    cameras: tuple[Camera, ...]
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    rate_hz: float
+    n_ticks: int
+    radiance_gain: float
+    targets: tuple[Target, ...]
+    sensor: dict[str, Any]  # "model" and "rows_bottom_up" are required
+    source: dict[str, Any]  # "kind" is required: "mitsuba", "recorder" or "spikecv"
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))  # [N, 3] known surface points
+    clock: dict[str, Any] = field(default_factory=lambda: {"t0_ns": 0, "source": "simulation"})
+    sync: dict[str, Any] = field(default_factory=lambda: {"method": "exact", "max_error_us": 0})
+    gaps: tuple[dict[str, Any], ...] = ()
+    splits: Mapping[str, Split] = field(default_factory=dict)  # `standard_splits`, or none but the default
+    extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def all_splits(self) -> dict[str, Split]:
+        """All splits by name, the default one first. Raises ValueError where `splits` has another default one."""
+        default = Split(self.train, self.test)
+        if self.splits.get(DEFAULT_SPLIT, default) != default:
+            raise ValueError(f"{DEFAULT_SPLIT} is {default}, and not {self.splits[DEFAULT_SPLIT]}")
+        return {DEFAULT_SPLIT: default} | dict(self.splits)
+
+    def targets_of(self, split: Split) -> tuple[Target, ...]:
+        """The scored images of a split."""
+        return tuple(t for t in self.targets if t.camera in split.test)
+
+
+def stream_name(camera: str) -> str:
+    """Path of a camera's stream inside the scene folder."""
+    return f"spikes/{camera}.dat"
+
+
+def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
+    """Write scene.json, transforms, targets, the COLMAP model, README and croissant.json; last of all the manifest.
+
+    The streams, images and everything else are already in `root`. A folder without manifest.json is an unfinished
+    scene.
+    """
+    size, splits = scene.cameras[0], scene.all_splits
+    meta = {
+        **scene.extras,
+        "schema": SCHEMA,
+        "id": scene.id,
+        "title": scene.title,
+        "licence": scene.licence,
+        "units": "m",
+        "world_up": [0, 0, 1],
+        "rate_hz": scene.rate_hz,
+        "n_ticks": scene.n_ticks,
+        "width": size.width,
+        "height": size.height,
+        "clock": scene.clock,
+        "sync": scene.sync,
+        "pose_convention": _POSES,
+        "sensor": scene.sensor,
+        "radiance_gain": scene.radiance_gain,
+        "streams": {c.id: stream_name(c.id) for c in scene.cameras},
+        "splits": {name: {"train": list(s.train), "test": list(s.test)} for name, s in splits.items()},
+        "default_split": DEFAULT_SPLIT,
+        "gaps": list(scene.gaps),
+        "source": scene.source,
+    }
+    check_meta(meta, root / "scene.json")
+    write_json(root / "scene.json", meta)
+    _write_transforms(root, scene)
+    _write_targets(root, scene)
+    write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
+    write_text(root / "README.md", _readme(root, scene))
+    write_croissant(root, meta, f"{scene.title}. {_summary(scene)}")
+    return write_manifest(root)
+
+
+def _write_targets(root: Path, scene: SceneDescription) -> None:
+    """The scored images: of the default split, and of those splits that hold out other cameras."""
+    lists = {
+        name: [{"camera": t.camera, "tick": t.tick} for t in scene.targets_of(split)]
+        for name, split in scene.all_splits.items()
+        if name == DEFAULT_SPLIT or set(split.test) != set(scene.test)
+    }
+    default = lists.pop(DEFAULT_SPLIT)
+    write_json(root / "targets.json", {"targets": default} | ({"splits": lists} if lists else {}))
+
+
+def _write_transforms(root: Path, scene: SceneDescription) -> None:
+    """The default split's streams and targets, and in transforms_all.json every image that there is.
+
+    Images of training cameras stay out of transforms_train.json: they are ground truth, which no method may train on.
+    """
+    by_id = {c.id: c for c in scene.cameras}
+    train = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.train]
+    test = [_frame(scene, by_id[c], 0, stream_name(c)) for c in scene.test]
+    targets = scene.targets_of(scene.all_splits[DEFAULT_SPLIT])
+    test += [_frame(scene, by_id[t.camera], t.tick, f"images/{t.name}.exr") for t in targets]
+    paths = sorted((root / "images").glob("*/*.exr"))
+    images = [_frame(scene, by_id[p.parent.name], int(p.stem), p.relative_to(root).as_posix()) for p in paths]
+    for name, frames in (("train", train), ("test", test), ("all", images)):
+        write_json(root / f"transforms_{name}.json", {"camera_model": "PINHOLE", "frames": frames})
+
+
+def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -> dict[str, Any]:
+    timing = {"time": tick / scene.n_ticks, "tick": tick, "t_us": tick * 1e6 / scene.rate_hz}
+    return {"camera": camera.id, "file_path": file_path, **timing, **to_nerfstudio(camera)}
+
+
+def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.float64]) -> None:
+    """Write cameras.bin, images.bin and points3D.bin with pycolmap: one PINHOLE camera and one image per view.
+
+    Raises UserError where the folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for i, c in enumerate(cameras, start=1):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=i, model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy]
+            )
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
+        model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=c.id), pose)
+    for p in points:
+        model.add_point3D(p, pycolmap.Track(), np.full(3, 128, dtype=np.uint8))
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        model.write_binary(str(folder))
+        written = pycolmap.Reconstruction(str(folder))
+    except (ValueError, RuntimeError, OSError) as e:
+        fix = "free some disk space, or choose another folder"
+        raise problem(folder, "a folder that a whole COLMAP model can be written to", str(e), fix) from e
+    if (written.num_images(), written.num_points3D()) != (len(cameras), len(points)):
+        raise problem(folder, "a whole COLMAP model", "a part of it", "free some disk space, or choose another folder")
+
+
+def read_colmap(folder: Path) -> tuple[Camera, ...]:
+    """Cameras of a COLMAP model of PINHOLE cameras, one per registered image, named by the image."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(folder))
+    cameras = []
+    for image in model.images.values():
+        c = model.cameras[image.camera_id]
+        pose = image.cam_from_world()
+        K = c.calibration_matrix()
+        values = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
+        cameras.append(Camera(image.name, c.width, c.height, *values, R, t))
+    return tuple(sorted(cameras, key=lambda c: c.id))
+
+
+# What a scene may hold beside its streams and descriptions: a path and a sentence for README.md.
+_CONTENTS = {
+    "images": "`images/CAMERA/TICK.exr`: linear radiance at the start of the tick, 1.0 = white (half float): gray in\n"
+    "  channel Y, where it was rendered in colour also R, G, B.",
+    "masks": "`masks/CAMERA/TICK.png`: the moving region of the same image (white).",
+    "geometry": "`geometry/CAMERA/TICK.exr`: Z, depth along the optical axis in metres (inf: nothing); id, the moving\n"
+    "  thing (0: none; names in scene.json); flow.x, flow.y, how far its point moves in pixels in the next 20 ticks.",
+    "calibration/flat": "`calibration/flat/CAMERA.dat`: a recording of uniform light, packed like `spikes/`.",
+    "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`.",
+    "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
+    "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
+    "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
+    "events": "`events/CAMERA.npz`: an event camera: t (us), x, y (row 0 at the top), p (1: brighter, 0: darker).",
+    "sheet.png": "`sheet.png`, `preview.webp`: the scene at a glance.",
+}
+
+
+def _summary(scene: SceneDescription) -> str:
+    c, ms = scene.cameras[0], scene.n_ticks * 1000 / scene.rate_hz
+    cameras = f"{len(scene.cameras)} spike cameras of {c.width}x{c.height} pixels"
+    return f"{cameras}, {scene.n_ticks} ticks at {scene.rate_hz:g} Hz ({ms:g} ms)."
+
+
+def _readme(root: Path, scene: SceneDescription) -> str:
+    contents = "\n".join(f"- {text}" for name, text in _CONTENTS.items() if (root / name).exists())
+    splits = "\n".join(
+        f"  - `{name}`: train {', '.join(s.train)}; test {', '.join(s.test) or 'none'}"
+        for name, s in scene.all_splits.items()
+    )
+    return f"""# {scene.title}
+
+Scene `{scene.id}` in the format `{SCHEMA}`. {_summary(scene)}
+Licence: {scene.licence}.
+
+- `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
+  tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.
+{contents}
+- `scene.json`: everything else about the scene. `manifest.json`: size and SHA-256 of every file.
+- `transforms_train.json`, `transforms_test.json`: poses and intrinsics; `sparse/0`: the same for COLMAP.
+  `transforms_all.json`: the same for every image, those at training cameras too, which are not for training.
+- `targets.json`: what is scored. Splits, the first is the default:
+{splits}
+"""

@@ -1,0 +1,1 @@
+"""What all speed measurements share, and those of this room."""

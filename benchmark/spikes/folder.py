@@ -1,0 +1,65 @@
+"""A folder of recorded streams without poses, `stream.json` beside `.dat` files: a recording before calibration.
+
+stream.json (schema `spike4dgs-streams/1`) states what the headerless files cannot: size, rate, order of rows, ticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, write_json
+from spike4dgs.benchmark.spikes.gaps import read_gaps, refuse_gaps
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
+
+NAME = "stream.json"
+_SCHEMA = "spike4dgs-streams/1"
+
+
+def write_stream_folder(root: Path, streams: dict[str, SpikeStream], facts: Mapping[str, Any] | None = None) -> None:
+    """Describe streams, which are already in `root` as `CAMERA.dat`, in stream.json.
+
+    `facts` are what else is known of the recording: clock, sync, source.
+    """
+    described = {
+        camera: {
+            "file": f"{camera}.dat",
+            "width": s.width,
+            "height": s.height,
+            "rate_hz": s.rate_hz,
+            "rows_bottom_up": s.rows_bottom_up,
+            "n_ticks": s.n_ticks,
+        }
+        for camera, s in streams.items()
+    }
+    gaps = [gap.record for s in streams.values() for gap in s.gaps]
+    write_json(root / NAME, {"schema": _SCHEMA, "streams": described, "gaps": gaps, **(facts or {})})
+
+
+def open_stream_folder(root: Path, allow_gaps: bool = False) -> dict[str, SpikeStream]:
+    """Memory-map every stream of a folder, by camera.
+
+    Raises UserError where stream.json or a stream is missing, damaged, truncated or of another format, and where the
+    recording has gaps unless `allow_gaps`.
+    """
+    path = root / NAME
+    data = read_json(path, "a description of streams")
+    if data.get("schema") != _SCHEMA:
+        raise problem(path, f"schema '{_SCHEMA}'", f"{data.get('schema')!r}", "import the recording again")
+    streams = {}
+    try:
+        ticks = {str(camera): int(s["n_ticks"]) for camera, s in data["streams"].items()}
+        gaps = read_gaps(data.get("gaps", []), ticks, path)
+        for camera, s in data["streams"].items():
+            order, n_ticks = bool(s["rows_bottom_up"]), int(s["n_ticks"])
+            size = (int(s["width"]), int(s["height"]))
+            own = tuple(gap for gap in gaps if gap.camera == camera)
+            streams[str(camera)] = open_stream(
+                root / str(s["file"]), *size, float(s["rate_hz"]), rows_bottom_up=order, n_ticks=n_ticks, gaps=own
+            )
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise problem(path, "file, width, height, rate_hz, ... of streams", repr(e), "import it again") from None
+    refuse_gaps(gaps, path, allow_gaps)
+    return streams

@@ -1,0 +1,164 @@
+"""Packed spike streams: memory-mapped reading, windows, counts, streaming writing.
+
+Layout (SpikeCV, generation-1 camera): headerless; every tick is ceil(H * W / 8) bytes; pixels row-major, least
+significant bit first (pixel p of a tick is bit p & 7 of byte p >> 3); rows are stored bottom to top. Where H * W is no
+multiple of 8 the last byte of a tick is padded with zero bits. Nothing here ever unpacks a whole clip.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import writing
+from spike4dgs.benchmark.spikes.gaps import Gap
+
+UInt8 = NDArray[np.uint8]
+T = TypeVar("T", bound=np.generic)
+
+
+def bytes_per_tick(width: int, height: int) -> int:
+    """Bytes of one packed tick: ceil(width * height / 8)."""
+    return (width * height + 7) // 8
+
+
+@dataclass(frozen=True, eq=False)
+class SpikeStream:
+    """A packed stream. `packed` is [n_ticks, bytes_per_tick] uint8, usually a read-only memory map.
+
+    `rows_bottom_up` is the order of rows in the file; every method returns images with row 0 at the top. `gaps` are
+    the ticks of a recording that were lost: they hold zeros, which are no measurement.
+    """
+
+    packed: UInt8
+    width: int
+    height: int
+    rate_hz: float
+    rows_bottom_up: bool = True
+    source: str = "memory"
+    gaps: tuple[Gap, ...] = ()
+
+    @property
+    def n_ticks(self) -> int:
+        """Number of ticks."""
+        return len(self.packed)
+
+    def window(self, start: int, stop: int) -> UInt8:
+        """Spikes of ticks [start, stop) as [stop - start, H, W] uint8 of 0 and 1.
+
+        Raises UserError for a window that leaves the clip.
+        """
+        self._check(start, stop)
+        from spike4dgs.benchmark.spikes import bits
+
+        return bits.unpack(self.packed[start:stop], self.width, self.height, self.rows_bottom_up)
+
+    def counts(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Spikes per pixel in ticks [start, stop) as [H, W] uint16, counted on the packed bits.
+
+        Raises UserError for a window that leaves the clip or is longer than 65535 ticks.
+        """
+        self._check(start, stop)
+        if stop - start > 65535:
+            raise problem("window", "at most 65535 ticks", f"{stop - start}", "add up shorter windows")
+        return self._upright(
+            count_bits(self.packed[start:stop], self.width * self.height).reshape(self.height, self.width)
+        )
+
+    def _upright(self, images: NDArray[T]) -> NDArray[T]:
+        return images[..., ::-1, :] if self.rows_bottom_up else images
+
+    def _check(self, start: int, stop: int) -> None:
+        if not 0 <= start <= stop <= self.n_ticks:
+            raise problem(self.source, f"a window within ticks [0, {self.n_ticks})", f"[{start}, {stop})", "shorten it")
+
+
+def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:
+    """Sum over ticks of each of the first `n_pixels` bits of packed rows [n, bytes] -> [n_pixels] uint16."""
+    from spike4dgs.benchmark.spikes import bits
+
+    return bits.count_bits(packed, n_pixels)
+
+
+def pack(spikes: NDArray[np.generic], rows_bottom_up: bool = True) -> UInt8:
+    """Pack upright spikes [T, H, W] (non-zero fires) into rows [T, bytes_per_tick] of the file layout."""
+    stored = spikes[:, ::-1] if rows_bottom_up else spikes
+    flat = stored.reshape(len(stored), stored.shape[1] * stored.shape[2])
+    return np.packbits(flat != 0, axis=1, bitorder="little")
+
+
+def open_stream(
+    path: Path,
+    width: int,
+    height: int,
+    rate_hz: float,
+    *,
+    rows_bottom_up: bool = True,
+    n_ticks: int | None = None,
+    gaps: tuple[Gap, ...] = (),
+) -> SpikeStream:
+    """Memory-map a stream file. `gaps`: what the file's description says it lacks.
+
+    Raises UserError where the file is missing, empty, no whole number of ticks, or not `n_ticks` long (if given).
+    """
+    size = bytes_per_tick(width, height)
+    if width <= 0 or height <= 0:
+        raise problem(path, "a positive width and height", f"{width}x{height}", "correct them")
+    if not path.is_file():
+        raise problem(path, "a spike stream", "no such file", "check the path")
+    found = path.stat().st_size
+    if found == 0 or found % size:
+        fix = "the stream is truncated or the width and height are wrong"
+        raise problem(path, f"whole ticks of {size} bytes ({width}x{height})", f"{found} bytes", fix)
+    if n_ticks is not None and found != n_ticks * size:
+        raise problem(path, f"{n_ticks} ticks", f"{found // size}", "the stream is truncated or not this scene's")
+    packed = np.memmap(path, dtype=np.uint8, mode="r", shape=(found // size, size))
+    return SpikeStream(packed, width, height, rate_hz, rows_bottom_up, str(path), gaps)
+
+
+class SpikeWriter:
+    """Write a stream tick by tick; the file appears under its name only when the writer closes without error.
+
+    Raises UserError where the system cannot write it (disk full, no permission, ...); nothing stays behind then.
+
+    >>> with SpikeWriter(Path("cam.dat"), 8, 2) as w:  # doctest: +SKIP
+    ...     w.write(np.zeros((100, 2), np.uint8))
+    """
+
+    def __init__(self, path: Path, width: int, height: int) -> None:
+        self.path, self._size = path, bytes_per_tick(width, height)
+        self.n_ticks = 0
+        self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self._part, "wb")
+
+    def write(self, packed: UInt8) -> None:
+        """Append packed ticks [n, bytes_per_tick]. Raises UserError for rows of another size."""
+        if packed.ndim != 2 or packed.shape[1] != self._size or packed.dtype != np.uint8:
+            expected = f"uint8 rows of {self._size} bytes"
+            raise problem(self.path, expected, f"{packed.dtype} {packed.shape}", "pack the ticks with spikes.pack")
+        with writing(self.path):
+            self._file.write(np.ascontiguousarray(packed).data)
+        self.n_ticks += len(packed)
+
+    def __enter__(self) -> SpikeWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
+        try:
+            with writing(self.path):
+                if kind is None:
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
+                self._file.close()
+                if kind is None:
+                    os.replace(self._part, self.path)
+        finally:
+            self._part.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Training bursts for networks that learn from many views at once."""

@@ -1,0 +1,1 @@
+"""An array of cameras in software, behind a pyusb backend."""

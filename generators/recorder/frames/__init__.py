@@ -1,0 +1,1 @@
+"""From bytes to frames with true ticks: layouts, rings, losses, clips."""

@@ -1,0 +1,44 @@
+"""Gaps while recording: the reasons there are, and which ticks of a clip are missing from what was received."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.spikes.gaps import Gap
+
+__all__ = ["REASONS", "Gap", "missing", "merged"]
+
+OVERFLOW, STALL, UNPLUGGED, TIME_OUT = "overflow", "stall", "unplugged", "time-out"
+SHORT_READ, TORN_FRAME, INTERRUPTED = "short read", "torn frame", "interrupted"
+DISK = "disk"  # received, and not taken by the disk
+REASONS = (OVERFLOW, STALL, UNPLUGGED, TIME_OUT, SHORT_READ, TORN_FRAME, INTERRUPTED, DISK)
+
+
+def missing(camera: str, ticks: NDArray[np.int64], n_ticks: int, reason: str) -> tuple[Gap, ...]:
+    """The ticks of [0, n_ticks) that are not among `ticks` (ascending), as gaps of one reason."""
+    inside = ticks[(ticks >= 0) & (ticks < n_ticks)]
+    edges = np.concatenate([[-1], inside, [n_ticks]])
+    holes = np.nonzero(np.diff(edges) > 1)[0]
+    return tuple(Gap(camera, int(edges[i]) + 1, int(edges[i + 1] - edges[i]) - 1, reason) for i in holes)
+
+
+def merged(gaps: Iterable[Gap], n_ticks: int) -> tuple[Gap, ...]:
+    """Gaps sorted, cut to [0, n_ticks), without overlap; neighbours of one camera and reason are one gap.
+
+    Where two overlap, the ticks keep the reason of the one that begins first.
+    """
+    out: list[Gap] = []
+    for gap in sorted(gaps):
+        last = out[-1] if out and out[-1].camera == gap.camera else None
+        first = max(gap.first_tick, 0, last.stop_tick if last else 0)
+        ticks = min(gap.stop_tick, n_ticks) - first
+        if ticks <= 0:
+            continue
+        if last and last.stop_tick == first and last.reason == gap.reason:
+            out[-1] = Gap(gap.camera, last.first_tick, last.ticks + ticks, gap.reason)
+        else:
+            out.append(Gap(gap.camera, first, ticks, gap.reason))
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""Intrinsics and poses of an array from a moving chessboard."""

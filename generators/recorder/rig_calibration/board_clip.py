@@ -1,0 +1,256 @@
+"""A chessboard that moves before an array of nine spike cameras, without hardware: a clip to try the calibration on.
+
+The board's radiance is traced with 4x4 samples a pixel, at a key for every pixel that the board moves, and handed to
+the same sensor simulator as every scene, with gain and dark maps and shot noise. What is written is a scene folder, so
+`record --emulate` serves it like a real array, and its poses are the truth for `calibrate-rig`. Not modelled: lenses
+(the cameras are pinholes), and shading of the board by its tilt.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
+from spike4dgs.benchmark.spikes.bits import in_threads, kernel
+from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64
+from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, RADIANCE_GAIN, Sensor, random_charge, simulate
+
+RATE_HZ = 20000
+LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames, and how far the board moves in that time at most
+WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
+_POSES = 500  # of the motion at which its speed is looked at
+DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of view is the horizontal one
+_PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
+
+
+@dataclass(frozen=True)
+class BoardMotion:
+    """Where the board is at a share `s` of the clip: it sways, comes and goes, tilts both ways and rolls.
+
+    Every swing has its own number of cycles in a clip, so that place and tilt never go together: that is what tells
+    focal lengths from distances.
+    """
+
+    distance_m: float = DISTANCE_M
+
+    def pose(self, s: float) -> tuple[Float64, Float64]:
+        """Rotation [3, 3] and translation [3] from board to world coordinates (z up, the array looks along +y)."""
+
+        def swing(amplitude: float, cycles: float, phase: float) -> float:
+            return amplitude * math.sin(2 * math.pi * (cycles * s + phase))
+
+        d = self.distance_m
+        place = np.array([swing(0.10 * d, 2, 0.1), swing(0.15 * d, 1, 0.3), swing(0.05 * d, 3, 0.4)])
+        tilt = _turn(0, swing(35, 2, 0.35)) @ _turn(1, swing(35, 3, 0.0)) @ _turn(2, swing(15, 1, 0.6))
+        upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the board's y is down, its z away
+        return upright @ tilt, place
+
+
+def _turn(axis: int, degrees: float) -> Float64:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turned = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    turned[i, i], turned[i, j], turned[j, i], turned[j, j] = c, -s, s, c
+    return turned
+
+
+def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M) -> tuple[Camera, ...]:
+    """Nine cameras, 3x3, that look at the origin, none mounted or made quite like another.
+
+    Standard deviations: 2 % of the focal length, 1 % of the width in the principal point, a degree about each axis.
+    """
+    rng = np.random.default_rng([seed, *b"array"])
+    focal = 0.5 * width / math.tan(math.radians(FIELD_DEG) / 2)
+    cameras = []
+    for view in range(9):
+        row, column = divmod(view, 3)
+        center = np.array([(column - 1) * SPACING_M, -distance_m, (1 - row) * SPACING_M])
+        c = look_at(
+            f"cam_{view:02d}", center, np.zeros(3), np.array([0.0, 0.0, 1.0]), focal=focal, width=width, height=height
+        )
+        f_spread, c_spread, turn_deg = _PER_CAMERA_SPREAD
+        f = focal * (1 + f_spread * rng.normal())
+        cx, cy = np.array([c.cx, c.cy]) + c_spread * width * rng.normal(size=2)
+        wobble = (
+            _turn(0, turn_deg * rng.normal()) @ _turn(1, turn_deg * rng.normal()) @ _turn(2, turn_deg * rng.normal())
+        )
+        R = wobble @ c.R
+        cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ center))
+    return tuple(cameras)
+
+
+def draw_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:
+    """Radiance [H, W] of the board before an even wall; a pixel is the mean of 4x4 samples. R, t: board to world."""
+    to_camera = np.stack([camera.R @ R[:, 0], camera.R @ R[:, 1], camera.R @ t + camera.t], axis=1)
+    to_board = np.linalg.inv(camera.K @ to_camera)  # (u, v, 1) -> (x, y, 1) / depth, x and y in the board's plane
+    to_board[:2] /= board.square_m
+    image = np.full((camera.height, camera.width), WALL, np.float32)
+    top, bottom, left, right = _bounds(camera, board, R, t)
+    part = image[top:bottom, left:right]
+    in_threads(_draw, len(part), to_board, board.columns, board.rows, left, top, part, small=part.size < 20000)
+    return image
+
+
+def _bounds(camera: Camera, board: Board, R: Float64, t: Float64) -> tuple[int, int, int, int]:
+    """First and last row and column that the board with its margin may touch; all of them where it comes too near."""
+    half = np.array([board.columns + 3, board.rows + 3]) / 2 * board.square_m
+    outline = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+    uv, depth = camera.project(outline @ R.T + t)
+    if depth.min() <= 0:
+        return 0, camera.height, 0, camera.width
+    last = [camera.width, camera.height]
+    left, top = np.clip(np.floor(uv.min(axis=0)).astype(int), 0, last)
+    right, bottom = np.clip(np.ceil(uv.max(axis=0)).astype(int), 0, last)
+    return int(top), int(bottom), int(left), int(right)
+
+
+@kernel
+def _draw(h: Float64, columns: int, rows: int, left: int, top: int, image: Float32, start: int, stop: int) -> None:
+    """Rows [start, stop) of a part of a picture. h [3, 3]: pixel -> board in squares, over the depth."""
+    for v in range(start, stop):
+        for u in range(image.shape[1]):
+            x, y = left + u, top + v
+            light = _light(h, columns, rows, x, y)
+            whole = True  # a pixel whose four corners see one square sees nothing else
+            for k in range(1, 4):
+                whole &= _square(h, columns, rows, x + k % 2, y + k // 2) == _square(h, columns, rows, x, y)
+            if not whole:
+                light = 0.0
+                for k in range(16):
+                    light += _light(h, columns, rows, x + (k % 4 + 0.5) / 4, y + (k // 4 + 0.5) / 4) / 16
+            image[v, u] = light
+
+
+@kernel
+def _square(h: Float64, columns: int, rows: int, x: float, y: float) -> Any:
+    """Column and row of the board's square at a place of the picture; the first square is (-1, -1)."""
+    over = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    a = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / over + (columns - 1) / 2
+    b = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / over + (rows - 1) / 2
+    return (math.floor(a), math.floor(b)) if over > 0 else (-9, -9)
+
+
+@kernel
+def _light(h: Float64, columns: int, rows: int, x: float, y: float) -> float:
+    i, j = _square(h, columns, rows, x, y)
+    if i < -2 or j < -2 or i > columns or j > rows:
+        return WALL
+    if i < -1 or j < -1 or i >= columns or j >= rows:
+        return WHITE  # the margin, as wide as a square
+    return DARK if (i + j) % 2 == 0 else WHITE
+
+
+def write_board_clip(
+    out: Path, cameras: tuple[Camera, ...], board: Board, motion: BoardMotion, n_ticks: int, seed: int = 0
+) -> Path:
+    """Write the clip as a scene folder and return its path. Raises UserError where something is there already."""
+    check_new(out)
+    spacing = key_spacing(cameras, board, motion, n_ticks)
+    key_ticks = list(range(0, n_ticks + spacing, spacing))
+    poses = [motion.pose(tick / n_ticks) for tick in key_ticks]
+    for camera in cameras:
+        size, entropy = (camera.height, camera.width), [seed, *f"board {camera.id}".encode()]
+        sensor = Sensor(
+            gain=gain_map(*size, seed, camera.id),
+            dark=dark_map(*size, seed, camera.id),
+            photons=PHOTONS_PER_SPIKE,
+            noise_seed=tuple(entropy),
+        )
+        with SpikeWriter(out / stream_name(camera.id), camera.width, camera.height) as writer:
+            keys = _Keys(camera, board, poses)
+            for packed in simulate(keys, key_ticks, n_ticks, sensor, random_charge(*size, entropy)):
+                writer.write(packed)
+    ids = tuple(c.id for c in cameras)
+    finish_scene(
+        out,
+        SceneDescription(
+            id=f"board-{seed}",
+            title="A chessboard that moves before the array",
+            licence="CC0-1.0",
+            cameras=cameras,
+            train=ids,
+            test=(),
+            rate_hz=float(RATE_HZ),
+            n_ticks=n_ticks,
+            radiance_gain=RADIANCE_GAIN,
+            targets=(),
+            sensor={"model": "integrate-and-fire/2", "rows_bottom_up": True},
+            source={
+                "kind": "board",
+                "columns": board.columns,
+                "rows": board.rows,
+                "square_m": board.square_m,
+                "seed": seed,
+            },
+        ),
+    )
+    return out
+
+
+def key_spacing(cameras: Sequence[Camera], board: Board, motion: BoardMotion, n_ticks: int) -> int:
+    """Ticks between key frames: no corner of the board moves by more than `KEY_PX` in any camera."""
+    ticks = np.linspace(0, n_ticks, _POSES)
+    corners = board.corners[[0, board.columns - 1, -board.columns, -1]]
+    poses = [motion.pose(tick / n_ticks) for tick in ticks]
+    world = np.concatenate([corners @ R.T + t for R, t in poses])
+    tracks = np.stack([c.project(world)[0].reshape(_POSES, len(corners), 2) for c in cameras])
+    fastest = float(np.linalg.norm(np.diff(tracks, axis=1), axis=-1).max()) / (ticks[1] - ticks[0])  # px a tick
+    return int(np.clip(KEY_PX / fastest, 1, LONGEST_KEY_TICKS))
+
+
+@dataclass(frozen=True, eq=False)
+class _Keys(Sequence[Float32]):
+    """What a camera sees at the key ticks, drawn when it is asked for."""
+
+    camera: Camera
+    board: Board
+    poses: list[tuple[Float64, Float64]]
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __getitem__(self, k: Any) -> Any:
+        return draw_board(self.camera, self.board, *self.poses[k])
+
+
+def board_clip(
+    *,
+    out: Path = Path("runs/board"),
+    seconds: float = 1.0,
+    width: int = 400,
+    height: int = 250,
+    columns: int = 8,
+    rows: int = 5,
+    square_m: float = 0.04,
+    seed: int = 0,
+) -> int:
+    """Simulate a chessboard that moves before an array of nine cameras: a scene for `record --emulate`.
+
+    Args:
+        out: Folder of the scene.
+        seconds: Length of the clip; the board goes through the same motion in it, so a longer clip is slower.
+        width: Pixels per row of the cameras.
+        height: Rows of the cameras.
+        columns: Inner corners of the board from left to right.
+        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
+        square_m: Side of a square in metres.
+        seed: Of the array's errors of mounting and of the sensors.
+    """
+    n_ticks = round(seconds * RATE_HZ)
+    if n_ticks < 1:
+        raise problem("--seconds", f"at least {1 / RATE_HZ:g}, one tick", f"{seconds:g}", "ask for a longer clip")
+    cameras = array(width, height, seed)
+    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(), n_ticks, seed)
+    print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")
+    return 0

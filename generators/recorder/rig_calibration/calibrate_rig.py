@@ -1,0 +1,241 @@
+"""`calibrate-rig`: from clips of a chessboard that was moved before the array to every camera's intrinsics and pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import atomic_path, write_json, write_text
+from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.generators.recorder.profile.profile import calibration_toml
+from spike4dgs.generators.recorder.rig_calibration.array_start import first_rig
+from spike4dgs.generators.recorder.rig_calibration.board import Board
+from spike4dgs.generators.recorder.rig_calibration.board_views import (
+    BoardRecording,
+    BoardViews,
+    choose_views,
+    common_cameras,
+    find_all,
+    open_recording,
+    picture,
+)
+from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
+    Adjusted,
+    Freedom,
+    Rig,
+    Sightings,
+    adjust,
+    rms_px,
+    trimmed,
+)
+
+WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # with a worse reprojection error, or more corners that do not fit, it is no array
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayCalibration:
+    """What `calibrate_array` found. The cameras stand in the array's own frame, see `levelled`."""
+
+    cameras: tuple[Camera, ...]
+    adjusted: Adjusted
+    sightings: Sightings
+    reference: int
+    reprojection_px: float  # root mean square over the corners that count
+    per_camera_px: tuple[float, ...]
+
+    @property
+    def corners(self) -> tuple[int, int]:
+        """Number of corners that count, and of those left out."""
+        return int(self.sightings.used.sum()), int((~self.sightings.used).sum())
+
+
+def calibrate_array(
+    sightings: Sightings, board: Board, names: Sequence[str], size: tuple[int, int], freedom: Freedom
+) -> ArrayCalibration:
+    """Intrinsics and poses from sightings; corners that do not fit the rest are left out. `size`: width, height.
+
+    Raises UserError where a camera has seen too little, or where no array of pinholes explains what was seen.
+    """
+    points = board.corners
+    start, reference = first_rig(sightings, points, names, size)
+    rough = adjust(start, sightings, points, reference, freedom)
+    used = trimmed(rough.rig, sightings, points)
+    found = adjust(rough.rig, used, points, reference, freedom)
+    error = rms_px(found.rig, used, points)
+    left_out = float(np.mean(~used.used))
+    if not (error < WORST_PX and left_out < MOST_LEFT_OUT):
+        expected = (
+            f"a reprojection error below {WORST_PX:g} px, and at least {1 - MOST_LEFT_OUT:.0%} of the corners in it"
+        )
+        fix = "check that all cameras share one clock and one orientation (`rows`, `mirrored`), and --columns, --rows"
+        raise problem("array", expected, f"{error:.2f} px with {1 - left_out:.0%} of them", fix)
+    each = tuple(rms_px(found.rig, used.of(used.camera == c), points) for c in range(len(names)))
+    return ArrayCalibration(levelled(found.rig, names, size), found, used, reference, error, each)
+
+
+def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Camera, ...]:
+    """The cameras in the array's own frame: z up, y where the array looks, x to its right; all taken as means.
+
+    The origin is the middle of all places of the board: about what the array looks at.
+    """
+    u, _, vt = np.linalg.svd(rig.R.sum(axis=0))
+    right, down, forward = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    W = np.stack([right, forward, -down])
+    frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
+    return tuple(
+        frame.camera(Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t))
+        for name, f, m, R, t in zip(names, rig.focal, rig.middle, rig.R, rig.t, strict=True)
+    )
+
+
+def differences(found: Sequence[Camera], stated: Mapping[str, Camera]) -> dict[str, float] | None:
+    """How found cameras differ from those that a clip states, after the best similarity; None where it states none."""
+    known = [stated[c.id] for c in found if c.id in stated]
+    if len(known) < max(len(found), 2):
+        return None
+    errors, scale = pose_errors(found, known).summary(), align_cameras(found, known).scale
+    names = ("rotation_deg", "rotation_max_deg", "translation_m", "translation_max_m")
+    focal = [abs(a.fx / b.fx - 1) for a, b in zip(found, known, strict=True)]
+    middle = [np.hypot(a.cx - b.cx, a.cy - b.cy) for a, b in zip(found, known, strict=True)]
+    return {name: errors[name] for name in names} | {
+        "scale": abs(1 / scale - 1),
+        "focal_max": max(focal),
+        "principal_point_max_px": float(max(middle)),
+    }
+
+
+def calibrate_rig(
+    clips: Positional[tuple[Path, ...]],
+    *,
+    out: Path = Path("runs/rig"),
+    columns: int = 8,
+    rows: int = 5,
+    square_m: float = 0.04,
+    views: int = 40,
+    window_ticks: int = 100,
+    shared_focal: bool = False,
+    centered: bool = False,
+    allow_gaps: bool = False,
+) -> int:
+    """Calibrate an array from clips of a moving chessboard: OUT/calibration.toml, report.json and corners.png.
+
+    Args:
+        clips: Recordings of the board (scene folders), all by the same cameras.
+        out: Folder for what is found.
+        columns: Inner corners of the board from left to right.
+        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
+        square_m: Side of a square in metres; it sets the scale of everything.
+        views: Moments to look at, in all clips together.
+        window_ticks: Ticks that a picture adds up: more is less noise and more motion blur.
+        shared_focal: One focal length for all cameras.
+        centered: Principal points stay in the middle of the picture.
+        allow_gaps: Use clips with gaps; pictures with missing ticks are left out.
+    """
+    if not clips:
+        raise problem("calibrate-rig", "one or more clips", "none", "record the board with `spike4dgs record`")
+    board, recordings = Board(columns, rows, square_m), [open_recording(path, allow_gaps) for path in clips]
+    names, size = common_cameras(recordings)
+    chosen = choose_views(recordings, views, window_ticks)
+    seen = find_all(recordings, names, chosen, board)
+    found = calibrate_array(seen.sightings, board, names, size, Freedom(shared_focal, centered))
+    report = {
+        "clips": [r.name for r in recordings],
+        "board": {"columns": columns, "rows": rows, "square_m": square_m},
+        "views": {"looked_at": len(chosen), "with_board": len(seen.views), "window_ticks": window_ticks},
+        **_results(found),
+        "against_clip": differences(found.cameras, recordings[0].cameras),
+    }
+    write_text(out / "calibration.toml", calibration_toml(found.cameras))
+    write_json(out / "report.json", report)
+    _draw(recordings, seen, found, out / "corners.png")
+    _print(report)
+    print(f"calibration, report and picture: {out}")
+    return 0
+
+
+def _results(found: ArrayCalibration) -> dict[str, Any]:
+    a, s = found.adjusted, found.sightings
+    cameras = {
+        camera.id: {
+            "views": int(np.sum(s.camera == c)),
+            "reprojection_px": found.per_camera_px[c],
+            "focal_px": camera.fx,
+            "focal_sd_px": float(a.focal_px[c]),
+            "principal_point_px": [camera.cx, camera.cy],
+            "center_sd_m": float(a.center_m[c]),
+            "turn_sd_deg": float(a.turn_deg[c]),
+        }
+        for c, camera in enumerate(found.cameras)
+    }
+    used, left_out = found.corners
+    return {
+        "reprojection_px": found.reprojection_px,
+        "corners": {"used": used, "left_out": left_out},
+        "reference": found.cameras[found.reference].id,
+        "cameras": cameras,
+    }
+
+
+def _print(report: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    title = f"reprojection error {report['reprojection_px']:.3f} px RMS"
+    table = Table(
+        "camera", "views", "RMS, px", "focal, px", "+-", "middle, px", "place +-, mm", "turn +-, deg", title=title
+    )
+    for name, c in report["cameras"].items():
+        x, y = c["principal_point_px"]
+        row = [name, f"{c['views']}", f"{c['reprojection_px']:.3f}", f"{c['focal_px']:.2f}", f"{c['focal_sd_px']:.2f}"]
+        table.add_row(*row, f"{x:.1f}, {y:.1f}", f"{1e3 * c['center_sd_m']:.2f}", f"{c['turn_sd_deg']:.3f}")
+    Console(width=120).print(table)
+    views, corners = report["views"], report["corners"]
+    print(
+        f"{views['with_board']} of {views['looked_at']} views have the board; "
+        f"{corners['left_out']} of {sum(corners.values())} corners do not fit and are left out"
+    )
+    print(f"standard deviations of place and turn are relative to {report['reference']}")
+    if d := report["against_clip"]:
+        place = f"{1e3 * d['translation_m']:.2f} and {1e3 * d['translation_max_m']:.2f} mm"
+        print("against the cameras that the clip states, mean and worst error:")
+        print(f"  rotation {d['rotation_deg']:.3f} and {d['rotation_max_deg']:.3f} deg, place {place}")
+        print(f"  scale {100 * d['scale']:.3f} %, focal length at worst {100 * d['focal_max']:.3f} %,")
+        print(f"  principal point at worst {d['principal_point_max_px']:.2f} px")
+
+
+def _draw(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCalibration, path: Path) -> None:
+    """Each camera's picture in the view that most cameras saw, with its corners; small, the corners of all views."""
+    from matplotlib.figure import Figure
+
+    s = found.sightings
+    best = int(np.argmax(np.bincount(s.view)))
+    side = math.ceil(math.sqrt(len(found.cameras)))
+    aspect = found.cameras[0].height / found.cameras[0].width
+    figure = Figure(figsize=(12, 12 * aspect * math.ceil(len(found.cameras) / side) / side + 1), layout="constrained")
+    for axes, c in zip(figure.subplots(side, side, squeeze=False).flat, range(side * side), strict=True):
+        axes.axis("off")
+        if c >= len(found.cameras):
+            continue
+        name = found.cameras[c].id
+        image = picture(recordings[seen.views[best].recording], name, seen.views[best])
+        if image is not None:
+            axes.imshow(image, cmap="gray", extent=(0, image.shape[1], image.shape[0], 0))
+        mine = s.of(s.camera == c)
+        axes.scatter(*mine.uv[mine.used].T, s=1, color="tab:orange", linewidths=0)
+        axes.scatter(*mine.uv[~mine.used].T, s=12, color="tab:red", marker="x", linewidths=0.8)
+        for uv in mine.uv[mine.view == best]:
+            axes.plot(*uv.T, color="tab:cyan", linewidth=0.6, marker=".", markersize=4)
+        axes.set_title(f"{name}: {len(mine.view)} views, {found.per_camera_px[c]:.3f} px", fontsize=9)
+    figure.suptitle(
+        f"Corners that count (orange), left out (red), and the board in one view; {found.reprojection_px:.3f} px RMS"
+    )
+    with atomic_path(path) as part:
+        figure.savefig(part, dpi=100)

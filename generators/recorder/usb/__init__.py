@@ -1,0 +1,1 @@
+"""Bulk reads over USB, several in flight."""

@@ -1,0 +1,185 @@
+"""One opened camera: its start and stop sequences, and reads on it, several in flight where that is possible.
+
+A camera sends without pause, so that a moment without a read in flight lets its small memory run over. `open_link`
+takes libusb's queue (`queued.py`), or the queue that a backend brings itself, else reads one at a time (`reads.py`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import usb.core
+import usb.util
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.generators.recorder.profile.profile import CameraProfile, RigProfile
+from spike4dgs.generators.recorder.usb import queued as libusb
+from spike4dgs.generators.recorder.usb.reads import Completion, SingleReads, Transfers
+
+__all__ = ["Completion", "Link", "QueueingBackend", "Transfers", "UsbLink", "open_link"]
+
+_DRAIN_MS = 20  # a device that is silent for so long has sent what it still held
+_DRAIN_BYTES = 64 << 20  # more than a bridge or a camera holds: what sends so much was not stopped
+
+_FIX_START = "check endpoint_out and start in the rig profile, then plug the camera in again"
+
+
+class Link(Protocol):
+    """One opened camera."""
+
+    @property
+    def serial(self) -> str:
+        """The camera's serial number."""
+
+    @property
+    def queued(self) -> bool:
+        """Whether several reads can be in flight."""
+
+    @property
+    def restartable(self) -> bool:
+        """Whether it can be stopped and started anew, and then begins with a whole frame."""
+
+    def start(self) -> None:
+        """Send the camera's start sequence. Raises UserError where the camera does not take it."""
+
+    def stop(self) -> None:
+        """Send the stop sequence; a camera that is gone has stopped already."""
+
+    def drain(self) -> int:
+        """Read and drop what the camera still holds after `stop`; the number of bytes."""
+
+    def transfers(self) -> Transfers:
+        """New machinery for reads on this camera, for one pass."""
+
+    def close(self) -> None:
+        """Release the device."""
+
+
+@runtime_checkable
+class QueueingBackend(Protocol):
+    """A pyusb backend with a queue of its own, such as an emulator's."""
+
+    def open_transfers(self, device: usb.core.Device, endpoint: int, transfer_bytes: int, depth: int) -> Transfers:
+        """Machinery that keeps up to `depth` bulk reads of `transfer_bytes` in flight on `endpoint`."""
+
+
+@dataclass(eq=False)
+class UsbLink:
+    """A `Link` on a pyusb device whose interfaces are claimed."""
+
+    device: usb.core.Device
+    camera: CameraProfile
+    profile: RigProfile
+    queued: bool
+
+    @property
+    def serial(self) -> str:
+        """The camera's serial number."""
+        return self.camera.serial
+
+    @property
+    def restartable(self) -> bool:
+        """Whether the profile says how to start and to stop it."""
+        return bool(self.camera.start and self.camera.stop)
+
+    def start(self) -> None:
+        """Send the start sequence."""
+        try:
+            self._write(self.camera.start)
+        except usb.core.USBError as e:
+            where, found = _name(self.camera), f"{e.strerror} while it was started"
+            raise problem(where, "a camera that takes its start sequence", found, _FIX_START) from e
+
+    def stop(self) -> None:
+        """Send the stop sequence."""
+        with contextlib.suppress(usb.core.USBError):
+            self._write(self.camera.stop)
+
+    def drain(self) -> int:
+        """Read until the camera is silent; a camera that never is, is left after 64 MiB."""
+        size = self.profile.transfer_bytes
+        reads = SingleReads(self.device, self.camera.endpoint_in, size, _DRAIN_MS)
+        into, total = np.empty(size, np.uint8), 0
+        while total < _DRAIN_BYTES:
+            reads.submit(into)
+            done = reads.wait(0)
+            if done is None or not done.bytes:
+                break
+            total += done.bytes
+        return total
+
+    def transfers(self) -> Transfers:
+        """Queued reads, or single ones."""
+        endpoint, size, depth = self.camera.endpoint_in, self.profile.transfer_bytes, self.profile.transfers
+        if not self.queued:
+            return SingleReads(self.device, endpoint, size, self.profile.timeout_ms)
+        if isinstance(self.device.backend, QueueingBackend):
+            return self.device.backend.open_transfers(self.device, endpoint, size, depth)
+        return libusb.QueuedReads(self.device, endpoint, depth)
+
+    def close(self) -> None:
+        """Release interfaces and handle."""
+        with contextlib.suppress(usb.core.USBError):
+            usb.util.dispose_resources(self.device)
+
+    def _write(self, commands: tuple[bytes, ...]) -> None:
+        for command in commands:
+            self.device.write(self.camera.endpoint_out, command, self.profile.timeout_ms)
+
+
+def open_link(device: usb.core.Device, camera: CameraProfile, profile: RigProfile, queued: bool | None = None) -> Link:
+    """Open a camera that `find_cameras` has found, and claim its interfaces.
+
+    `queued`: True insists on queued reads, False on one at a time, None takes the queue where there is one. Raises
+    UserError where the device cannot be opened, or has no queue and one is insisted on.
+    """
+    try:
+        _claim(device, camera)
+    except usb.core.USBError as e:
+        raise _refused(camera, e) from e
+    reason = None if isinstance(device.backend, QueueingBackend) else libusb.unavailable(device)
+    if queued and reason:
+        usb.util.dispose_resources(device)
+        raise problem(_name(camera), "queued reads", reason, "install pyusb 1.3.1 with libusb-1.0, or do not insist")
+    return UsbLink(device, camera, profile, queued=not reason if queued is None else queued)
+
+
+def _claim(device: usb.core.Device, camera: CameraProfile) -> None:
+    try:
+        device.get_active_configuration()
+    except usb.core.USBError as e:
+        if e.errno in (errno.EACCES, errno.ENODEV):
+            raise
+        device.set_configuration()
+    for interface in {camera.interface, camera.control_interface} - {None}:
+        # Some systems and backends have no kernel drivers; one that stays is found out by the claim.
+        with contextlib.suppress(NotImplementedError, usb.core.USBError):
+            if device.is_kernel_driver_active(interface):
+                device.detach_kernel_driver(interface)
+        usb.util.claim_interface(device, interface)
+
+
+def _refused(camera: CameraProfile, error: usb.core.USBError) -> UserError:
+    """What the system's refusal to open a camera means."""
+    expected = "a camera that can be opened"
+    if error.errno == errno.EACCES:
+        found, fix = "no permission", udev_fix(camera.vendor_id)
+    elif error.errno == errno.EBUSY:
+        found, fix = "another program holds it", "end that program"
+    else:
+        found, fix = str(error.strerror), "plug the camera in again"
+    return problem(_name(camera), expected, found, fix)
+
+
+def udev_fix(vendor_id: int) -> str:
+    """What to do where the system does not let this user open a device."""
+    rule = f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{vendor_id:04x}", MODE="0666"'
+    return f"put the line {rule} into /etc/udev/rules.d/70-spike4dgs.rules and plug the camera in again"
+
+
+def _name(camera: CameraProfile) -> str:
+    return f"camera {camera.id} (serial {camera.serial})"

@@ -1,0 +1,140 @@
+"""How things move across the picture, exactly from geometry, and at which ticks key frames are rendered for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.generators.rendering.mitsuba_scene import Hits
+from spike4dgs.generators.worlds import WorldScene
+
+_STEP_S = 1e-6  # short against every motion here, long against float64 round-off of metres
+COARSE_PX = 2.5  # that anything moves between two coarse keys; less than the 3 px by which `sight` grows what moves
+_MOST_SUB_TICKS = 8
+
+
+def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: float, samples: int = 33) -> float:
+    """Speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
+
+    Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation
+    included. Occlusion is not considered, so the answer is an upper bound that is met wherever that vertex is seen.
+    """
+    fastest = 0.0
+    for t in np.linspace(0.0, duration_s, samples):
+        before, after = world.moving_points(t), world.moving_points(t + _STEP_S)
+        for camera in cameras:
+            uv, z = camera.project(before)
+            uv_after, _ = camera.project(after)
+            seen = (z > 0) & (uv > 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+            speed = np.linalg.norm(uv_after - uv, axis=1)[seen] / _STEP_S
+            fastest = max(fastest, float(speed.max(initial=0.0)))
+    return fastest
+
+
+def carried(world: WorldScene, hits: Hits, points: np.ndarray, from_s: float, to_s: float) -> np.ndarray:
+    """Where the surface points [N, 3] that `hits` found on moving things at `from_s` are at `to_s`: [N, 3] float64."""
+    out = points.astype(np.float64)
+    before, after = world.poses(from_s), world.poses(to_s)
+    for number, name in enumerate(world.instances):
+        mine = hits.thing == number
+        if mine.any():
+            move = after[name] @ np.linalg.inv(before[name])
+            out[mine] = points[mine] @ move[:3, :3].T + move[:3, 3]
+    for number, surface in enumerate(world.deforming.values(), start=len(world.instances)):
+        mine = hits.thing == number
+        if mine.any():
+            corners = surface.part.mesh.faces[hits.face[mine]]  # [K, 3]
+            u, v = hits.uv[mine].T
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            shift = surface.vertices(to_s)[corners] - surface.vertices(from_s)[corners]  # [K, 3 corners, xyz]
+            out[mine] = points[mine] + np.einsum("kc,kcx->kx", weights, shift)
+    return out
+
+
+@dataclass(frozen=True)
+class KeyPlan:
+    """At which ticks key frames are rendered, and which pixels of them.
+
+    Attributes:
+        n_ticks, rate_hz: length of the clip and ticks per second.
+        max_px: how far a point of the picture may move between two of its keys.
+        chain: spacings in ticks, coarsest first, each a divisor of the one before. Keys at multiples of `chain[0]` are
+            whole; at other multiples of `chain[k]` only pixels are traced whose motion over `chain[k - 1]` ticks is
+            more than `max_px`; the others are interpolated from the coarser keys.
+        sub_ticks: where the motion within one tick is more than `max_px`, the mean of a tick is rendered at so many
+            instants inside the tick; 1 is off.
+    """
+
+    n_ticks: int
+    rate_hz: int
+    max_px: float
+    chain: tuple[int, ...]
+    sub_ticks: int = 1
+
+    @property
+    def ticks(self) -> list[int]:
+        """All ticks that have a key, ascending from 0 to the first coarse key at or after `n_ticks`."""
+        return list(range(0, -(-self.n_ticks // self.chain[0]) * self.chain[0] + 1, self.chain[-1]))
+
+    def level(self, tick: int) -> int:
+        """Which of the spacings a tick's key belongs to: the coarsest that divides it. 0 is a whole key."""
+        return next(level for level, spacing in enumerate(self.chain) if tick % spacing == 0)
+
+
+def key_plan(
+    world: WorldScene,
+    cameras: Sequence[Camera],
+    n_ticks: int,
+    rate_hz: int,
+    max_px: float,
+    *,
+    adaptive: bool = True,
+    sub_ticks: bool = True,
+) -> KeyPlan:
+    """The plan for a clip, from the exact image motion of the world's geometry.
+
+    Raises UserError where a millisecond is no whole number of ticks.
+
+    Args:
+        world: what moves.
+        cameras: the views.
+        n_ticks: length of the clip.
+        rate_hz: ticks per second, a multiple of 1000.
+        max_px: how far a point of the picture may move between two of its keys.
+        adaptive: False renders every pixel that changes at every tick: the slow, exact way.
+        sub_ticks: False never renders instants inside a tick.
+    """
+    speed = max_image_speed(world, cameras, n_ticks / rate_hz)
+    chain = spacings(speed, n_ticks, rate_hz, max_px) if adaptive else (1,)
+    instants = 1
+    while chain[-1] == 1 and sub_ticks and instants < min(speed / rate_hz / max_px, _MOST_SUB_TICKS):
+        instants *= 2
+    return KeyPlan(n_ticks, rate_hz, max_px, chain, instants)
+
+
+def spacings(speed_px_s: float, n_ticks: int, rate_hz: int, max_px: float) -> tuple[int, ...]:
+    """Key spacings in ticks, coarsest first, for a clip whose fastest point has this speed.
+
+    All divide a millisecond, so that a frame at every whole millisecond is exactly a key. The finest is the longest
+    that moves nothing by more than `max_px` (one tick, if even that is too long); each other is the shortest multiple
+    of the one after it, as long as nothing moves by more than 2.5 px.
+    Raises UserError where a millisecond is no whole number of ticks.
+    """
+    per_ms, rest = divmod(rate_hz, 1000)
+    if rest or per_ms < 1 or n_ticks < 1 or max_px <= 0:
+        found = f"rate {rate_hz} Hz, {n_ticks} ticks, {max_px} px"
+        raise problem(
+            "key frames", "a multiple of 1000 Hz, at least 1 tick, a positive motion", found, "change the profile"
+        )
+
+    divisors = [d for d in range(1, per_ms + 1) if per_ms % d == 0]
+    chain = [max((d for d in divisors if speed_px_s * d / rate_hz <= max_px), default=1)]
+    while coarser := [
+        d for d in divisors if d > chain[0] and d % chain[0] == 0 and speed_px_s * d / rate_hz <= COARSE_PX
+    ]:
+        chain.insert(0, coarser[0])
+    return tuple(chain)

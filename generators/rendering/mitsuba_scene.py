@@ -1,0 +1,194 @@
+"""From a world's plain data to Mitsuba's scene objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
+from spike4dgs.generators.worlds import WorldScene
+from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.primitives.materials import Material, mesh_to_mitsuba
+from spike4dgs.generators.worlds.primitives.meshes import Mesh, merge, vertex_normals
+
+_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)  # Mitsuba's skies are y up
+_PLAIN = Material((0.5, 0.5, 0.5))
+
+
+class Hits(NamedTuple):
+    """Where rays meet moving things first. All arrays have one entry per ray."""
+
+    distance: np.ndarray  # float32, along the unit direction; inf: no hit
+    thing: np.ndarray  # int32, number of the instance or, after all instances, of the deforming surface; -1: no hit
+    face: np.ndarray  # int64, of the mesh that was hit
+    uv: np.ndarray  # [N, 2] float64, barycentric weights of the face's second and third corner
+
+
+class MitsubaScene:
+    """A world in Mitsuba's memory: `empty` (what stands still), `movers` (what moves, without materials), `full`.
+
+    `full` and `movers` are at the last pose that `place` was asked for. What moves is a few plain meshes whose vertices
+    are set anew, never Mitsuba's instances: for every kernel that it starts Mitsuba goes through each instance, and for
+    a figure of a dozen limbs that takes longer than tracing its pixels.
+    """
+
+    def __init__(self, world: WorldScene) -> None:
+        mi = load_mitsuba()
+        self._world = world
+        static = {name: _emitter(spec) for name, spec in world.emitters.items()}
+        static |= _shapes("static", _in_palettes(world.static))
+        self._batches = _batches(world)
+        moving, plain = (
+            _shapes("moving", {k: b.part(dress) for k, b in self._batches.items()}) for dress in (True, False)
+        )
+        self.empty = mi.load_dict({"type": "scene", **static})
+        self.full = mi.load_dict({"type": "scene", **static, **moving})
+        self.movers = mi.load_dict({"type": "scene", **plain})
+        self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
+        # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
+        self._own_normals = str(mi.variant()).startswith("scalar")
+        self._placed_at: float | None = None
+        self.place(0.0)
+
+    @property
+    def mover_ids(self) -> list[str]:
+        """Mitsuba's names of the shapes of `movers`."""
+        return [f"moving_{name}" for name in self._batches]
+
+    def hits(self, distance: np.ndarray, shape: np.ndarray, face: np.ndarray, uv: np.ndarray) -> Hits:
+        """Hits from the number of the shape in `mover_ids` (-1: none) that each ray meets, and its face there."""
+        thing = np.full(len(shape), -1, np.int32)
+        for number, batch in enumerate(self._batches.values()):
+            mine = shape == number
+            thing[mine] = batch.things[face[mine]]
+        return Hits(distance, thing, face, uv)
+
+    def place(self, t_s: float) -> None:
+        """Move what moves in `full` and `movers` to where it is at `t_s` seconds."""
+        if t_s == self._placed_at:
+            return
+        poses = self._world.poses(t_s)
+        turns = np.array([poses[name][:3] for name in self._world.instances]).reshape(-1, 3, 4)
+        placed = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
+        for parameters in self._parameters:
+            for name, (positions, _) in placed.items():
+                parameters[f"{name}.vertex_positions"] = positions
+            if self._own_normals:
+                parameters.update()
+            for name, (_, normals) in placed.items():
+                if normals is not None:
+                    parameters[f"{name}.vertex_normals"] = normals
+            parameters.update()
+        self._placed_at = t_s
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Moving surfaces of one material as one mesh.
+
+    Attributes:
+        merged: rest positions, each part in its own coordinates.
+        material: of all.
+        owner: [N], number of the instance that each vertex belongs to; None for a deforming surface.
+        normals: [N, 3] at rest; None where faces are flat, or Mitsuba computes them.
+        things: [M], number of the instance or deforming surface that each face belongs to.
+        vertices: of a deforming surface.
+    """
+
+    merged: Mesh
+    material: Material
+    owner: np.ndarray | None
+    normals: np.ndarray | None
+    things: np.ndarray
+    vertices: Callable[[float], np.ndarray] | None = None
+
+    def part(self, dressed: bool) -> Part:
+        """The mesh, with its material or without."""
+        return Part(self.merged, self.material if dressed else _PLAIN)
+
+    def at(self, t_s: float, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Flat float32 positions and normals at a time; `turns` [instances, 3, 4] are the poses."""
+        if self.vertices is not None:
+            return np.ascontiguousarray(self.vertices(t_s), np.float32).ravel(), None
+        pose = turns[self.owner]
+        positions = np.einsum("nij,nj->ni", pose[:, :, :3], self.merged.vertices) + pose[:, :, 3]
+        if self.normals is None:
+            return positions.astype(np.float32).ravel(), None
+        normals = np.einsum("nij,nj->ni", pose[:, :, :3], self.normals)
+        return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
+
+
+def _batches(world: WorldScene) -> dict[str, _Batch]:
+    """The moving surfaces of a world, those of equal material and smoothness merged."""
+    alike: dict[tuple[Any, ...], list[tuple[int, Part]]] = {}
+    for number, group in enumerate(world.instances.values()):
+        for part in world.groups[group]:
+            m = part.material
+            picture = id(m.albedo) if isinstance(m.albedo, np.ndarray) else None
+            alike.setdefault((picture, m.gloss, m.metal, part.mesh.smooth), []).append((number, part))
+    found = {}
+    for k, members in enumerate(alike.values()):
+        numbers, parts = zip(*members, strict=True)
+        one = parts[0]
+        if not isinstance(one.material.albedo, np.ndarray):
+            one = _in_palette(parts)
+        else:
+            one = Part(merge([part.mesh for part in parts]), one.material)
+        normals = np.concatenate([vertex_normals(part.mesh) for part in parts]) if one.mesh.smooth else None
+        owner = np.repeat(numbers, [len(part.mesh.vertices) for part in parts])
+        things = np.repeat(numbers, [len(part.mesh.faces) for part in parts])
+        found[f"rigid{k}"] = _Batch(one.mesh, one.material, owner, normals, things)
+    for number, (name, surface) in enumerate(world.deforming.items(), start=len(world.instances)):
+        things = np.full(len(surface.part.mesh.faces), number)
+        found[name] = _Batch(*surface.part, None, None, things, surface.vertices)
+    return found
+
+
+@lru_cache(maxsize=1)
+def mitsuba_scene(world: WorldScene) -> MitsubaScene:
+    """The scene of a world; the last one is kept, because every scene in memory makes Mitsuba's kernels larger."""
+    return MitsubaScene(world)
+
+
+def _shapes(prefix: str, parts: Mapping[str, Part]) -> dict[str, Any]:
+    return {f"{prefix}_{name}": mesh_to_mitsuba(f"{prefix}_{name}", *part) for name, part in parts.items()}
+
+
+def _in_palettes(parts: Mapping[str, Part]) -> dict[str, Part]:
+    """The same surfaces, those of plain colours merged as far as they reflect alike: fewer materials, less work."""
+    kept: dict[str, Part] = {}
+    alike: dict[tuple[Any, ...], list[Part]] = {}
+    for name, part in parts.items():
+        if isinstance(part.material.albedo, np.ndarray):
+            kept[name] = part
+        else:
+            alike.setdefault((part.material.gloss, part.material.metal, part.mesh.smooth), []).append(part)
+    return kept | {f"plain{number}": _in_palette(members) for number, members in enumerate(alike.values())}
+
+
+def _in_palette(parts: Sequence[Part]) -> Part:
+    """Surfaces that differ in their plain colours only as one, with these colours in a picture of one row."""
+    material = parts[0].material
+    colours = np.array([part.material.albedo for part in parts], np.float32)[None]  # [1, N, 3]
+    meshes = [
+        replace(part.mesh, uv=np.tile([(k + 0.5) / len(parts), 0.5], (len(part.mesh.vertices), 1)))
+        for k, part in enumerate(parts)
+    ]
+    return Part(merge(meshes), replace(material, albedo=colours))
+
+
+def _emitter(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Turns numpy arrays into Mitsuba's bitmaps and transforms; `z_up` stands a sky upright in our world."""
+    mi = load_mitsuba()
+    out = {key: value for key, value in spec.items() if key != "z_up"}
+    if spec.get("z_up"):
+        out["to_world"] = mi.ScalarTransform4f(_Z_UP)
+    elif "to_world" in spec:
+        out["to_world"] = mi.ScalarTransform4f(spec["to_world"])
+    if "bitmap" in spec:
+        out["bitmap"] = mi.Bitmap(np.ascontiguousarray(spec["bitmap"], np.float32))
+    return out

@@ -1,0 +1,261 @@
+"""Key frames of a world: the background once, and at each time only the pixels that the moving things change.
+
+Three kinds of pixel, cheapest first:
+
+- *Still*: the background, rendered once with many samples.
+- *Softly lit* (bounced light, wide penumbrae): the background times a slowly varying factor, see `soft_light`.
+- *Traced* at every key: a ray through the pixel's centre meets a moving thing, or the surface that it meets has one
+  between itself and the light; both grown by 3 px (`sight`).
+
+Keys between two coarse ones hold only traced pixels in which something moves too fast for the coarse ones (`motion`).
+
+Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. What stands still
+keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole picture, bit for
+bit. Traced pixels that see no moving surface, only its shadow, get the background plus the *difference* of two such
+renderings: the background's low noise stays, and nothing jumps where the traced region ends.
+
+This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area), or denoise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import gray
+from spike4dgs.generators.rendering.image_motion import KeyPlan, max_image_speed
+from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
+from spike4dgs.generators.rendering.soft_light import MOTION_PX, SoftLight
+from spike4dgs.generators.rendering.visibility import Sight
+from spike4dgs.generators.worlds import WorldScene
+
+MAX_DEPTH = 4  # camera, surface, two bounces
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """What does not move, linear RGB [C, H, W, 3] float32.
+
+    Attributes:
+        background: at full quality.
+        first: the same with the random numbers, and so the noise, of keys.
+    """
+
+    background: np.ndarray
+    first: np.ndarray
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a file or another process."""
+        return {"background": self.background, "first": self.first}
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> Still:
+        """The inverse of `arrays`."""
+        return Still(arrays["background"], arrays["first"])
+
+    def views(self, chosen: Sequence[int]) -> Still:
+        """Some of the views."""
+        return Still(self.background[list(chosen)], self.first[list(chosen)])
+
+
+class MultiViewRenderer(Sight):
+    """Renders all `cameras` (one resolution) of a world together: one launch per time. Pictures are [C, H, W] float32.
+
+    >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
+    >>> pictures = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
+    """
+
+    def __init__(
+        self,
+        world: WorldScene,
+        cameras: Sequence[Camera],
+        *,
+        seed: int,
+        spp: int,
+        background_spp: int,
+        color: bool = False,
+        still: Still | None = None,
+        whole_frames: bool = False,
+    ) -> None:
+        """Loads the world into Mitsuba (about a second). Raises UserError for numbers of samples that do not fit.
+
+        Args:
+            world: what is rendered.
+            cameras: views of one resolution.
+            seed: of all random numbers.
+            spp: samples per pixel of keys, a power of two.
+            background_spp: of what stands still, a power of two, at least `spp`.
+            color: pictures are linear RGB, [C, H, W, 3].
+            still: what a renderer with the same arguments returned from `still`; else it is rendered when needed.
+            whole_frames: trace every pixel of every key: the slow, exact way.
+        """
+        for name, value in (("spp", spp), ("background_spp", background_spp)):
+            if value < 1 or value & (value - 1):
+                raise problem(name, "a power of two", str(value), "give 16, 32, 64, ...")
+        if background_spp < spp:
+            raise problem("background_spp", f"at least spp = {spp}", str(background_spp), "raise it")
+        if len({(c.width, c.height) for c in cameras}) != 1:
+            raise problem("cameras", "one resolution for all", "several or none", "render them apart")
+        scene = mitsuba_scene(world)
+        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
+        self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
+        self._seed = seed
+        self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
+        if still is not None:
+            self.still = still
+
+    # ------------------------------------------------------------ pictures
+
+    @cached_property
+    def still(self) -> Still:
+        """The views without the moving things."""
+        first = self._whole(self.spp, 0, None)
+        total = first.astype(np.float64)
+        parts = self.background_spp // self.spp
+        for stream in range(1, parts):
+            total += self._whole(self.spp, stream, None)
+        return Still((total / parts).astype(np.float32), first)
+
+    def still_on(self, background: np.ndarray) -> Still:
+        """With a background that another renderer made; only the part that has this one's noise is rendered."""
+        return Still(background, self._whole(self.spp, 0, None))
+
+    @cached_property
+    def background(self) -> np.ndarray:
+        """`still.background`, in the kind of the pictures: [C, H, W], or in colour [C, H, W, 3]."""
+        return self.still.background if self.color else gray(self.still.background)
+
+    def keys(self, t_s: float) -> np.ndarray:
+        """The views at `t_s`: still, softly lit and traced pixels put together."""
+        if self.whole_frames:
+            return self.crn_frames(t_s)
+        change = self._soft_light.change(t_s)
+        picture = self.background * (1 + (change[..., None] if self.color else change))
+        where = np.flatnonzero(self.traced(t_s))
+        self._flat(picture)[where] = self._traced_at(where, t_s)
+        return picture
+
+    def key_arrays(self, tick: int, plan: KeyPlan) -> dict[str, np.ndarray]:
+        """What `KeyStore` keeps of a tick: for each view v the pixels that are given, packed, and their values.
+
+        Coarse keys (`given{v}`, `values{v}`): the pixels that differ from the background. Others: those that move too
+        fast for the coarser keys. With sub-ticks also `mean_given{v}`, `mean_values{v}`: the mean radiance over the
+        tick where it moves too fast even for that. A function of the arguments alone, whatever was rendered before.
+        """
+        t_s, level = tick / plan.rate_hz, plan.level(tick)
+        if level == 0:
+            picture = self.keys(t_s)
+            given = np.ones(self.shape, bool) if self.whole_frames else picture != self.background
+            values = picture.ravel()[given.ravel()]
+        else:
+            given = self._fast(t_s, plan.chain[level - 1] / plan.rate_hz, plan.max_px)
+            values = self._traced_at(np.flatnonzero(given), t_s)
+        arrays = self._sparse("given", "values", given, values)
+        if plan.sub_ticks > 1 and tick < plan.n_ticks:
+            fast = self._fast(t_s + 0.5 / plan.rate_hz, 1 / plan.rate_hz, plan.max_px)
+            means = self._means_at(np.flatnonzero(fast), t_s, plan)
+            arrays |= self._sparse("mean_given", "mean_values", fast, means)
+        return arrays
+
+    def crn_frames(self, t_s: float) -> np.ndarray:
+        """Every pixel traced at `t_s` with the random numbers of `keys`; for measuring what `keys` leaves out."""
+        rgb = self._whole(self.spp, 0, t_s)
+        return rgb if self.color else gray(rgb)
+
+    def reference_frames(self, t_s: float, spp: int) -> np.ndarray:
+        """The views at `t_s` by Mitsuba's own render loop, sensor, film and sampler: every pixel, nothing reused."""
+        mi = load_mitsuba()
+        from spike4dgs.generators.rendering.scalar_tiles import load_sensor
+
+        self._scene.place(t_s)
+        integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
+        frames = []
+        for camera in self.cameras:
+            sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, spp)
+            rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1))
+            frames.append(rgb[..., :3] if self.color else gray(rgb[..., :3]))
+        return np.stack(frames) * np.float32(self.world.exposure)
+
+    def changed(self, t_s: float) -> np.ndarray:
+        """[C, H, W] bool: the pixels of `keys` that are not simply the background: traced or softly lit."""
+        return self.traced(t_s) | (self._soft_light.change(t_s) != 0)
+
+    def traced(self, t_s: float) -> np.ndarray:
+        """[C, H, W] bool: the pixels that `keys` traces."""
+        return np.ones(self.shape, bool) if self.whole_frames else super().traced(t_s)
+
+    # ------------------------------------------------------------ inner workings
+
+    def _whole(self, spp: int, stream: int, t_s: float | None) -> np.ndarray:
+        """Every pixel traced, linear RGB [C, H, W, 3]."""
+        return self._rgb_at(np.arange(int(np.prod(self.shape))), spp, stream, t_s).reshape(*self.shape, 3)
+
+    def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
+        """Radiance [K] or [K, 3] of the flat pixels `where` of a key."""
+        rgb = self._rgb_at(where, self.spp, 0, t_s)
+        traced = rgb if self.color else gray(rgb)
+        if self.whole_frames:
+            return traced
+        correction = self._flat(self.background)[where] - self._flat(self._first)[where]
+        correction[self.object_masks(t_s).ravel()[where]] = 0
+        return np.maximum(traced + correction, 0)
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        return self.still.first if self.color else gray(self.still.first)
+
+    def _means_at(self, where: np.ndarray, t_s: float, plan: KeyPlan) -> np.ndarray:
+        """Mean radiance [K] of flat pixels over the tick from `t_s` on: of so many instants inside it."""
+        shares = (np.arange(plan.sub_ticks) + 0.5) / plan.sub_ticks
+        return np.mean([self._traced_at(where, t_s + share / plan.rate_hz) for share in shares], axis=0)
+
+    def _fast(self, t_s: float, within_s: float, max_px: float) -> np.ndarray:
+        """[C, H, W] bool: traced pixels in which something moves more than `max_px` px `within_s` seconds."""
+        return super().traced(t_s) & (self.speeds(t_s) * within_s > max_px)
+
+    def _rgb_at(self, pixels: np.ndarray, spp: int, stream: int, t_s: float | None) -> np.ndarray:
+        """Linear RGB [K, 3] of flat pixels; None: without the moving things."""
+        if t_s is not None:
+            self._scene.place(t_s)
+        return np.asarray(self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure))
+
+    def _gray_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
+        """Radiance [K] of flat pixels with the keys' random numbers, gray and before exposure: for soft light."""
+        if moving:
+            self._scene.place(t_s)
+        return gray(self._tracer.trace(pixels, spp, 0, moving))
+
+    def _flat(self, picture: np.ndarray) -> np.ndarray:
+        """A view of the picture as [N] or [N, 3]."""
+        return picture.reshape(-1, 3) if self.color else picture.reshape(-1)
+
+    def _sparse(self, mask_name: str, values_name: str, given: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:
+        bounds = np.concatenate([[0], np.cumsum(given.reshape(len(given), -1).sum(1))])
+        arrays: dict[str, np.ndarray] = {}
+        for v, mask in enumerate(given):
+            arrays[f"{mask_name}{v}"] = np.packbits(mask)
+            arrays[f"{values_name}{v}"] = values[bounds[v] : bounds[v + 1]].astype(np.float32)
+        return arrays
+
+    def _anchor_s(self) -> float:
+        """Time between the anchors of soft light."""
+        speed = max_image_speed(self.world, self.cameras, self.world.duration_s, samples=5)
+        return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
+
+
+def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
+    """The tracer for the process's variant. Imported here because the modules need the variant to be set."""
+    if load_mitsuba().variant().startswith("scalar"):
+        from spike4dgs.generators.rendering.scalar_tiles import TileTracer
+
+        return TileTracer(scene, cameras, seed, MAX_DEPTH)
+    from spike4dgs.generators.rendering.wavefront import WavefrontTracer
+
+    return WavefrontTracer(scene, cameras, seed, MAX_DEPTH)

@@ -1,0 +1,167 @@
+"""Tracing lists of pixels with Mitsuba's vectorised variants: all views and all pixels that changed in one launch.
+
+Import only after the variant is set: the sampler derives from the variant's `mi.Sampler`.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
+
+_LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
+
+
+class PixelSampler(mi.Sampler):  # type: ignore[misc]
+    """Correlated multi-jittered samples (Kensler 2013) that depend on the pixel's key and the sample number alone.
+
+    Mitsuba's own samplers number their sequences by lane, so a pixel's samples would change with the list of pixels
+    traced. `count` must be a power of two: its permutations then need no rejection loop.
+    """
+
+    def __init__(self, key: mi.UInt32, index: mi.UInt32, count: int) -> None:
+        super().__init__(mi.Properties())
+        bits = count.bit_length() - 1
+        self._count, self._columns, self._rows = count, 1 << (bits + 1) // 2, 1 << bits // 2
+        self.key, self.index = key, index
+        self.dimension = dr.zeros(mi.UInt32, dr.width(key))
+
+    def next_1d(self, active: mi.Bool = True) -> mi.Float:
+        """One stratified number in [0, 1) per lane."""
+        salt = self._next_salt()
+        stratum = _shuffle(self.index, self._count, salt)
+        return (mi.Float(stratum) + _unit(_hash(salt ^ (self.index * 0x68E31DA4)))) / self._count
+
+    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+        """One point per lane, stratified on the grid and along both axes."""
+        salt = self._next_salt()
+        s = _shuffle(self.index, self._count, salt)
+        column, row = s & (self._columns - 1), s >> (self._columns.bit_length() - 1)
+        across = _shuffle(row, self._rows, _hash(salt + 0x51633E2D))
+        down = _shuffle(column, self._columns, _hash(salt + 0x6B43A9B5))
+        jitter = _hash(salt ^ (self.index * 0xB5297A4D))
+        x = (mi.Float(column) + (mi.Float(across) + _unit(jitter)) / self._rows) / self._columns
+        y = (mi.Float(row) + (mi.Float(down) + _unit(_hash(jitter))) / self._columns) / self._rows
+        return mi.Point2f(x, y)
+
+    def _next_salt(self) -> mi.UInt32:
+        self.dimension = self.dimension + 1
+        return _hash(self.key ^ (self.dimension * 0x9E3779B9))
+
+
+def _hash(x: mi.UInt32) -> mi.UInt32:
+    """PCG's output permutation (Jarzynski and Olano 2020): 32 bits in, 32 well mixed bits out."""
+    x = x * 747796405 + 2891336453
+    x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737
+    return (x >> 22) ^ x
+
+
+def _unit(x: mi.UInt32) -> mi.Float:
+    """The upper 24 bits as a float in [0, 1)."""
+    return mi.Float(x >> 8) * (1.0 / (1 << 24))
+
+
+def _shuffle(i: mi.UInt32, n: int, salt: mi.UInt32) -> mi.UInt32:
+    """A random permutation of 0..n-1, n a power of two: every step is invertible modulo n."""
+    w = n - 1
+    i = (i ^ salt) & w
+    i = (i * ((salt >> 4) | 1)) & w
+    i = i ^ ((i & w) >> 2)
+    i = (i * 0xE170893D) & w
+    i = i ^ (salt >> 16) & w
+    i = i ^ ((i & w) >> 3)
+    i = (i * ((salt >> 23) | 1)) & w
+    i = i ^ ((i & w) >> 1)
+    i = (i * 0x6935FA69) & w
+    return (i + (salt >> 9)) & w
+
+
+class WavefrontTracer:
+    """Traces pixels of several views at once. Pixels are flat numbers: (view * height + row) * width + column."""
+
+    def __init__(self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int) -> None:
+        self._scene, self._seed = scene, seed
+        self._width, self._height = cameras[0].width, cameras[0].height
+        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+        rows = []
+        for c in cameras:
+            to_world = c.R.T @ np.linalg.inv(c.K)  # pixel coordinates -> world direction
+            rows.append([*to_world.ravel(), *c.center])
+        self._cameras = mi.Float(np.array(rows, np.float32).ravel())  # [C, 12]
+        by_id = {shape.id(): shape for shape in scene.movers.shapes()}
+        self._movers = [mi.ShapePtr(by_id[name]) for name in scene.mover_ids]
+        self._keys = mi.UInt32(np.array([zlib.crc32(c.id.encode()) for c in cameras], np.uint32))
+
+    def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
+        """Linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
+
+        A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
+        """
+        per_launch = max(_LANES // spp, 1)
+        parts = [
+            self._launch(pixels[k : k + per_launch], spp, stream, moving) for k in range(0, len(pixels), per_launch)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+    def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
+        listed = mi.UInt32(np.ascontiguousarray(pixels, np.uint32))
+        lane = dr.arange(mi.UInt32, len(pixels) * spp)
+        shift = spp.bit_length() - 1
+        pixel, index = dr.gather(mi.UInt32, listed, lane >> shift), lane & (spp - 1)
+        area = self._width * self._height
+        view = pixel // area
+        inside = pixel - view * area
+        row = inside // self._width
+        column = inside - row * self._width
+        salt = dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
+        key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self._keys, view))) + salt)
+        sampler = PixelSampler(key, index, spp)
+        offset = sampler.next_2d()
+        ray = self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
+        scene = self._scene.full if moving else self._scene.empty
+        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
+        dr.eval(radiance)  # the path kernel writes one colour per sample; the reductions below read it
+        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in radiance], 1) / np.float32(spp)
+
+    def _ray(self, view: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.RayDifferential3f:
+        def number(k: int) -> mi.Float:
+            return dr.gather(mi.Float, self._cameras, view * 12 + k)
+
+        d = [number(3 * k) * u + number(3 * k + 1) * v + number(3 * k + 2) for k in range(3)]
+        ray = dr.zeros(mi.RayDifferential3f, dr.width(view))
+        ray.o = mi.Point3f(number(9), number(10), number(11))
+        ray.d = dr.normalize(mi.Vector3f(*d))
+        ray.maxt = dr.largest(mi.Float)
+        return ray
+
+    def prepare(self, origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
+        """Rays [N, 3] with unit directions, ready to be cast again and again."""
+        o, d = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (origins, directions))
+        ray = mi.Ray3f(mi.Point3f(o), d)
+        dr.eval(ray)
+        return ray
+
+    def cast_static(self, rays: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays meet what stands still: distance [N] float32 (inf: nothing) and surface normal [N, 3] float32."""
+        hit = self._scene.empty.ray_intersect(rays)
+        distance = dr.select(hit.is_valid(), hit.t, dr.inf)
+        dr.eval(distance, hit.n)
+        return np.array(distance), np.array(hit.n).T
+
+    def cast_movers(self, rays: mi.Ray3f) -> Hits:
+        """Where rays meet the moving things, which stand alone: nothing else is in the way."""
+        hit = self._scene.movers.ray_intersect_preliminary(rays)
+        number = mi.Int32(-1)
+        for k, shape in enumerate(self._movers):
+            number = dr.select(hit.is_valid() & (hit.shape == shape), k, number)
+        distance = dr.select(hit.is_valid(), hit.t, dr.inf)
+        face, uv = (dr.select(hit.is_valid(), a, 0) for a in (hit.prim_index, hit.prim_uv))
+        dr.eval(distance, number, face, uv)
+        place = np.array(face, np.int64), np.array(uv, np.float64).T
+        return self._scene.hits(np.array(distance), np.array(number), *place)

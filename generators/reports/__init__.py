@@ -1,0 +1,1 @@
+"""Tables and pictures of scenes and of what their making costs."""

@@ -1,0 +1,96 @@
+"""Calibration recordings of the simulated cameras, and the command that turns recordings into maps.
+
+`calibrate` estimates the maps of a scene's cameras (`benchmark.calibration`) and, where the truth is known, says how
+far off they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.scene.calibration import Calibration, estimate
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.generators.sensor.maps import write_maps
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+
+FLAT_RADIANCE = 0.7
+FLAT_TICKS = 500  # 25 ms
+DARK_TICKS = 2000  # 100 ms: the darkest hundredth of the pixels fires every 670 ticks
+
+
+def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Sequence[int]) -> None:
+    """Record folder/flat/CAM.dat and folder/dark/CAM.dat with a simulated camera. `entropy`: of the initial charges."""
+    for name, radiance, n_ticks in (("flat", FLAT_RADIANCE, FLAT_TICKS), ("dark", 0.0, DARK_TICKS)):
+        keys = [np.full((camera.height, camera.width), radiance, np.float32)] * 2
+        charge = random_charge(camera.height, camera.width, [*entropy, *name.encode()])
+        noise = (*sensor.noise_seed, *name.encode())
+        same = Sensor(sensor.radiance_gain, sensor.gain, sensor.dark, sensor.photons, noise)
+        with SpikeWriter(folder / name / f"{camera.id}.dat", camera.width, camera.height) as writer:
+            for packed in simulate(keys, [0, n_ticks], n_ticks, same, charge):
+                writer.write(packed)
+
+
+def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) -> int:
+    """Estimate gain and dark maps of a scene's cameras from its flat-field and dark recordings: OUT/CAM.npz and .png.
+
+    Where the scene holds the true maps (truth/), the table says how far off the estimates are.
+
+    Args:
+        scene: Scene folder with calibration/flat and calibration/dark.
+        out: Folder for the maps and their pictures.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not looked at
+    table = Table(
+        "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
+    )
+    for camera in opened.cameras.values():
+        recordings = opened.recordings(camera.id)
+        if recordings is None:
+            fix = "make a scene with calibration/flat and calibration/dark"
+            raise problem(scene / "scene.json", "calibration recordings", f"none of {camera.id}", fix)
+        found = estimate(recordings)
+        write_maps(out / f"{camera.id}.npz", {"gain": found.gain, "dark": found.dark})
+        _draw(found, out / f"{camera.id}.png", camera.id)
+        level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
+        row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
+        table.add_row(*row, *(f"{e:.3f}" if e is not None else "-" for e in truth_errors(opened, camera, found)))
+    Console(width=120).print(table)
+    print(f"maps and pictures: {out}")
+    return 0
+
+
+def truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[float | None, float | None]:
+    """RMS error in percent of gain and dark map, each relative to the truth; None where the truth is not known."""
+    path = f"truth/{camera.id}.npz"
+    if path not in scene.manifest.files:
+        return None, None
+    with np.load(scene.manifest.path(path)) as truth:
+        pairs = [(getattr(found, name), truth[name] if name in truth else None) for name in ("gain", "dark")]
+    errors = [None if t is None else 100 * float(np.sqrt(np.mean((a / t - 1) ** 2))) for a, t in pairs]
+    return errors[0], errors[1]
+
+
+def _draw(found: Calibration, path: Path, title: str) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for axes, image, name, limits in (
+        (left, found.gain, "gain", (0.8, 1.2)),
+        (right, 1000 * found.dark, "dark rate, spikes per 1000 ticks", (0, 20)),
+    ):
+        figure.colorbar(axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap="viridis"), ax=axes)
+        axes.set(title=f"{title}: {name}", xticks=[], yticks=[])
+    with atomic_path(path) as part:
+        figure.savefig(part, dpi=80)

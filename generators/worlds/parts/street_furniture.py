@@ -1,0 +1,128 @@
+"""What stands on the pavements of the street: trees, lamps, signs, a bench, bollards, flower boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.parts.street_plan import DARK, PAVEMENT_Z
+from spike4dgs.generators.worlds.primitives.materials import Material
+from spike4dgs.generators.worlds.primitives.meshes import (
+    Mesh,
+    box,
+    ellipsoid,
+    merge,
+    quad,
+    revolve,
+    rotation,
+    scaling,
+    translation,
+    tube,
+)
+from spike4dgs.generators.worlds.primitives.textures import Canvas, fractal, mix, paving, plain
+
+
+def trees(rng: np.random.Generator) -> dict[str, Part]:
+    """Three street trees in planters: trunk, branches and some hundred leaf cards each."""
+    trunks, leaves, tubs, soil = [], [], [], []
+    for x in (-7.3 + rng.uniform(-0.4, 0.4), 1.9 + rng.uniform(-0.4, 0.4), 9.4 + rng.uniform(-0.4, 0.4)):
+        y = 6.5
+        fork = np.array([x + rng.uniform(-0.1, 0.1), y, 2.3])
+        trunks.append(tube([(x, y, 0.1), (x + 0.04, y, 1.2), fork], [0.15, 0.11, 0.085]))
+        for a in np.linspace(0, 2 * np.pi, 5)[:-1] + rng.uniform(0, 1):
+            tip = fork + [0.7 * np.cos(a), 0.7 * np.sin(a), 0.9]
+            trunks.append(tube([fork - [0, 0, 0.1], (fork + tip) / 2 + [0, 0, 0.1], tip], [0.07, 0.05, 0.025], 7))
+        for _ in range(330):
+            d = rng.normal(size=3)
+            d *= rng.random() ** 0.35 / np.linalg.norm(d)
+            middle = fork + [0, 0, 1.15] + d * (1.35, 1.2, 1.1)
+            turn = np.eye(4)
+            turn[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            card = quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.2))
+            card = card.moved(translation(*middle) @ turn @ scaling(*rng.uniform(0.16, 0.30, 2), 1))
+            leaves.append(Mesh(card.vertices, card.faces, card.uv + rng.random(2), smooth=False))
+        tubs.append(box((1.15, 1.15, 0.5), (x, y, PAVEMENT_Z + 0.25), 0.8))
+        soil.append(quad((x, y, PAVEMENT_Z + 0.503), (1.0, 0, 0), (0, 1.0, 0)))
+    bark = mix(fractal((64, 64), rng, 16), (0.09, 0.065, 0.04), (0.30, 0.23, 0.16))
+    green = mix(fractal((256, 256), rng, 48), (0.06, 0.15, 0.03), (0.34, 0.52, 0.14))
+    return {
+        "trunks": Part(merge(trunks), Material(bark)),
+        "leaves": Part(merge(leaves), Material(green)),
+        "tubs": Part(merge(tubs), Material(paving((96, 96), rng, (16, 32), (0.40, 0.24, 0.17), (0.60, 0.40, 0.30)))),
+        "soil": Part(merge(soil), Material(mix(fractal((64, 64), rng, 8), (0.04, 0.03, 0.02), (0.16, 0.11, 0.07)))),
+    }
+
+
+def furniture(rng: np.random.Generator) -> dict[str, Part]:
+    """Lamps, signs, a bench, a bin, a hydrant, a letter box, bollards and flower boxes."""
+    z = PAVEMENT_Z
+    poles, boards = [], {}
+    for x in (-4.9, 5.6):
+        poles.append(tube([(x, 5.95, z), (x, 5.95, 3.6), (x, 5.75, 4.3), (x, 5.0, 4.45)], 0.06))
+        poles.append(revolve(np.array([(0.16, 0), (0.16, 0.25), (0.07, 0.45)]), 20).at(x, 5.95, z))
+    for k, (x, words, edge) in enumerate(
+        ((-0.3, "STOP", (0.62, 0.04, 0.04)), (4.0, "30", (0.62, 0.04, 0.04)), (-9.8, "P", (0.05, 0.15, 0.5)))
+    ):
+        poles.append(tube([(x, 5.92, z), (x, 5.92, 2.75)], 0.035, 8))
+        c = Canvas(plain((96, 96), edge if k != 1 else (0.85, 0.85, 0.83)), 96)
+        c.ellipse(0.5, 0.5, 0.46, 0.46, (0.85, 0.85, 0.83))
+        c.ellipse(0.5, 0.5, 0.40, 0.40, edge)
+        if k == 1:
+            c.ellipse(0.5, 0.5, 0.33, 0.33, (0.85, 0.85, 0.83))
+        c.text(words, 0.5, 0.5, 0.20 if len(words) > 2 else 0.34, (0.03, 0.03, 0.03) if k == 1 else (0.85, 0.85, 0.83))
+        turn = rotation("x", np.pi / 2)
+        ring = np.linspace(0, 2 * np.pi, 33)[:-1]
+        face = quad((0, 0, 0), (0.84, 0, 0), (0, 0.84, 0))
+        if k != 2:
+            p = 0.42 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1)
+            i = np.arange(32)
+            uv = np.stack([0.5 + p[:, 0] / 0.84, 0.5 - p[:, 1] / 0.84], 1)
+            face = Mesh(
+                np.concatenate([p, [[0, 0, 0]]]),
+                np.stack([i, (i + 1) % 32, np.full(32, 32)], 1),
+                np.concatenate([uv, [[0.5, 0.5]]]),
+                False,
+            )
+        boards[f"sign{k}"] = Part(face.moved(translation(x, 5.87, 2.35) @ turn), Material(c.picture))
+    slats = [box((1.7, 0.09, 0.04), (-2.0 + 9.4, 7.4 + dy, z + 0.45)) for dy in (-0.2, -0.09, 0.02, 0.13)]
+    slats += [box((1.7, 0.04, 0.09), (7.4, 7.62, z + h)) for h in (0.62, 0.75, 0.88)]
+    legs = [box((0.06, 0.45, 0.45), (7.4 + dx, 7.4, z + 0.22)) for dx in (-0.7, 0.7)]
+    hydrant = revolve(
+        np.array([(0.16, 0), (0.16, 0.06), (0.11, 0.08), (0.11, 0.5), (0.14, 0.52), (0.10, 0.66), (0, 0.72)]), 20
+    )
+    bin_ = revolve(np.array([(0.24, 0), (0.27, 0.8), (0.29, 0.82), (0.20, 0.92), (0, 0.95)]), 24)
+    bollard = revolve(np.array([(0.09, 0), (0.075, 0.75), (0.09, 0.78), (0.06, 0.88), (0, 0.9)]), 16)
+    stripes = mix(((np.arange(96) // 12) % 2)[:, None] * np.ones((1, 8)), (0.08, 0.08, 0.08), (0.80, 0.62, 0.12))
+    letter = Canvas(plain((96, 64), (0.70, 0.55, 0.08)), 120)
+    letter.rectangle(0.08, 0.15, 0.45, 0.2, (0.03, 0.03, 0.03))
+    letter.text("POST", 0.265, 0.38, 0.10, (0.05, 0.05, 0.05))
+    bollards = [
+        bollard.at(x, y, z) for y in (5.85, -3.1) for x in (-6.2, -1.35, 0.55, 3.2, 6.6) if not (y < 0 and -4 < x < -1)
+    ]
+    boxes = [box((1.5, 0.5, 0.45), (x, -3.6, z + 0.22), 0.8) for x in (-5.3, 2.4, 7.4)]
+    blossoms = []
+    for x in (-5.3, 2.4, 7.4):
+        for _ in range(70):
+            p = (x + rng.uniform(-0.72, 0.72), -3.6 + rng.uniform(-0.22, 0.22), z + rng.uniform(0.46, 0.66))
+            r = rng.uniform(0.03, 0.07)
+            ball = ellipsoid((r, r, r), p, 6)
+            blossoms.append(Mesh(ball.vertices, ball.faces, ball.uv * 0 + rng.random(2), True))
+    petals = np.float32([[(0.7, 0.1, 0.2), (0.8, 0.7, 0.1), (0.12, 0.3, 0.06), (0.8, 0.8, 0.8)]] * 4)
+    petals = np.repeat(np.repeat(rng.permuted(petals, axis=1), 4, 0), 4, 1)
+    return boards | {
+        "poles": Part(merge(poles), Material((0.20, 0.22, 0.22), 0.2)),
+        "lamp_heads": Part(
+            merge([ellipsoid((0.16, 0.36, 0.08), (x, 4.85, 4.42)) for x in (-4.9, 5.6)]),
+            Material((0.55, 0.55, 0.55), 0.15),
+        ),
+        "bench": Part(merge(slats), Material((0.42, 0.25, 0.12))),
+        "bench_legs": Part(merge(legs), Material(DARK)),
+        "hydrant": Part(hydrant.at(2.9, 5.95, z), Material((0.65, 0.08, 0.05), 0.15)),
+        "bin": Part(bin_.at(-1.1, 7.6, z), Material((0.06, 0.22, 0.12), 0.2)),
+        "letter_box": Part(box((0.5, 0.4, 0.8), (-3.9, 7.9, z + 0.8)), Material(letter.picture)),
+        "bollards": Part(merge(bollards), Material(stripes)),
+        "flower_boxes": Part(
+            merge(boxes), Material(paving((96, 96), rng, (12, 96), (0.30, 0.18, 0.10), (0.48, 0.30, 0.18)))
+        ),
+        "flowers": Part(merge(blossoms), Material(petals)),
+    }

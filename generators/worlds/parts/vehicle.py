@@ -1,0 +1,283 @@
+"""A small rally car: body and glasshouse with painted doors, windows and numbers, tyres, lights, spinning rims.
+
+Own coordinates: x forward, y to the left, z up, origin on the ground below the middle. Metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.primitives.materials import Colour, Material
+from spike4dgs.generators.worlds.primitives.meshes import (
+    Atlas,
+    Mesh,
+    box,
+    ellipsoid,
+    loft,
+    merge,
+    quad,
+    revolve,
+    rotation,
+    translation,
+    tube,
+)
+from spike4dgs.generators.worlds.primitives.textures import Canvas, fractal, mix, plain
+
+LENGTH_M, WIDTH_M, HEIGHT_M = 4.2, 1.76, 1.46
+WHEEL_RADIUS_M, RIM_RADIUS_M, ARCH_RADIUS_M = 0.33, 0.22, 0.405
+AXLES_X_M = (-1.29, 1.29)
+TRACK_Y_M = 0.77  # middle of each wheel, left and right
+
+GLASS: Colour = (0.03, 0.035, 0.045)
+DARK: Colour = (0.025, 0.025, 0.028)
+_ATLAS = Atlas(LENGTH_M + 0.1, WIDTH_M + 0.1, HEIGHT_M, 128)
+
+# side outlines, x from the rear bumper to the nose
+_TOP = np.array(
+    [(-2.1, 0.50), (-2.09, 0.66), (-2.05, 0.84), (-1.95, 0.93), (-1.6, 0.96), (-0.8, 0.95), (0.3, 0.92), (0.9, 0.89)]
+    + [(1.35, 0.83), (1.75, 0.75), (1.97, 0.66), (2.07, 0.55), (2.1, 0.44)]
+)
+_BOTTOM = np.array([(-2.1, 0.40), (-2.04, 0.28), (-1.9, 0.20), (1.92, 0.17), (2.05, 0.21), (2.1, 0.34)])
+_ROOF = np.array(
+    [(-1.88, 0.86), (-1.72, 1.02), (-1.45, 1.26), (-1.15, 1.38), (-0.7, 1.44), (-0.1, 1.45), (0.25, 1.40)]
+    + [(0.62, 1.17), (1.0, 0.86)]
+)
+
+
+@dataclass(frozen=True)
+class Livery:
+    """Colours of one car: linear RGB, and the number on its doors."""
+
+    body: Colour
+    second: Colour
+    number: str
+
+
+def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
+    """Everything that only translates. The tyres belong here: they look the same at every angle."""
+    shell = _ATLAS.wrap(loft(np.stack([_body_ring(x) for x in _stations()])))
+    glasshouse = _ATLAS.wrap(loft(np.stack([_cabin_ring(x) for x in np.linspace(-1.87, 0.98, 46)])))
+    tyre = revolve(_tyre_profile(), 40, "y")
+    floor = box((3.9, 1.15, 0.55), (0, 0, 0.46))
+    trims = [box((2.05, 0.03, 0.09), (0, s * 0.855, 0.235)) for s in (-1, 1)]
+    trims += [box((0.10, 1.5, 0.10), (2.06, 0, 0.25)), box((0.3, 1.35, 0.03), (-1.72, 0, 1.33))]
+    trims += [box((0.05, 0.05, 0.3), (-1.72, s * 0.5, 1.18)) for s in (-1, 1)]
+    lamps = [ellipsoid((0.13, 0.17, 0.085), (1.96, s * 0.60, 0.62)) for s in (-1, 1)]
+    lamps += [ellipsoid((0.05, 0.07, 0.07), (2.08, s * y, 0.36)) for s in (-1, 1) for y in (0.25, 0.5)]
+    tails = [ellipsoid((0.05, 0.15, 0.08), (-2.06, s * 0.66, 0.76)) for s in (-1, 1)]
+    mirrors = [ellipsoid((0.09, 0.12, 0.075), (0.52, s * 0.93, 0.99)) for s in (-1, 1)]
+    plate = Canvas(plain((40, 160), (0.85, 0.85, 0.8)), 300)
+    plate.text("S4-DGS", 0.267, 0.067, 0.08, (0.02, 0.02, 0.05))
+    plates = [quad((2.115, 0, 0.40), (0, 0.52, 0), (0, 0, 0.12)), quad((-2.115, 0, 0.60), (0, -0.52, 0), (0, 0, 0.12))]
+    aerial = tube([(-1.2, 0, 1.38), (-1.38, 0, 1.72)], 0.012, 6)
+    return (
+        Part(shell, Material(_paint_body(livery, rng), 0.12)),
+        Part(glasshouse, Material(_paint_cabin(livery), 0.08)),
+        Part(merge([tyre.moved(translation(*w)) for w in wheel_positions()]), Material(_tyre_picture())),
+        Part(merge([floor, *trims]), Material(DARK)),
+        Part(merge(lamps), Material((0.85, 0.85, 0.82), 0.08)),
+        Part(merge(tails), Material((0.6, 0.03, 0.03), 0.08)),
+        Part(merge([*mirrors, aerial]), Material(livery.second, 0.12)),
+        Part(merge(plates), Material(plate.picture)),
+    )
+
+
+def rim_parts() -> tuple[Part, ...]:
+    """One rim about its own axle (the y axis): ring, five double spokes, hub; alike from both sides."""
+    ring = [(0.205, -0.115), (RIM_RADIUS_M, -0.11), (RIM_RADIUS_M, 0.11), (0.205, 0.115), (0.195, 0.09), (0.195, -0.09)]
+    bright: list[Mesh] = [revolve(np.array(ring + ring[:1]), 40, "y")]
+    for k in range(5):
+        turn = rotation("y", 2 * np.pi * k / 5)
+        for side in (-1, 1):
+            for lean in (-0.16, 0.16):
+                spoke = box((0.024, 0.03, 0.165), (0, side * 0.088, 0.122))
+                bright.append(spoke.moved(turn @ rotation("y", lean)))
+    hub = [ellipsoid((0.055, 0.02, 0.055), (0, s * 0.095, 0)) for s in (-1, 1)]
+    brake = [revolve(np.array([(0.04, s * 0.05), (0.15, s * 0.05)]), 32, "y") for s in (-1, 1)]
+    behind = [revolve(np.array([(0.0, s * 0.03), (0.2, s * 0.03)]), 32, "y") for s in (-1, 1)]
+    # one painted mark makes a whole turn distinguishable from a fifth of one
+    mark = [box((0.05, 0.012, 0.075), (0, s * 0.108, 0.15)) for s in (-1, 1)]
+    return (
+        Part(merge(bright), Material((0.72, 0.72, 0.74), 0.2)),
+        Part(merge(hub), Material((0.10, 0.10, 0.28), 0.1)),
+        Part(merge(brake), Material((0.22, 0.22, 0.23))),
+        Part(merge(behind), Material(DARK)),
+        Part(merge(mark), Material((0.80, 0.10, 0.06))),
+    )
+
+
+def wheel_positions() -> list[tuple[float, float, float]]:
+    """Wheel centres in the car's coordinates."""
+    return [(x, s * TRACK_Y_M, WHEEL_RADIUS_M) for x in AXLES_X_M for s in (-1, 1)]
+
+
+# ---------------------------------------------------------------- shape
+
+
+def _stations() -> np.ndarray:
+    """Cross-section positions: even, and dense along the wheel arches."""
+    angle = np.linspace(0, np.pi, 21)
+    edge = ARCH_RADIUS_M + 0.004
+    arches = [np.concatenate([x + ARCH_RADIUS_M * np.cos(angle), [x - edge, x + edge]]) for x in AXLES_X_M]
+    ends = np.array([-2.095, -2.08, -2.05, -2.0, 2.0, 2.05, 2.08, 2.095])
+    return np.unique(np.round(np.concatenate([np.linspace(-2.1, 2.1, 43), ends, *arches]), 4))
+
+
+def _body_ring(x: float) -> np.ndarray:
+    """Cross-section of the lower body at x: a rounded rectangle between the outlines, cut by the wheel arches."""
+    top = np.interp(x, _TOP[:, 0], _TOP[:, 1])
+    bottom = np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1])
+    for axle in AXLES_X_M:
+        if abs(x - axle) <= ARCH_RADIUS_M:
+            bottom = max(bottom, WHEEL_RADIUS_M + np.sqrt(ARCH_RADIUS_M**2 - (x - axle) ** 2))
+    flare = 0.02 * sum(np.exp(-(((x - axle) / 0.5) ** 2)) for axle in AXLES_X_M)
+    half = WIDTH_M / 2 * (1 - 0.20 * abs(x / 2.1) ** 5) - 0.02 + flare
+    return _rounded(x, half, bottom, top, round_top=0.17, round_bottom=0.04, lean=0.07, crown=0.05)
+
+
+def _cabin_ring(x: float) -> np.ndarray:
+    """Cross-section of the glasshouse at x, narrowing towards the roof."""
+    roof = np.interp(x, _ROOF[:, 0], _ROOF[:, 1])
+    half = 0.80 * (1 - 0.10 * abs((x + 0.45) / 1.45) ** 3)
+    return _rounded(x, half, 0.70, max(roof, 0.72), round_top=0.10, round_bottom=0.01, lean=0.24, crown=0.03)
+
+
+def _rounded(
+    x: float,
+    half: float,
+    bottom: float,
+    top: float,
+    *,
+    round_top: float,
+    round_bottom: float,
+    lean: float,
+    crown: float,
+) -> np.ndarray:
+    """Ring [m, 3] at x: sides lean inwards by `lean` metres per 0.6 m of height, the top bulges by `crown`."""
+    r1, r0 = min(round_top, 0.45 * (top - bottom)), min(round_bottom, 0.3 * (top - bottom))
+    a = np.linspace(0, np.pi / 2, 7)
+    low = np.stack([half - r0 + r0 * np.sin(a), bottom + r0 - r0 * np.cos(a)], 1)
+    wall = np.stack([np.full(5, half), np.linspace(bottom + r0, top - r1, 7)[1:-1]], 1)
+    high = np.stack([half - r1 + r1 * np.cos(a), top - r1 + r1 * np.sin(a)], 1)
+    under = np.stack([np.linspace(0, half - r0, 4)[:-1], np.full(3, bottom)], 1)
+    roof = np.stack([np.linspace(half - r1, 0, 7)[1:], np.full(6, top)], 1)
+    y, z = np.concatenate([under, low, wall, high, roof]).T
+    y = y - lean * np.clip(z - 0.62, 0, None) / 0.6 * (y / half)
+    z = z - crown * (y / half) ** 2 * np.clip((z - bottom) / (top - bottom), 0, 1) ** 2
+    ring = np.stack([np.full_like(y, x), y, z], 1)
+    return np.concatenate([ring, (ring * [1, -1, 1])[-2:0:-1]])
+
+
+def _tyre_profile() -> np.ndarray:
+    """Half cross-section of a tyre, a flattened ring between rim and tread."""
+    r0, r1 = RIM_RADIUS_M - 0.005, WHEEL_RADIUS_M
+    profile = [(r0, -0.10), (r0 + 0.05, -0.122), (r1 - 0.02, -0.115), (r1 - 0.004, -0.095), (r1, -0.05), (r1, 0.05)]
+    return np.array(profile + [(r1 - 0.004, 0.095), (r1 - 0.02, 0.115), (r0 + 0.05, 0.122), (r0, 0.10)])
+
+
+# ---------------------------------------------------------------- paint
+
+
+def _canvas(colour: Colour, rng: np.random.Generator | None = None) -> Canvas:
+    picture = plain(_ATLAS.shape, colour)
+    if rng is not None:
+        picture *= (0.92 + 0.14 * fractal(_ATLAS.shape, rng, 64, 4))[..., None]
+    return Canvas(picture, _ATLAS.texels_per_m)
+
+
+def _side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
+    """Points (x, z) on a flank -> texture metres."""
+    return _ATLAS.place(chart, np.array([(x, 0.0, z) for x, z in xz]))
+
+
+def _top(xy: list[tuple[float, float]]) -> np.ndarray:
+    """Points (x, y) seen from above -> texture metres."""
+    return _ATLAS.place("top", np.array([(x, y, 0.0) for x, y in xy]))
+
+
+def _paint_body(livery: Livery, rng: np.random.Generator) -> np.ndarray:
+    c = _canvas(livery.body, rng)
+    white = (0.86, 0.86, 0.83)
+    for chart in ("near", "far"):
+        c.polygon(_side(chart, [(-2.1, 0.50), (-0.75, 0.40), (2.1, 0.40), (2.1, 0.18), (-2.1, 0.18)]), livery.second)
+        c.polygon(
+            _side(chart, [(-2.1, 0.55), (-0.75, 0.45), (2.1, 0.45), (2.1, 0.42), (-0.75, 0.42), (-2.1, 0.52)]), white
+        )
+        for shift, shade in ((0.0, livery.second), (0.32, white)):
+            slash = [(-1.02 - shift, 0.90), (-0.80 - shift, 0.90), (-0.98 - shift, 0.46), (-1.2 - shift, 0.48)]
+            c.polygon(_side(chart, slash), shade)
+        for door in ([(-0.72, 0.95), (-0.70, 0.42), (-0.52, 0.25), (0.44, 0.25), (0.52, 0.92)],):
+            c.line(_side(chart, door), 0.022, DARK)
+        c.line(_side(chart, [(0.86, 0.62), (0.86, 0.28)]), 0.015, DARK, 0.6)
+        c.polygon(_side(chart, [(-0.62, 0.82), (-0.42, 0.82), (-0.42, 0.78), (-0.62, 0.78)]), DARK)
+        c.polygon(_side(chart, [(0.62, 0.72), (0.84, 0.72), (0.80, 0.62), (0.62, 0.62)]), DARK, 0.85)
+        x, y = _side(chart, [(-0.06, 0.62)])[0]
+        c.ellipse(x, y, 0.235, 0.235, DARK)
+        c.ellipse(x, y, 0.215, 0.215, white)
+        c.text(livery.number, x, y, 0.22, (0.02, 0.02, 0.02))
+        x, y = _side(chart, [(1.62, 0.545)])[0]
+        c.text("4D", x, y, 0.13, (0.02, 0.02, 0.02))
+        x, y = _side(chart, [(-1.82, 0.66)])[0]
+        c.text("20k", x, y, 0.11, white)
+        x, y = _side(chart, [(0.0, 0.325)])[0]
+        c.text("S P I K E", x, y, 0.105, white)
+    _paint_bonnet(c, livery, white)
+    for chart, grille in (("front", True), ("back", False)):
+        x, y = _ATLAS.place(chart, np.array([(0, 0, 0.42)]))[0]
+        c.rectangle(x - 0.62, y - 0.07, x + 0.62, y + 0.07, DARK if grille else livery.second)
+    return c.picture
+
+
+def _paint_bonnet(c: Canvas, livery: Livery, white: Colour) -> None:
+    """Stripes, seams, vents and a number on the bonnet and the boot lid."""
+    for y0, y1 in ((-0.30, -0.10), (0.10, 0.30)):
+        c.polygon(_top([(0.8, y0), (2.1, y0), (2.1, y1), (0.8, y1)]), livery.second)
+        c.polygon(_top([(-2.1, y0), (-1.6, y0), (-1.6, y1), (-2.1, y1)]), livery.second)
+    for s in (-1, 1):
+        c.polygon(_top([(0.8, s * 0.33), (2.1, s * 0.33), (2.1, s * 0.37), (0.8, s * 0.37)]), white)
+        c.line(_top([(1.0, s * 0.74), (1.9, s * 0.62)]), 0.018, DARK)
+        for k in range(3):
+            x = 1.15 + 0.09 * k
+            c.line(_top([(x, s * 0.46), (x + 0.02, s * 0.62)]), 0.03, DARK)
+    c.line(_top([(1.93, -0.7), (1.97, 0), (1.93, 0.7)]), 0.02, DARK)
+    x, y = _top([(1.5, -0.0)])[0]
+    c.ellipse(x, y, 0.2, 0.2, white)
+    c.text(livery.number, x, y, 0.19, (0.02, 0.02, 0.02))
+
+
+def _paint_cabin(livery: Livery) -> np.ndarray:
+    c = _canvas(livery.body)
+    seat: Colour = (0.10, 0.09, 0.085)
+    for chart in ("near", "far"):
+        front = [(-0.50, 0.95), (-0.50, 1.33), (0.10, 1.33), (0.28, 1.27), (0.66, 0.95)]
+        rear = [(-0.60, 0.95), (-0.60, 1.33), (-1.02, 1.29), (-1.30, 1.16), (-1.52, 0.95)]
+        for window, back in ((front, -0.36), (rear, -1.12)):
+            c.polygon(_side(chart, window), GLASS)
+            c.polygon(_side(chart, [(back, 0.95), (back - 0.06, 1.2), (back + 0.10, 1.24), (back + 0.2, 0.95)]), seat)
+            glint = [(back + 0.38, 0.97), (back + 0.56, 1.27), (back + 0.62, 1.27), (back + 0.44, 0.97)]
+            c.polygon(_side(chart, glint), (0.16, 0.18, 0.20), 0.8)
+        c.line(_side(chart, [*front, front[0]]), 0.02, DARK)
+        c.line(_side(chart, [*rear, rear[0]]), 0.02, DARK)
+    windscreen = [(0.30, -0.56), (0.92, -0.68), (0.92, 0.68), (0.30, 0.56)]
+    c.polygon(_top(windscreen), GLASS)
+    c.polygon(_top([(0.30, -0.56), (0.38, -0.575), (0.38, 0.575), (0.30, 0.56)]), (0.86, 0.86, 0.83))
+    c.polygon(_top([(0.5, -0.2), (0.62, -0.24), (0.62, -0.5), (0.5, -0.48)]), (0.14, 0.12, 0.10), 0.8)
+    c.polygon(_top([(-1.24, -0.52), (-1.66, -0.6), (-1.66, 0.6), (-1.24, 0.52)]), GLASS)
+    for y0, y1 in ((-0.30, -0.10), (0.10, 0.30)):
+        c.polygon(_top([(-1.2, y0), (0.28, y0), (0.28, y1), (-1.2, y1)]), livery.second)
+    x, y = _top([(-0.45, 0.0)])[0]
+    c.ellipse(x, y, 0.33, 0.33, DARK)
+    c.ellipse(x, y, 0.31, 0.31, (0.86, 0.86, 0.83))
+    c.text(livery.number, x, y, 0.32, (0.02, 0.02, 0.02))
+    return c.picture
+
+
+def _tyre_picture() -> np.ndarray:
+    """Rows run across the profile (sidewall, tread, sidewall); the same all around."""
+    rows = np.full((64, 4), 0.03, np.float32)
+    rows[::7] = 0.012
+    rows[8:11] = rows[53:56] = 0.30  # a white ring on each sidewall
+    return mix(rows, (0, 0, 0), (1, 1, 1))

@@ -1,0 +1,1 @@
+"""Gaussians: parameters, density control, optimiser."""

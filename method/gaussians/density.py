@@ -1,0 +1,64 @@
+"""Adaptive density control: where Gaussians are added and which are removed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.splat import RenderOutput
+
+
+@dataclass(eq=False)
+class Pressure:
+    """Screen-space gradients gathered since the last refinement: where the picture asks for more Gaussians."""
+
+    gradient: Tensor  # [N] sum of |dLoss/dmeans2d| in half-image units, as if each view were a loss of its own
+    seen: Tensor  # [N] number of views that saw the Gaussian
+
+    @classmethod
+    def zero(cls, n: int, device: torch.device) -> Pressure:
+        """Nothing gathered yet for `n` Gaussians."""
+        return cls(torch.zeros(n, device=device), torch.zeros(n, device=device))
+
+    def add(self, out: RenderOutput) -> None:
+        """Gather one rendered batch after its backward pass. Units as in 3DGS, whose thresholds are customary."""
+        grad = out.means2d.grad
+        if grad is None:
+            return
+        views, height, width = out.alpha.shape
+        half = torch.tensor([width / 2, height / 2], dtype=grad.dtype, device=grad.device) * views
+        visible = out.visible
+        self.gradient += torch.where(visible, (grad * half).norm(dim=-1), 0.0).sum(0).float()
+        self.seen += visible.sum(0)
+
+    def mean(self) -> Tensor:
+        """Mean gradient [N] over the views that saw each Gaussian."""
+        return self.gradient / self.seen.clamp(min=1)
+
+
+def refine(
+    gaussians: Gaussians, pressure: Pressure, settings: TrainSettings, scale: float, limit: int, rng: torch.Generator
+) -> list[Edit]:
+    """Edits, to be applied one after the other: move the dead, then densify where the gradient is high.
+
+    Faint Gaussians are relocated instead of deleted while the number is at its `limit`, and deleted before.
+    """
+    dead = gaussians.logits.detach().sigmoid() < settings.min_opacity
+    grow = pressure.mean() * ~dead
+    room = limit - (len(gaussians) - int(dead.sum()))
+    if room <= 0:
+        return [relocate(gaussians, dead, rng)]
+    want = grow > settings.grow_gradient
+    if int(want.sum()) > room:
+        want = torch.zeros_like(dead).index_fill(0, torch.topk(grow, room).indices, True)
+    large = gaussians.log_scales.detach().amax(-1) > math.log(settings.split_scale * scale)
+    first = densify(gaussians, want & ~large, want & large, rng)
+    dead_then = first.gaussians.logits.sigmoid() < settings.min_opacity
+    second = prune(first.gaussians, ~dead_then)
+    source = first.source[second.source]
+    return [Edit(second.gaussians, source, int((source < 0).sum()))]

@@ -1,0 +1,100 @@
+"""Adam over named groups: schedules, edits of the number of Gaussians, and its state as plain tensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from spike4dgs.method.gaussians.parameters import Edit, Gaussians
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+@dataclass(frozen=True)
+class Decay:
+    """A learning rate that falls log-linearly from `first` to `last` over a stage."""
+
+    first: float
+    last: float
+
+    def at(self, fraction: float) -> float:
+        """The rate after `fraction` in [0, 1] of the stage."""
+        return math.exp((1 - fraction) * math.log(self.first) + fraction * math.log(self.last))
+
+
+@dataclass(frozen=True)
+class WarmCosine:
+    """A learning rate that rises linearly to `peak` in `warm_up` steps, and falls to nothing with the cosine."""
+
+    peak: float
+    warm_up: int  # steps
+    steps: int  # of the whole training
+
+    def at(self, step: int) -> float:
+        """The rate of a step."""
+        rise = min(1.0, (step + 1) / self.warm_up)
+        return self.peak * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+
+
+def make_adam(groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> torch.optim.Adam:
+    """Adam with one named group per entry; learning rates are set before each step (`set_rates`, `set_rate`).
+
+    eps is 1e-15 as in 3DGS: gradients of single Gaussians are far below Adam's usual 1e-8.
+    """
+    named = [{"name": name, "params": params} for name, params in groups.items() if params]
+    return torch.optim.Adam(named, lr=0.0, betas=betas, eps=1e-15, fused=True)
+
+
+def set_rates(adam: torch.optim.Adam, rates: dict[str, Decay], fraction: float) -> None:
+    """Set every group's learning rate for the point `fraction` in [0, 1] of a stage."""
+    for group in adam.param_groups:
+        group["lr"] = rates[group["name"]].at(fraction)
+
+
+def set_rate(adam: torch.optim.Adam, rate: float) -> None:
+    """Set one learning rate for all groups."""
+    for group in adam.param_groups:
+        group["lr"] = rate
+
+
+def apply_edit(adam: torch.optim.Adam, edit: Edit) -> Gaussians:
+    """Replace the Gaussians' parameters in `adam` by those of an edit, moments included; return the new leaves."""
+    new = edit.gaussians.trainable()
+    kept = edit.source >= 0
+    for group in adam.param_groups:
+        leaf = new.tensors().get(group["name"])
+        if leaf is None:
+            continue
+        state = adam.state.pop(group["params"][0], {})
+        for moment in MOMENTS:
+            if moment in state:
+                old, fresh = state[moment], torch.zeros_like(leaf)
+                fresh[kept] = old[edit.source[kept]]
+                state[moment] = fresh
+        group["params"] = [leaf]
+        if state:
+            adam.state[leaf] = state
+    return new
+
+
+def export_state(adam: torch.optim.Adam) -> dict[str, Tensor]:
+    """Moments and step counts as `GROUP.INDEX.KEY` -> tensor."""
+    return {
+        f"{group['name']}.{i}.{key}": value
+        for group in adam.param_groups
+        for i, p in enumerate(group["params"])
+        for key, value in adam.state.get(p, {}).items()
+    }
+
+
+def import_state(adam: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+    """Restore what `export_state` gave, for the same groups and shapes."""
+    for group in adam.param_groups:
+        for i, p in enumerate(group["params"]):
+            prefix = f"{group['name']}.{i}."
+            state = {k.removeprefix(prefix): v.to(p.device) for k, v in tensors.items() if k.startswith(prefix)}
+            if state:
+                adam.state[p] = state

@@ -1,0 +1,1 @@
+"""Tensors in files: models and network weights."""

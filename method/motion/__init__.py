@@ -1,0 +1,1 @@
+"""The motion part of a recipe: how Gaussians move."""

@@ -1,0 +1,153 @@
+"""HexPlane deformation as in 4DGS (Wu et al. 2024): six feature planes per level, a small MLP, additive changes.
+
+A canonical Gaussian at x looks up a feature at (x, t): the PRODUCT over the planes xy, xz, yz, xt, yt, zt of bilinear
+values, CONCATENATED over levels of rising spatial resolution; the time resolution is the same at all levels. A linear
+layer and one head per parameter (ReLU, linear, ReLU, linear) turn it into changes of means, log-scales, raw
+quaternions, logits and colours.
+
+Defects of the published code that are not repeated here:
+
+- t is normalised to the whole time axis. There t in [0, 1] meets a grid over [-1, 1], so half of each plane is dead.
+- The heads' last layers start at zero: the deformation is exactly zero at first. There it is random.
+- The box comes from the robust extent of the points, seen depth included, never from the camera array.
+- `plane_tv` is total variation along both axes. There it is a second difference along one axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion.mlp import perceptron
+
+SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # the planes xy, xz, yz
+_CHANGES = {"means": 3, "log_scales": 3, "quats": 4, "logits": 1, "colors": 1}
+
+
+@dataclass(frozen=True)
+class HexPlaneShape:
+    """Sizes of the field."""
+
+    spatial: tuple[int, ...]  # cells per axis at each level
+    times: int  # cells of the time axis
+    features: int  # per plane and level
+    width: int  # of the MLP
+
+
+class HexPlane(nn.Module):
+    """Feature planes over a box and the clip. Planes are channel-last: space [3, R, R, F], time [3, T, R, F]."""
+
+    def __init__(self, shape: HexPlaneShape, low: Tensor, high: Tensor, generator: torch.Generator) -> None:
+        super().__init__()
+        self.shape = shape
+        self.low: Tensor
+        self.high: Tensor
+        self.register_buffer("low", low.float().clone())
+        self.register_buffer("high", high.float().clone())
+        f = shape.features
+        # As published: time planes start at 1 (no influence), spatial planes uniform in [0.1, 0.5].
+        self.space = nn.ParameterList(
+            [nn.Parameter(0.1 + 0.4 * torch.rand(3, r, r, f, generator=generator)) for r in shape.spatial]
+        )
+        self.time = nn.ParameterList([nn.Parameter(torch.ones(3, shape.times, r, f)) for r in shape.spatial])
+
+    def forward(self, means: Tensor, t: float) -> Tensor:
+        """Features [N, levels * F] of points [N, 3] at the time t in [0, 1]. Points outside the box take its border."""
+        unit = (means - self.low) / (self.high - self.low)  # [N, 3], the box is [0, 1]^3
+        if means.device.type == "cpu":
+            from spike4dgs.method.motion.hexplane_cpu import sample_levels
+
+            return sample_levels(unit, [self.rows_at(plane, t) for plane in self.time], list(self.space))
+        levels = zip(self.space, self.time, strict=True)
+        return torch.cat([sample_level(unit, space, self.rows_at(time, t)) for space, time in levels], -1)
+
+    @staticmethod
+    def rows_at(plane: Tensor, t: float) -> Tensor:
+        """A time plane [3, T, R, F] at t in [0, 1] -> [3, R, F]; 0 is the first row and 1 the last."""
+        position = min(max(t, 0.0), 1.0) * (plane.shape[1] - 1)
+        row = min(int(position), max(plane.shape[1] - 2, 0))
+        if plane.shape[1] == 1:
+            return plane[:, 0]
+        return torch.lerp(plane[:, row], plane[:, row + 1], position - row)
+
+
+def sample_level(unit: Tensor, space: Tensor, lines: Tensor) -> Tensor:
+    """One level in plain torch: unit coordinates [N, 3], planes [3, R, R, F], lines [3, R, F] -> product [N, F]."""
+    grid = 2 * unit - 1
+    product = torch.ones((), dtype=unit.dtype, device=unit.device)
+    for plane, (a, b) in zip(space, SPATIAL_AXES, strict=True):
+        product = product * _bilinear(plane, grid[:, [b, a]])  # grid_sample wants the last axis first
+    for axis, line in enumerate(lines):
+        at = torch.stack([torch.zeros_like(grid[:, axis]), grid[:, axis]], -1)
+        product = product * _bilinear(line[:, None], at)
+    return product
+
+
+def _bilinear(plane: Tensor, grid: Tensor) -> Tensor:
+    """A plane [A, B, F] at grid [N, 2] in [-1, 1] -> [N, F]."""
+    image = plane.permute(2, 0, 1)[None]
+    out = functional.grid_sample(image, grid[None, :, None], padding_mode="border", align_corners=True)
+    return out[0, :, :, 0].T
+
+
+class HexPlaneMotion(nn.Module):
+    """The motion part `hexplane`: features, one linear layer, five heads. Means move in units of `scale` metres."""
+
+    def __init__(
+        self, shape: HexPlaneShape, low: Tensor, high: Tensor, scale: float, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.scale = scale
+        self.planes = HexPlane(shape, low, high, generator)
+        w = shape.width
+        self.trunk = nn.Linear(shape.features * len(shape.spatial), w)
+        self.hidden = nn.Linear(w, w * len(_CHANGES))  # the heads' first layers side by side
+        self.last = nn.ModuleDict({name: nn.Linear(w, size) for name, size in _CHANGES.items()})
+        for layer in (self.trunk, self.hidden):
+            nn.init.xavier_uniform_(layer.weight, generator=generator)
+            nn.init.zeros_(layer.bias)
+        for parameter in self.last.parameters():
+            nn.init.zeros_(parameter)
+
+    def changes(self, means: Tensor, t: float) -> dict[str, Tensor]:
+        """What the field adds to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
+        final: list[Tensor] = list(self.last.parameters())  # weight, bias, weight, bias, ...
+        last = torch.block_diag(*final[0::2]), torch.cat(final[1::2])
+        layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
+        out = perceptron(self.planes(means, t), layers)
+        parts = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))
+        return {**parts, "means": parts["means"] * self.scale, "logits": parts["logits"][:, 0]}
+
+    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
+        """The Gaussians at the time t in [0, 1]."""
+        added = self.changes(gaussians.means, t)
+        return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
+
+    def mlp(self) -> list[nn.Parameter]:
+        """Parameters of the linear layers."""
+        return [*self.trunk.parameters(), *self.hidden.parameters(), *self.last.parameters()]
+
+
+def plane_tv(space: Sequence[Tensor]) -> Tensor:
+    """Total variation of the spatial planes: mean squared difference of neighbours, both axes.
+
+    sum over the three planes of mean (P[i+1,j] - P[i,j])^2 + mean (P[i,j+1] - P[i,j])^2, averaged over levels, so that
+    the weight means the same with any number of levels (the published code sums over them).
+    """
+    per_level = [3 * (p.diff(dim=1).square().mean() + p.diff(dim=2).square().mean()) for p in space]
+    return torch.stack(per_level).mean()
+
+
+def time_smoothness(time: Sequence[Tensor]) -> Tensor:
+    """Second differences of the time planes along time: sum over planes of mean (P[t-1] - 2 P[t] + P[t+1])^2."""
+    return torch.stack([3 * p.diff(n=2, dim=1).square().mean() for p in time]).mean()
+
+
+def time_sparsity(time: Sequence[Tensor]) -> Tensor:
+    """Distance of the time planes from 1, where they have no influence: sum over planes of mean |1 - P|."""
+    return torch.stack([3 * (1 - p).abs().mean() for p in time]).mean()

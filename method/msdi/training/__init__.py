@@ -1,0 +1,1 @@
+"""Training of MSDI: data, losses, the loop, evaluation, the model card."""

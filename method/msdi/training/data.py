@@ -1,0 +1,153 @@
+"""What MSDI learns from: batches of windows of spikes with their pictures, points and cameras, drawn from bursts.
+
+Everything that can vary without another rendering is drawn anew at every use: which views, in which order (the first
+one's frame is that of the points), the sensors' noise, phases and maps, the brightness, the direction of time, and
+whether the world is seen in a mirror. All of it is exact: an integrator's spikes played backwards are those of one that
+saw the light backwards, and a mirrored rig is a rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.bursts import REACH, Burst, BurstFile, Float32, Float64
+from spike4dgs.method.msdi.training.spikes import Pixels, make_spikes
+
+_MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+_DIMMEST, _BRIGHTEST = 0.6, 1.4  # factors of a sample's radiance
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """B samples of V views, T ticks, H x W pixels."""
+
+    spikes: NDArray[np.uint8]  # [B, V, T, H, W] of 0 and 1
+    rate: Float32  # [B, V, H, W] truth: spikes per tick at the start of the middle tick, at most the 1 that can be told
+    points: Float32  # [B, V, H, W, 3] what the pixel's centre sees, in view 0's frame, metres; NaN where it is nothing
+    moving: NDArray[np.bool_]  # [B, V, H, W] where something moves, or its shadow, or near it
+    sensitivity: Float32  # [B, V, H, W] of the pixels, mean 1: n(x, y)
+    dark: Float32  # [B, V, H, W] spikes per tick in the dark
+    intrinsics: Float32  # [B, V, 3, 3]
+    w2c: Float64  # [B, V, 4, 4] from view 0's frame to the view's
+    gain: float  # spikes per tick of white
+
+
+class Bursts:
+    """The bursts of several files, which share one sensor, numbered within groups of one picture size.
+
+    Raises UserError for no files, and for files of several radiance gains.
+    """
+
+    def __init__(self, files: Sequence[BurstFile]) -> None:
+        if len({f.facts.radiance_gain for f in files}) != 1:
+            found = f"{len(files)} files" if not files else "several radiance gains"
+            raise problem("training bursts", "files of one radiance gain", found, "name other data")
+        self.files = list(files)
+        self.gain = files[0].facts.radiance_gain
+        self.views = min(f.facts.views for f in files)
+        self._groups: dict[tuple[int, int], list[tuple[BurstFile, int]]] = {}
+        for f in files:
+            group = self._groups.setdefault((f.facts.height, f.facts.width), [])
+            group += [(f, number) for number in range(len(f))]
+
+    def __len__(self) -> int:
+        """Number of bursts."""
+        return sum(map(len, self._groups.values()))
+
+    def draw(self, samples: int, views: int, ticks: int, rng: np.random.Generator) -> Batch:
+        """A batch of randomly chosen and varied bursts, all of one picture size."""
+        groups = list(self._groups.values())
+        shares = np.array([len(g) for g in groups]) / len(self)
+        group = groups[int(rng.choice(len(groups), p=shares))]
+        drawn = []
+        for _ in range(samples):
+            file, number = group[int(rng.integers(len(group)))]
+            burst = varied(chosen(file.read(number), rng.permutation(file.facts.views)[:views]), rng)
+            drawn.append(self._sample(burst, file, ticks, rng))
+        return _stacked(drawn)
+
+    def fixed(self, most: int, views: int, ticks: int) -> list[Batch]:
+        """At most `most` bursts, evenly chosen over the files, one a batch, as they are: the first `views` of each.
+
+        The same for the same files; only the sensors' noise and phases are drawn, from each burst's number.
+        """
+        every = [pair for group in self._groups.values() for pair in group]
+        picked = np.unique(np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int))
+        found = []
+        for number in picked.tolist():
+            file, n = every[number]
+            burst = chosen(file.read(n), np.arange(min(views, file.facts.views)))
+            found.append(_stacked([self._sample(burst, file, ticks, np.random.default_rng(number))]))
+        return found
+
+    def _sample(self, burst: Burst, file: BurstFile, ticks: int, rng: np.random.Generator) -> Batch:
+        """A batch of one sample without the first axis."""
+        rates = burst.keys * np.float32(self.gain)
+        pixels = Pixels(rates, burst.gain, burst.dark, file.facts.photons_per_spike)
+        relative = burst.w2c @ np.linalg.inv(burst.w2c[0])
+        return Batch(
+            spikes=make_spikes(pixels, ticks, rng).swapaxes(0, 1),
+            rate=np.clip(rates[len(rates) // 2], 0, 1),
+            points=points_of(burst.depth, burst.K, relative),
+            moving=burst.moving,
+            sensitivity=np.ascontiguousarray(burst.gain),
+            dark=np.ascontiguousarray(burst.dark),
+            intrinsics=burst.K.astype(np.float32),
+            w2c=relative,
+            gain=self.gain,
+        )
+
+
+def check_ticks(ticks: int) -> None:
+    """Raise UserError for a window that bursts do not hold."""
+    if ticks % 2 == 0 or not 1 <= ticks < 2 * REACH:
+        raise problem("MSDI's window", f"an odd number of ticks below {2 * REACH}", str(ticks), "train another one")
+
+
+def chosen(burst: Burst, views: NDArray[np.int64]) -> Burst:
+    """Some views of a burst, in this order."""
+    b = burst
+    pictures = b.keys[:, views], b.depth[views], b.moving[views]
+    return Burst(*pictures, w2c=b.w2c[views], K=b.K[views], gain=b.gain[views], dark=b.dark[views])
+
+
+def varied(burst: Burst, rng: np.random.Generator) -> Burst:
+    """A burst with other sensors and another brightness, perhaps backwards in time, perhaps in a mirror."""
+    brightness = np.float32(np.exp(rng.uniform(np.log(_DIMMEST), np.log(_BRIGHTEST))))
+    backwards, mirror = rng.random(2) < 0.5
+    keys = burst.keys[::-1] if backwards else burst.keys
+    order, flips = rng.permutation(len(burst.gain)), [slice(None, None, s) for s in rng.choice([-1, 1], 2)]
+    gain, dark = (maps[order][:, *flips] for maps in (burst.gain, burst.dark))
+    found = replace(burst, keys=keys * brightness, gain=gain, dark=dark)
+    return mirrored(found) if mirror else found
+
+
+def mirrored(burst: Burst) -> Burst:
+    """What the mirrored rig sees of the mirrored world."""
+    width = burst.depth.shape[-1]
+    K = burst.K.copy()
+    K[:, 0, 2] = width - K[:, 0, 2]
+    pictures = {name: getattr(burst, name)[..., ::-1] for name in ("keys", "depth", "moving", "gain", "dark")}
+    return replace(burst, K=K, w2c=_MIRROR @ burst.w2c @ _MIRROR, **pictures)
+
+
+def points_of(depth: Float32, K: Float64, w2c: Float64) -> Float32:
+    """Points [V, H, W, 3] that pixel centres see, in the world's frame, from depths [V, H, W]; NaN where it is inf."""
+    _, height, width = depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)  # [H, W, 3]
+    z = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
+    inverse = np.linalg.inv(w2c)
+    to_world = inverse[:, :3, :3] @ np.linalg.inv(K)  # [V, 3, 3]
+    rays = np.einsum("vij,hwj->vhwi", to_world, pixels)
+    return np.asarray(rays * z[..., None] + inverse[:, None, None, :3, 3], np.float32)
+
+
+def _stacked(samples: Sequence[Batch]) -> Batch:
+    names = ("spikes", "rate", "points", "moving", "sensitivity", "dark", "intrinsics", "w2c")
+    return Batch(**{name: np.stack([getattr(s, name) for s in samples]) for name in names}, gain=samples[0].gain)

@@ -1,0 +1,264 @@
+"""Train MSDI on training bursts: `train-msdi`.
+
+Loss: L1 of the pictures in radiance, which teaches extractor and generator, and DUSt3R's confidence-weighted regression
+of points (`losses`), which teaches everything behind them. Each step has a
+fixed number of views: few samples of many views, or many of few.
+
+Everything random is drawn from (seed, step): on one machine, with the same data, a killed run goes on from its
+checkpoint as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.environment import choose_device, device_type
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
+from spike4dgs.benchmark.scene.bursts import FIRST_TRAINING_VARIANT, BurstFile, open_folder
+from spike4dgs.method.checkpoint import resume_training, save_training
+from spike4dgs.method.gaussians.optimizer import make_adam
+from spike4dgs.method.msdi.checkpoints import read_state, transfer
+from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
+from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.network import Msdi
+from spike4dgs.method.msdi.training.curves import Curve, plot_calibration, plot_curves
+from spike4dgs.method.msdi.training.data import Batch, Bursts, check_ticks
+from spike4dgs.method.msdi.training.evaluate import Scores, evaluate
+from spike4dgs.method.msdi.training.losses import image_loss, point_loss
+from spike4dgs.method.msdi.training.model_card import model_card
+from spike4dgs.method.msdi.training.settings import PUBLISHED, TrainingSettings
+from spike4dgs.method.msdi.weights import Card, save_weights
+
+ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only
+_LINE_EVERY_S = 30.0  # between lines of progress
+_SAVE_EVERY_S = 300.0  # between checkpoints
+_PREPARERS = 8  # threads that make batches ahead, for a GPU
+_SCORED_BURSTS = 36  # of the hidden ones
+
+
+@dataclass(frozen=True)
+class StepLosses:
+    """Of one step."""
+
+    total: float
+    image_l1: float  # radiance
+    points: float
+
+
+class Training:
+    """A training in progress."""
+
+    def __init__(self, data: Bursts, config: MsdiConfig, settings: TrainingSettings, device: str, seed: int) -> None:
+        check_ticks(config.ticks)
+        self.data, self.settings, self.device, self.seed = data, settings, device, seed
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.network = Msdi(config).to(device).train()
+        pictures: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
+        own = {id(p) for p in pictures}
+        points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
+        self.adam = make_adam({"pictures": pictures, "points": points}, (0.9, 0.999))
+        self.step = 0
+        self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step, a function of the seed and the step."""
+        rng = np.random.default_rng([self.seed, step])
+        views = int(rng.integers(2, min(self.settings.most_views, self.data.views) + 1))
+        return self.data.draw(max(1, self.settings.views // views), views, self.network.config.ticks, rng)
+
+    def train_step(self) -> StepLosses:
+        """One step."""
+        batch = self._take(self.step)
+        spikes, rate, points, intrinsics, sensitivity, dark = (
+            torch.from_numpy(a).to(self.device, non_blocking=True)
+            for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics, batch.sensitivity, batch.dark)
+        )
+        draws = np.random.default_rng([self.seed, self.step, 1])
+        known = draws.random() >= self.settings.unknown_share
+        sensors = Sensors(sensitivity, dark) if draws.random() >= self.settings.raw_share else None
+        kind = device_type(self.device)
+        with torch.random.fork_rng(devices=[]), torch.autocast(kind, torch.bfloat16, enabled=kind == "cuda"):
+            torch.manual_seed(int(draws.integers(1 << 62)))  # the numbers of the views
+            found = self.network(spikes, intrinsics if known else None, sensors)
+        image_l1 = image_loss(found.images, rate) / batch.gain
+        of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
+        total = image_l1 + of_points  # their parameters are not the same ones: there is nothing to weigh
+        self.adam.zero_grad(set_to_none=True)
+        total.backward()
+        rates, norms = self.settings.rates(self.step), []
+        for group in self.adam.param_groups:
+            group["lr"] = rates[group["name"]]
+            norms.append(torch.nn.utils.clip_grad_norm_(group["params"], 1.0))
+        if all(norm.isfinite() for norm in norms):  # else it is left out: one bad sample must not undo the network
+            self.adam.step()
+        self.step += 1
+        return StepLosses(total.item(), image_l1.item(), of_points.item())
+
+    def save(self, path: Path, key: str) -> None:
+        """Write everything needed to go on."""
+        save_training(path, self.step, self.network, self.adam, key)
+
+    def resume(self, path: Path, key: str) -> None:
+        """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
+        self.step = resume_training(path, self.network, self.adam, key) or self.step
+
+
+def _ahead(make: Callable[[int], Batch], steps: int) -> Callable[[int], Batch]:
+    """`make` for rising steps, with the next batches made by other threads while the caller works on one."""
+    pool = ThreadPoolExecutor(_PREPARERS)
+    waiting: dict[int, Future[Batch]] = {}
+
+    def take(step: int) -> Batch:
+        for coming in range(step, min(step + 2 * _PREPARERS, steps)):
+            if coming not in waiting:
+                waiting[coming] = pool.submit(make, coming)
+        return waiting.pop(step).result()
+
+    return take
+
+
+def train_msdi(
+    *,
+    data: Path = Path("data/msdi"),
+    out: Path = Path("runs/msdi"),
+    config: str = "small",
+    start: Path | None = None,
+    steps: int = 20_000,
+    views: int = 8,
+    rate: float = PUBLISHED["rate"],
+    device: str = "auto",
+    seed: int = 0,
+) -> int:
+    """Train MSDI on what `make-msdi-data` rendered. A killed run goes on where it was with the same command.
+
+    OUT/msdi-CONFIG.safetensors can be used at any time: set SPIKE4DGS_MSDI to its path. OUT/losses.csv, scores.csv and
+    curves.png show the course, calibration.png what the confidence is worth, README.md is the model card. Shards that
+    were added to DATA since the last start are used from the next start on.
+
+    Args:
+        data: Folder of shards; those of the hidden variants are only scored.
+        out: Folder for everything that is written.
+        config: small, or paper (a GPU's work).
+        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
+        steps: Steps.
+        views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
+        rate: Adam's learning rate after the warm-up, of what makes points.
+        device: auto, cpu or cuda.
+        seed: Seed of the first weights and of all that is drawn.
+    """
+    if config not in CONFIGS:
+        raise problem("--config", f"one of {', '.join(CONFIGS)}", repr(config), "correct the name")
+    if steps < 1 or views < 2 or not rate > 0:
+        found = f"{steps}, {views} and {rate}"
+        raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
+    files = open_folder(data)
+    learned, hidden = ([f for f in files if f.facts.hidden is h] for h in (False, True))
+    if wrong := [f.facts.id for f in learned if f.facts.variant < FIRST_TRAINING_VARIANT]:
+        expected = f"hidden variants and those from {FIRST_TRAINING_VARIANT} up"
+        raise problem(data, expected, ", ".join(wrong), "remove them: they are kept for tests")
+    if not learned:
+        raise problem(data, "shards to train on", "hidden variants only", "make more with `spike4dgs make-msdi-data`")
+    settings = TrainingSettings(steps=steps, views=views, rate=rate, warm_up=min(500, max(1, steps // 10)))
+    training = Training(Bursts(learned), CONFIGS[config], settings, choose_device(device), seed)
+    if start:
+        start_from(training.network, start)
+    key = sha256_json([asdict(settings), config, seed, sha256_file(start) if start else None])
+    size = sum(p.numel() for p in training.network.parameters())
+    print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
+    _Run(training, hidden, key, out).run()
+    return 0
+
+
+def start_from(network: Msdi, path: Path) -> None:
+    """Take the weights of an earlier training, or what a file of Fast3R or DUSt3R has, in place.
+
+    Raises UserError for a damaged file and for the weights of something else.
+    """
+    state = read_state(path, "name a file that train-msdi wrote, or one of Fast3R or DUSt3R")
+    own = network.state_dict()
+    if {n: t.shape for n, t in state.items()} == {n: t.shape for n, t in own.items()}:
+        network.load_state_dict({name: tensor.float() for name, tensor in state.items()})
+    else:
+        transfer(network, state, path)
+
+
+class _Run:
+    """A training with its files."""
+
+    def __init__(self, training: Training, hidden: list[BurstFile], key: str, out: Path) -> None:
+        self.training, self.key, self.out = training, key, out
+        training.resume(self.checkpoint, key)
+        self.seen = _note_data(out / "trained_on.json", training.data.files, fresh=training.step == 0)
+        ticks, most = training.network.config.ticks, training.settings.most_views
+        self.hidden = Bursts(hidden).fixed(_SCORED_BURSTS, most, ticks) if hidden else []
+        self.losses, self.scores = (Curve(out / f"{name}.csv", training.step) for name in ("losses", "scores"))
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file to go on from."""
+        return self.out / "checkpoint.safetensors"
+
+    def run(self) -> None:
+        """Train to the last step, and write everything again at the end."""
+        training, last = self.training, self.training.settings.steps
+        first, start = training.step, time.perf_counter()
+        shown = saved = start
+        recent: list[StepLosses] = []
+        while training.step < last:
+            recent.append(training.train_step())
+            now, step = time.perf_counter(), training.step
+            if now - shown > _LINE_EVERY_S or step == last:
+                shown = now
+                left = (now - start) / (step - first) * (last - step)
+                note = f"L1 {recent[-1].image_l1:.4f}, points {recent[-1].points:.3f}"
+                print(f"step {step}/{last}, {note}, {now - start:.0f} s, about {left:.0f} s left", flush=True)
+            if step % ROW_EVERY and step != last:
+                continue
+            names = ("total", "image_l1", "points")
+            self.losses.add(step, {n: float(np.mean([getattr(r, n) for r in recent])) for n in names})
+            recent = []
+            if step % training.settings.score_every == 0 or step == last:
+                self.export()
+            if now - saved > _SAVE_EVERY_S or step == last:
+                training.save(self.checkpoint, self.key)
+                self.losses.write()
+                saved = time.perf_counter()
+
+    def export(self) -> None:
+        """Score the weights as they are; write them, the curves and the model card."""
+        training = self.training
+        scores = (
+            evaluate(training.network, self.hidden, training.device) if self.hidden else Scores({}, np.ones((1, 2)))
+        )
+        measured = {name: round(value, 4) for name, value in scores.measured.items()}
+        card = Card(training.network.config.name, training.step, training.seed, self.seen, measured)
+        path = self.out / f"msdi-{card.config}.safetensors"
+        digest = save_weights(path, training.network, card)
+        self.scores.add(training.step, scores.measured)
+        self.scores.write()
+        self.losses.write()
+        plot_curves(self.out / "curves.png", self.losses.rows, self.scores.rows)
+        if scores.calibration is not None:
+            plot_calibration(self.out / "calibration.png", scores.calibration)
+        write_text(self.out / "README.md", model_card(card, training.settings, digest))
+        shown = "".join(f", {n} {measured[n]:g}" for n in ("psnr_db", "tfp_psnr_db", "point_error") if n in measured)
+        print(f"step {training.step}, written: {path}{shown}", flush=True)
+
+
+def _note_data(path: Path, files: list[BurstFile], *, fresh: bool) -> tuple[str, ...]:
+    """What is trained on, as ID@SHA256, with what earlier starts of the same training had; kept in a file."""
+    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files}
+    if path.is_file() and not fresh:
+        names |= set(read_json(path, "what was trained on")["shards"])
+    write_json(path, {"shards": sorted(names)})
+    return tuple(sorted(names))

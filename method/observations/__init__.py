@@ -1,0 +1,1 @@
+"""What the training views observe: images over time, points looked up in them, what moves."""

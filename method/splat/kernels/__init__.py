@@ -1,0 +1,1 @@
+"""The CPU kernels of the rasteriser, and how they are compiled and run."""

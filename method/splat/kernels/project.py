@@ -1,0 +1,224 @@
+"""Projection of Gaussians into one view, in float64. Its gradient is in project_gradient.py.
+
+A few Gaussians' arithmetic is cheap beside the pixels', and needles, huge pancakes and worlds whose origin is far away
+lose what float32 has. Blocks of Gaussians are copied into rows of a scratch array (structure of arrays) so that LLVM
+vectorises the arithmetic; constant row offsets let it prove that rows do not overlap.
+
+Symbols: p = (x, y, z) in the camera; J = [[jx, 0, jxz], [0, jy, jyz]]; A = R diag(scales); T = J R_w2c;
+B = T A with rows b0, b1; the blurred 2D covariance is [[xx, xy], [xy, yy]] = B B^T + eps2d I.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
+from spike4dgs.method.splat.kernels.jit import helper, kernel
+from spike4dgs.method.splat.kernels.vector_ir import bits_double, double_bits, fetch_add, float_bits
+from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN
+
+BLOCK = 128  # Gaussians per work item
+CULLED = np.uint32(0xFFFFFFFF)  # depth key of an invisible Gaussian
+ROWS = 22  # rows of the scratch array
+HALF_LOG2E = 0.5 / math.log(2.0)
+
+# Scratch rows: the parameters, then the projection.
+MX, MY, MZ, QW, QX, QY, QZ, SX, SY, SZ, OP = (k * BLOCK for k in range(11))
+CX, CY, SLOPE, HX, HY, XTOP, XIS, ETAS, RATIO, DEPTH, BAD = (k * BLOCK for k in range(11, 22))
+
+
+@helper
+def floor_int(x: float) -> int:
+    """Largest integer <= x (math.floor would be a library call that spills every vector register)."""
+    i = np.int64(x)
+    return i - np.int64(np.float64(i) > x)
+
+
+@helper
+def ceil_int(x: float) -> int:
+    """Smallest integer >= x."""
+    i = np.int64(x)
+    return i + np.int64(np.float64(i) < x)
+
+
+@helper
+def log2(x: float) -> float:
+    """log2 of a positive normal number to 3e-11: atanh series around the nearest power of two."""
+    bits = double_bits(x)
+    # An exponent written into the low mantissa bits of 2^52 becomes a number by subtraction.
+    exponent = bits_double((bits >> 52) | 0x4330000000000000) - 4503599627371519.0
+    m = bits_double((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
+    large = m > 1.4142135623730951
+    m = 0.5 * m if large else m
+    exponent = exponent + 1.0 if large else exponent
+    s = (m - 1.0) / (m + 1.0)
+    s2 = s * s
+    series = 1 / 3 + s2 * (1 / 5 + s2 * (1 / 7 + s2 * (1 / 9 + s2 * (1 / 11))))
+    return exponent + 2.8853900817779268 * s * (1.0 + s2 * series)
+
+
+@helper
+def rotation(w: float, x: float, y: float, z: float) -> Any:
+    """Rotation matrix, row by row, of a quaternion of any length."""
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return (
+        1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+        s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x),
+        s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y),
+    )  # fmt: skip
+
+
+@helper
+def camera_constants(camera: np.ndarray, width: int, height: int) -> Any:
+    """camera [16] = R (9), t (3), fx, fy, cx, cy -> the same as scalars, and the limits of x/z and y/z."""
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    mx, my = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+    limits = (-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my)
+    R = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
+    return R, (camera[9], camera[10], camera[11]), (fx, fy, cx, cy), limits
+
+
+@helper
+def jacobian(f: Any, limits: Any, u: float, v: float, inverse_z: float) -> Any:
+    """jx, jxz, jy, jyz of the projection at the point (u, v) = (x/z, y/z), held inside the limits."""
+    held_u, held_v = min(max(u, limits[0]), limits[1]), min(max(v, limits[2]), limits[3])
+    jx, jy = f[0] * inverse_z, f[1] * inverse_z
+    return jx, -jx * held_u, jy, -jy * held_v
+
+
+@helper
+def half_covariance(R: Any, j: Any, a: Any) -> Any:
+    """T = J R and B = T A, each as two rows of three. a: A row by row."""
+    t0 = (j[0] * R[0] + j[1] * R[6], j[0] * R[1] + j[1] * R[7], j[0] * R[2] + j[1] * R[8])
+    t1 = (j[2] * R[3] + j[3] * R[6], j[2] * R[4] + j[3] * R[7], j[2] * R[5] + j[3] * R[8])
+    b0 = (
+        t0[0] * a[0] + t0[1] * a[3] + t0[2] * a[6],
+        t0[0] * a[1] + t0[1] * a[4] + t0[2] * a[7],
+        t0[0] * a[2] + t0[1] * a[5] + t0[2] * a[8],
+    )
+    b1 = (
+        t1[0] * a[0] + t1[1] * a[3] + t1[2] * a[6],
+        t1[0] * a[1] + t1[1] * a[4] + t1[2] * a[7],
+        t1[0] * a[2] + t1[1] * a[5] + t1[2] * a[8],
+    )
+    return t0, t1, b0, b1
+
+
+@helper
+def dot(a: Any, b: Any) -> float:
+    """a . b of two 3-tuples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@helper
+def cross(a: Any, b: Any) -> Any:
+    """a x b of two 3-tuples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@helper
+def gather_parameters(s: np.ndarray, l: int, i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> None:  # noqa: E741
+    """Copy Gaussian i into lane l."""
+    s[MX + l], s[MY + l], s[MZ + l] = means[i, 0], means[i, 1], means[i, 2]
+    s[QW + l], s[QX + l], s[QY + l], s[QZ + l] = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    s[SX + l], s[SY + l], s[SZ + l], s[OP + l] = scales[i, 0], scales[i, 1], scales[i, 2], opacities[i]
+
+
+@kernel
+def project_forward(
+    means: Any, quats: Any, scales: Any, opacities: Any, camera: Any, width: int, height: int, near: float,
+    eps2d: float, antialiased: bool, records: Any, keys: Any, depths: Any, centers: Any, radii: Any, tiles: Any,
+    histogram: Any, invalid: Any, counter: Any, s: Any,
+) -> None:  # fmt: skip
+    """Project all Gaussians into one view.
+
+    Writes per Gaussian: records [N, 8] (blend_ir.py), keys [N] (depth bits or CULLED), depths [N], centers [N, 2] and
+    radii [N] in px (0 where culled), tiles [N, 4] (first and last + 1 tile in x, in y); per block: histogram
+    [blocks, 1 + tiles] (total and per-tile count of Gaussian-tile pairs), invalid [blocks] (a Gaussian with a
+    parameter that is not finite, or -1).
+    """
+    n_all, across = means.shape[0], (width + TILE_WIDTH - 1) // TILE_WIDTH
+    R, t, f, limits = camera_constants(camera, width, height)
+    while True:
+        block = fetch_add(counter, 0, 1)
+        first = block * BLOCK
+        if first >= n_all:
+            break
+        n = min(BLOCK, n_all - first)
+        for l in range(n):  # noqa: E741
+            gather_parameters(s, l, first + l, means, quats, scales, opacities)
+        for l in range(n, BLOCK):  # noqa: E741
+            gather_parameters(s, l, first, means, quats, scales, opacities)
+        for l in range(BLOCK):  # noqa: E741
+            project_lane(s, l, R, t, f, limits, width, height, near, eps2d, antialiased)
+        histogram[block, :] = 0
+        invalid[block] = -1
+        total = 0
+        for l in range(n):  # noqa: E741
+            i = first + l
+            keys[i], depths[i], radii[i] = CULLED, 0, 0
+            centers[i, 0], centers[i, 1] = 0, 0
+            if s[BAD + l] != 0.0:
+                invalid[block] = i
+            if not s[DEPTH + l] > 0.0:
+                continue
+            x, y, hx, hy = s[CX + l], s[CY + l], s[HX + l], s[HY + l]
+            # Pixel columns and rows whose centres lie within the ellipse's bounding box, clipped to the image.
+            x0, x1 = ceil_int(max(x - hx - 0.5, 0.0)), floor_int(min(x + hx + 0.5, float(width)))
+            y0, y1 = ceil_int(max(y - hy - 0.5, 0.0)), floor_int(min(y + hy + 0.5, float(height)))
+            if x1 <= x0 or y1 <= y0:
+                continue
+            depths[i] = s[DEPTH + l]
+            keys[i] = np.uint32(float_bits(depths[i]))
+            centers[i, 0], centers[i, 1], radii[i] = x, y, max(hx, hy)
+            r = records[i]
+            r[0], r[1], r[2], r[3] = x, y, s[SLOPE + l], hx
+            r[4], r[5], r[6], r[7] = s[XTOP + l], s[XIS + l], s[ETAS + l], s[RATIO + l]
+            tx0, tx1 = x0 // TILE_WIDTH, (x1 - 1) // TILE_WIDTH + 1
+            ty0, ty1 = y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1
+            tiles[i, 0], tiles[i, 1], tiles[i, 2], tiles[i, 3] = tx0, tx1, ty0, ty1
+            total += (tx1 - tx0) * (ty1 - ty0)
+            for ty in range(ty0, ty1):
+                for tx in range(tx0, tx1):
+                    histogram[block, 1 + ty * across + tx] += 1
+        histogram[block, 0] = total
+
+
+@helper
+def project_lane(
+    s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, width: int, height: int, near: float, eps2d: float,  # noqa: E741
+    antialiased: bool,
+) -> None:  # fmt: skip
+    """Project one lane; DEPTH becomes -1 for what cannot be seen."""
+    mx, my, mz, o = s[MX + l], s[MY + l], s[MZ + l], s[OP + l]
+    qw, qx, qy, qz = s[QW + l], s[QX + l], s[QY + l], s[QZ + l]
+    sx, sy, sz = s[SX + l], s[SY + l], s[SZ + l]
+    everything = mx + my + mz + qw + qx + qy + qz + sx + sy + sz + o
+    s[BAD + l] = 0.0 if everything - everything == 0.0 else 1.0
+    x, y = R[0] * mx + R[1] * my + R[2] * mz + t[0], R[3] * mx + R[4] * my + R[5] * mz + t[1]
+    z = R[6] * mx + R[7] * my + R[8] * mz + t[2]
+    inverse_z = 1.0 / max(z, near)
+    u, v = x * inverse_z, y * inverse_z
+    q = rotation(qw, qx, qy, qz)
+    a = (q[0] * sx, q[1] * sy, q[2] * sz, q[3] * sx, q[4] * sy, q[5] * sz, q[6] * sx, q[7] * sy, q[8] * sz)
+    _, _, b0, b1 = half_covariance(R, jacobian(f, limits, u, v, inverse_z), a)
+    g = cross(b0, b1)
+    det_sharp = dot(g, g)  # = |B B^T| by Cauchy-Binet; xx yy - xy^2 would cancel for needles
+    xx, xy, yy = dot(b0, b0), dot(b0, b1), dot(b1, b1)
+    det = det_sharp + eps2d * (xx + yy) + eps2d * eps2d
+    xx, yy = xx + eps2d, yy + eps2d
+    o = o * math.sqrt(det_sharp / det) if antialiased else o
+    reach = max(log2(255.0 * max(o, ALPHA_MIN)), 0.0)  # xi^2 + eta^2 where alpha = 1/255
+    half_width, half_height = math.sqrt(reach / HALF_LOG2E * xx), math.sqrt(reach / HALF_LOG2E * yy)
+    cx, cy = f[0] * u + f[2], f[1] * v + f[3]
+    across = (cx + half_width >= 0.5) & (cx - half_width <= width - 0.5)
+    down = (cy + half_height >= 0.5) & (cy - half_height <= height - 0.5)
+    drawable = (o >= ALPHA_MIN) & (det > 0.0) & (det < math.inf) & (qw * qw + qx * qx + qy * qy + qz * qz > 0.0)
+    s[DEPTH + l] = z if (z >= near) & drawable & across & down else -1.0
+    s[CX + l], s[CY + l], s[SLOPE + l] = cx, cy, xy / xx
+    s[HX + l], s[HY + l], s[XTOP + l] = half_width, half_height, xy / yy * half_height
+    s[XIS + l], s[ETAS + l] = math.sqrt(HALF_LOG2E / xx), math.sqrt(HALF_LOG2E * xx / det)
+    s[RATIO + l] = math.sqrt(det) / xx

@@ -1,0 +1,103 @@
+"""Which Gaussians lie in which tile, nearest first: offsets from block histograms, filling, and a radix sort."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.method.splat.kernels.jit import helper, kernel
+from spike4dgs.method.splat.kernels.project import BLOCK, CULLED
+from spike4dgs.method.splat.kernels.vector_ir import fetch_add
+
+
+@kernel
+def tile_offsets(histogram: Any, offsets: Any) -> int:
+    """Turn the counts of `project_forward` into write positions, in place; returns the number of pairs.
+
+    histogram [blocks, 1 + tiles]: afterwards column 0 is each block's first pair (in Gaussian order), the others its
+    first place in each tile's list; offsets [tiles + 1] bound the tiles' lists.
+    """
+    blocks, tiles = histogram.shape[0], offsets.shape[0] - 1
+    total = 0
+    for b in range(blocks):
+        count = histogram[b, 0]
+        histogram[b, 0] = total
+        total += count
+    place = 0
+    for tile in range(tiles):
+        offsets[tile] = place
+        for b in range(blocks):
+            count = histogram[b, 1 + tile]
+            histogram[b, 1 + tile] = place
+            place += count
+    offsets[tiles] = place
+    return place
+
+
+@kernel
+def fill_tiles(keys: Any, tiles: Any, across: int, histogram: Any, slots: Any, pairs: Any, counter: Any) -> None:
+    """Write each visible Gaussian into its tiles' lists, in index order: pairs [P] uint64 = depth bits << 32 | index.
+
+    slots [N + 1]: Gaussian i owns the gradient records slots[i]:slots[i + 1], one per tile it touches.
+    """
+    n, blocks = keys.shape[0], histogram.shape[0]
+    while True:
+        block = fetch_add(counter, 0, 1)
+        if block >= blocks:
+            break
+        slot = histogram[block, 0]
+        for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
+            slots[i] = slot
+            if keys[i] == CULLED:
+                continue
+            pair = (np.uint64(keys[i]) << np.uint64(32)) | np.uint64(i)
+            slot += (tiles[i, 1] - tiles[i, 0]) * (tiles[i, 3] - tiles[i, 2])
+            for ty in range(tiles[i, 2], tiles[i, 3]):
+                for tx in range(tiles[i, 0], tiles[i, 1]):
+                    column = 1 + ty * across + tx
+                    pairs[histogram[block, column]] = pair
+                    histogram[block, column] += 1
+        if block == blocks - 1:
+            slots[n] = slot
+
+
+@helper
+def sort_tile(pairs: Any, spare: Any, order: Any, begin: int, count: int, digits: Any) -> None:
+    """Stable radix sort of pairs[begin:begin + count] by depth, 8 bits at a time; order gets the indices.
+
+    digits [1024] and spare [count] are scratch. A digit that all share, such as the exponent's, is skipped.
+    """
+    if count == 0:
+        return
+    digits[:] = 0
+    for i in range(begin, begin + count):
+        k = np.uint32(pairs[i] >> np.uint64(32))
+        digits[k & 255] += 1
+        digits[256 + ((k >> 8) & 255)] += 1
+        digits[512 + ((k >> 16) & 255)] += 1
+        digits[768 + (k >> 24)] += 1
+    some_key = np.uint32(pairs[begin] >> np.uint64(32))
+    in_spare = False
+    for digit in range(4):
+        base, shift = 256 * digit, np.uint64(32 + 8 * digit)
+        if digits[base + ((some_key >> np.uint32(8 * digit)) & 255)] == count:
+            continue
+        place = np.int32(0)
+        for value in range(base, base + 256):
+            here = digits[value]
+            digits[value] = place
+            place += here
+        for i in range(count):
+            pair = spare[i] if in_spare else pairs[begin + i]
+            bucket = base + np.int64((pair >> shift) & np.uint64(255))
+            target = digits[bucket]
+            digits[bucket] = target + 1
+            if in_spare:
+                pairs[begin + target] = pair
+            else:
+                spare[target] = pair
+        in_spare = not in_spare
+    for i in range(count):
+        pair = spare[i] if in_spare else pairs[begin + i]
+        order[begin + i] = np.int32(pair & np.uint64(0xFFFFFFFF))

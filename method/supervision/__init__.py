@@ -1,0 +1,1 @@
+"""The supervision part of a recipe: what is compared with what."""

@@ -1,0 +1,37 @@
+"""The supervision `spike`: SpikeNeRF's spike loss, on pictures rendered from Gaussians.
+
+What is public. Spike4DGS's Table 4 compares "pixel loss in vanilla 4DGS, spike loss in SpikeNeRF, and the combination
+of the above" with its own, and does not write the spike loss down. SpikeNeRF's code does: the rendered intensity passes
+a sensor model with per-pixel maps and an integrate-and-fire neuron of 256 steps; the mean of its spikes is compared
+with the recorded mean spikes around the instant, by the mean of the squared difference after the exponent 1/2.2.
+
+What is our reading. The same neuron and loss as in Dy-SpikeNeRF (`radiance_field.spiking`: subtractive reset, random
+charge at the start); the sensor model is `SpikeCameras`; the recorded window has `spike_ticks` ticks, as many as TFP's.
+The combination is the plain sum with the supervision `pixel`.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.supervision.base import Render, Sample, Supervision
+from spike4dgs.method.supervision.spike_cameras import SpikeCameras, random_charge, recorded
+from spike4dgs.method.supervision.spike_neuron import firing_rate, spike_loss
+
+
+class SpikeRate(Supervision):
+    """Mean squared difference of simulated and recorded mean spikes per tick, after the published gamma."""
+
+    def __init__(self, settings: TrainSettings, scene: TrainingScene) -> None:
+        super().__init__()
+        self.settings, self.scene, self.cameras = settings, scene, SpikeCameras(scene)
+
+    def forward(self, render: Render, sample: Sample) -> Tensor:
+        """The loss of one rendered sample."""
+        s = self.settings
+        counts, ticks = recorded(self.scene, sample, s.spike_ticks)
+        current = self.cameras.rate(render(sample.t), sample.views)
+        rate = firing_rate(current, random_charge(current, sample.step), s.neuron_ticks)
+        return spike_loss(rate, counts.to(rate) / ticks)

@@ -1,0 +1,135 @@
+"""Gaussians with a place, a rotation and a colour at each of some times: what tracking gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spike4dgs.benchmark.results.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.fitted_model import count_bytes
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.splat import Splats, Views, render
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """What changes, at T times."""
+
+    times_us: Tensor  # [T] float64, ascending
+    free: Tensor  # [M] which Gaussians move
+    rows: Tensor  # [R] which change their colour
+    means: Tensor  # [T, M, 3] m
+    quats: Tensor  # [T, M, 4] unit quaternions
+    colors: Tensor  # [T, R, 1]
+
+    @classmethod
+    def start(cls, gaussians: Gaussians, free: Tensor, rows: Tensor, ticks: tuple[int, ...], rate_hz: float) -> Tracks:
+        """Tracks on which all times are as the Gaussians are, until `put` says otherwise."""
+        times = torch.tensor(ticks, dtype=torch.float64) * (1e6 / rate_hz)
+        quats = torch.nn.functional.normalize(gaussians.quats[free], dim=-1)
+        values = (gaussians.means[free], quats, gaussians.colors[rows])
+        return cls(times, free, rows, *(v.repeat(len(ticks), 1, 1) for v in values))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is found by tracking, by name."""
+        return {"means": self.means, "quats": self.quats, "colors": self.colors}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Take over what `tensors` gave."""
+        for name, value in self.tensors().items():
+            value.copy_(tensors[name])
+
+    def at(self, index: int) -> dict[str, Tensor]:
+        """Values at one of the times."""
+        return {name: value[index] for name, value in self.tensors().items()}
+
+    def put(self, index: int, values: dict[str, Tensor]) -> None:
+        """Set the values at one of the times."""
+        self.means[index], self.colors[index] = values["means"], values["colors"]
+        self.quats[index] = torch.nn.functional.normalize(values["quats"], dim=-1)
+
+    def between(self, t_us: float) -> dict[str, Tensor]:
+        """Values at any time: places and rotations linearly between the times and beyond them, colours between them.
+
+        Two times are so near to each other that a normalised linear quaternion is the spherical one for all purposes:
+        at 5 degrees a time the angle is wrong by less than 0.001 degrees.
+        """
+        if len(self.times_us) == 1:
+            return self.at(0)
+        j = int(torch.searchsorted(self.times_us, torch.tensor(t_us, dtype=torch.float64)))
+        j = min(max(j, 1), len(self.times_us) - 1)
+        start, stop = self.times_us[j - 1 : j + 1].tolist()
+        w = (t_us - start) / (stop - start)
+        low, high = self.at(j - 1), self.at(j)
+        return {
+            "means": torch.lerp(low["means"], high["means"], w),
+            "quats": torch.lerp(low["quats"], high["quats"], w),
+            "colors": torch.lerp(low["colors"], high["colors"], min(max(w, 0.0), 1.0)),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedModel:
+    """The Gaussians of the first time and their tracks."""
+
+    KIND: ClassVar = "tracking"
+
+    gaussians: Gaussians
+    tracks: Tracks
+    duration_us: float
+
+    @property
+    def device(self) -> str:
+        """Where the model lies."""
+        return str(self.gaussians.means.device)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the Gaussians and of the tracks."""
+        return count_bytes([*self.gaussians.tensors().values(), *self.tracks.tensors().values()])
+
+    def at(self, t_us: float) -> Gaussians:
+        """The Gaussians at a time of the clip; times outside of it take its ends."""
+        values = self.tracks.between(min(max(t_us, 0.0), self.duration_us))
+        g = self.gaussians
+        means, quats, colors = g.means.clone(), g.quats.clone(), g.colors.clone()
+        means[self.tracks.free], quats[self.tracks.free] = values["means"], values["quats"]
+        colors[self.tracks.rows] = values["colors"]
+        return replace(g, means=means, quats=quats, colors=colors)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
+        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        views = Views.from_cameras([camera], device=self.device)
+        image = render(self.splats(t_us), views).image
+        return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+
+    def splats(self, t_us: float) -> Splats:
+        """What is drawn at `t_us`."""
+        return self.at(t_us).splats()
+
+    def picture(self, image: Tensor, views: Views) -> Tensor:
+        """The drawn channel [V, H, W, 1] -> gray radiance [V, H, W]."""
+        return image[..., 0]
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model to one file; see `saved_model.load_model`."""
+        t = self.tracks
+        tracks = {**t.tensors(), "times_us": t.times_us, "free": t.free, "rows": t.rows}
+        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks)
+        write_model(path, ModelFile(self.KIND, {}, tensors, provenance))
+
+    @classmethod
+    def from_file(cls, file: ModelFile, device: str) -> TrackedModel:
+        """What `save` wrote. Raises KeyError or TypeError for another version's."""
+        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
+        tracks = {k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()}
+        return cls(gaussians, Tracks(**tracks), file.provenance.duration_us)

@@ -1,0 +1,136 @@
+"""TFSTP against its published equations in 50 digits, at rest, at the clip's ends, and against the light."""
+
+from __future__ import annotations
+
+from decimal import Decimal, localcontext
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.baselines.spike_to_image.tfi import tfi_image
+from spike4dgs.baselines.spike_to_image.tfp import tfp_image
+from spike4dgs.baselines.spike_to_image.tfstp import MEMORY_TICKS, tfstp_image
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+
+U0 = f = Decimal("0.15")
+D, F = Decimal(1), Decimal(10)
+
+
+def update(R: Decimal, u: Decimal, d: int) -> tuple[Decimal, Decimal]:
+    return (
+        1 - (1 - R * (1 - u)) * (-d / D).exp(),
+        U0 + (u + f * (1 - u) - U0) * (-d / F).exp(),
+    )
+
+
+def slow_rate(fired: list[int], n: int, tick: int) -> float:
+    """One pixel, from the published equations: the whole history, and both inversions as they are printed."""
+    before, after = [t for t in fired if t < tick], [t for t in fired if t >= tick]
+    if len(fired) < 2:
+        return len(fired) / n
+    if not before:
+        return 1 / max(after[1] - after[0], after[0] + 1)
+    gaps = list(np.diff(before))
+    if after:
+        gaps.append(after[0] - before[-1])
+    elif n - before[-1] >= gaps[-1]:
+        gaps.append(n - before[-1])
+    with localcontext() as context:
+        context.prec = 20 + int(max(gaps)) // 2  # 1 - R is exp(-d): long intervals need as many digits
+        R, u = Decimal(1), U0
+        for _ in range(160 // int(gaps[0]) + 4):  # until the first interval is at rest
+            R, u = update(R, u, int(gaps[0]))
+        for gap in gaps[1:]:
+            R, u = update(R, u, int(gap))
+        d_r = -D * ((1 - R) / (1 - R * (1 - u))).ln()
+        d_u = -F * ((u - U0) / (f - U0 + u * (1 - f))).ln()
+        return float((1 / d_r + 1 / d_u) / 2)
+
+
+def stream_of(spikes: np.ndarray, bottom_up: bool = True) -> SpikeStream:
+    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20000.0, bottom_up)
+
+
+def one_row(n: int, *pixels: Any) -> SpikeStream:
+    """A clip of `n` ticks of one row, whose pixels fire at the given ticks."""
+    spikes = np.zeros((n, 1, len(pixels)), np.uint8)
+    for x, ticks in enumerate(pixels):
+        spikes[list(ticks), 0, x] = 1
+    return stream_of(spikes)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 60), st.integers(1, 3), st.integers(1, 5), st.booleans(), st.integers(0, 99))
+def test_images_equal_the_published_equations(n: int, height: int, width: int, bottom_up: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rate = rng.choice([0, 0.03, 0.1, 0.4, 0.9, 1], (height, width))
+    spikes = (rng.random((n, height, width)) < rate).astype(np.uint8)
+    for tick in {0, n // 3, n - 1}:
+        image = tfstp_image(stream_of(spikes, bottom_up), tick)
+        assert image.dtype == np.float32 and image.shape == (height, width)
+        expected = [slow_rate(list(np.flatnonzero(s)), n, tick) for s in spikes.reshape(n, -1).T]
+        np.testing.assert_allclose(image.ravel(), expected, rtol=1e-6)
+
+
+def test_forgetting_what_is_older_than_the_memory_changes_little() -> None:
+    """Bright, then dark, just before the memory begins, and the other way round: the worst cases; then random ones."""
+    n, rng = 400, np.random.default_rng(3)
+    pixels = [
+        [*range(0, start, first), *range(start, n, second)]
+        for start in (200, 260, 300 - MEMORY_TICKS, 300 - MEMORY_TICKS - 1)
+        for first, second in ((1, 40), (1, 119), (1, 121), (40, 1), (3, 60), (90, 7))
+    ]
+    pixels += [list(np.flatnonzero(rng.random(n) < p)) for p in (0.01, 0.02, 0.05, 0.3, 0.8)]
+    image = tfstp_image(one_row(n, *pixels), 300)[0]
+    np.testing.assert_allclose(image, [slow_rate(p, n, 300) for p in pixels], rtol=1e-4)
+
+
+@pytest.mark.parametrize("interval", [1, 2, 3, 7, 20, 90, 700])
+def test_a_constant_interval_gives_exactly_its_rate(interval: int) -> None:
+    n = 3 * interval + 5
+    fired = range(interval // 2, n, interval)
+    stream = one_row(n, fired)
+    for tick in {0, 1, n // 2, n - 1}:
+        np.testing.assert_allclose(tfstp_image(stream, tick), 1 / interval, rtol=1e-7)
+
+
+def test_sparse_pixels_at_the_ends_of_the_clip() -> None:
+    """What has no memory is TFI: no spike, one spike, and all that lies before the second one."""
+    stream = one_row(20, [], [0], [19], [7], [0, 19], [0, 4], [15, 19], [3, 5])
+    for tick, same in ((0, 8), (4, 8), (5, 5)):
+        np.testing.assert_allclose(tfstp_image(stream, tick)[0, :same], tfi_image(stream, tick)[0, :same], rtol=1e-6)
+    assert tfstp_image(stream, 19)[0, 4] == pytest.approx(1 / 19)
+    assert 1 / 16 < tfstp_image(stream, 19)[0, 5] < 1 / 4, "dark since tick 4, but remembered"
+
+
+@pytest.mark.parametrize("radiance", [0.02, 0.11, 0.3, 0.77, 1.0])
+def test_constant_light_is_recovered_with_less_flicker_than_from_intervals(radiance: float) -> None:
+    """Ideal integrate-and-fire pixels of all phases, gain 0.6; also at the first and last ticks."""
+    phase = (np.arange(2000).reshape(40, 50) + 0.5) / 2000
+    charge = phase + 0.6 * radiance * np.arange(301)[:, None, None]
+    stream = stream_of(np.diff(np.floor(charge), axis=0).astype(np.uint8))
+    images = IMAGES["tfstp"](stream, [0, 1, 150, 298, 299], gain=0.6)
+    assert images.shape == (5, 40, 50) and images.dtype == np.float32
+    np.testing.assert_allclose(images.mean(axis=(1, 2)), radiance, rtol=0.03)
+    assert images[2].std() <= IMAGES["tfi"](stream, [150], gain=0.6)[0].std() * (1 + 1e-6)
+
+
+def test_it_lags_behind_a_change_of_light_and_arrives() -> None:
+    """The memory is about F = 10 ticks: after the light halves, the rate falls from above, and is there in 60 ticks."""
+    stream = one_row(200, [*range(0, 100, 2), *range(100, 200, 4)])
+    rates = np.array([tfstp_image(stream, t)[0, 0] for t in range(90, 180, 4)])
+    assert rates[0] == pytest.approx(0.5) and 0.27 < rates[3] < 0.5
+    assert (np.diff(rates[3:]) <= 1e-7).all() and rates[-1] == pytest.approx(0.25, rel=1e-3)
+
+
+def test_on_steady_noise_free_light_it_stands_between_intervals_and_counts() -> None:
+    """Errors of a picture of many grays: below TFI's. A window of 40 ticks beats both where nothing moves."""
+    light = np.random.default_rng(0).uniform(0.03, 0.6, (30, 40))
+    charge = np.random.default_rng(1).random((30, 40)) + light * np.arange(301)[:, None, None]
+    stream = stream_of(np.diff(np.floor(charge), axis=0).astype(np.uint8))
+    tfp, tfstp, tfi = (np.sqrt(np.mean((m(stream, 150) - light) ** 2)) for m in (tfp_image, tfstp_image, tfi_image))
+    assert tfp < tfstp < 0.75 * tfi

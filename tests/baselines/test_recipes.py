@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS, POSED, RECIPES, SPIKE4DGS, SUPERVISED
+from spike4dgs.baselines.spike_to_image.tfp import tfp_image
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Budget, Recipe, find_methods, get_method
+from spike4dgs.benchmark.reports.paper_tables import published
+from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
+from spike4dgs.method.fit import RecipeMethod
+
+TINY = Budget(scale=0.01)
+# One of each kind of fit that needs nothing that a user brings, and no features in the pictures.
+FITTED = [
+    "nearest-view",
+    "tfp+static",
+    "tfi+4dgs",
+    "tfp+stg",
+    "tfp+d3dgs",
+    "dy-spikegs",
+    "dy-spikenerf",
+    "tfp+4dgs+spss",
+    "spike4dgs",
+    "spike4dgs-x",
+]
+
+
+def quiet(done: int, total: int, note: str = "") -> None:
+    """A progress that nobody watches."""
+
+
+@pytest.fixture
+def scene(small_scene: Path) -> Scene:
+    return open_scene(small_scene)
+
+
+def test_every_row_of_the_papers_tables_is_a_method() -> None:
+    assert all(method.name == name for name, method in METHODS.items())
+    main = {recipe.name for recipe in RECIPES} - {"tfp+static"} | {"spike4dgs", "spike4dgs-x"}
+    for number in (1, 2):
+        assert set(published(number).rows) == main
+        assert set(published(number, "uncalibrated").rows) <= {recipe.name for recipe in POSED}
+    for number in (3, 4, 5, 7):
+        assert set(published(number).rows) <= set(METHODS)
+
+
+@pytest.mark.parametrize("recipe", [*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED, *POSED], ids=lambda r: r.name)
+def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
+    motions = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane", "static": "static"}
+    if recipe.name.startswith(("dy-", "spike4dgs")):
+        assert recipe.name.endswith("+colmap") == recipe.initialization.startswith("colmap")
+    else:
+        images, *middle = recipe.name.split("+")
+        at = next(i for i, part in enumerate(middle) if part in motions)
+        assert (recipe.images, recipe.motion) == (images, motions[middle[at]])
+        assert recipe.initialization == ("+".join(middle[:at]) or ("msdi" if images == "msdi" else "rig"))
+        assert recipe.supervision == ("+".join(middle[at + 1 :]) or "pixel")
+    assert (recipe.initialization not in ("rig", "rig-flat", "msdi")) == (recipe in POSED)
+    assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
+    assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
+
+
+def test_the_entry_point_finds_them() -> None:
+    found = find_methods()
+    assert all(found[name] is METHODS[name] for name in METHODS)
+    assert get_method("tfp+static") is METHODS["tfp+static"]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_params_survive_json(name: str) -> None:
+    params = METHODS[name].params
+    assert json.loads(json.dumps(params, allow_nan=False)) == params
+    assert params["name"] == name
+
+
+def test_params_tell_recipes_and_settings_apart() -> None:
+    texts = {json.dumps(m.params, sort_keys=True) for m in METHODS.values()}
+    changed = RecipeMethod(dataclasses.replace(METHODS["tfi+4dgs"].recipe, settings={"levels": 1}), PARTS)
+    texts.add(json.dumps(changed.params, sort_keys=True))
+    assert len(texts) == len(METHODS) + 1
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
+    reports: list[tuple[int, int]] = []
+    model = METHODS[name].fit(
+        scene.training, TINY, "cpu", 0, lambda done, total, note="": reports.append((done, total))
+    )
+    target = scene.targets[1]
+    camera = scene.cameras[target.camera]
+    image = model.render(camera, scene.t_us(target.tick))
+    assert image.shape == (camera.height, camera.width) and image.dtype == np.float32
+    assert np.isfinite(image).all() and image.min() >= 0
+    assert abs(image.mean() - scene.ground_truth(target).mean()) < 0.15
+    assert reports[-1][0] == reports[-1][1] and all(0 <= done <= total for done, total in reports)
+    for t_us in (-5.0, 0.0, scene.training.duration_us, 1e9):  # the clip's ends and beyond
+        assert np.isfinite(model.render(camera, t_us)).all()
+
+
+def test_nearest_view_is_the_nearest_training_cameras_tfp(scene: Scene) -> None:
+    model = METHODS["nearest-view"].fit(scene.training, TINY, "cpu", 0, quiet)
+    for tick in (0, 20, 60, scene.n_ticks - 1):
+        # The cameras stand in a row and cam_03 is held out, next to cam_02.
+        expected = tfp_image(scene.stream("cam_02"), tick) / scene.radiance_gain
+        np.testing.assert_allclose(model.render(scene.cameras["cam_03"], scene.t_us(tick)), expected, rtol=1e-6)
+    own = model.render(scene.cameras["cam_00"], scene.t_us(40))
+    np.testing.assert_allclose(own, tfp_image(scene.stream("cam_00"), 40) / scene.radiance_gain, rtol=1e-6)
+
+
+def test_nearest_view_does_not_depend_on_the_order_of_far_cameras(scene: Scene) -> None:
+    training = scene.training
+    order = [2, 0, 1]
+    mixed = dataclasses.replace(
+        training, cameras=tuple(training.cameras[i] for i in order), streams=tuple(training.streams[i] for i in order)
+    )
+    pictures = [
+        METHODS["nearest-view"].fit(s, TINY, "cpu", 0, quiet).render(scene.cameras["cam_03"], 2000.0)
+        for s in (training, mixed)
+    ]
+    np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize("part", ["images", "initialization", "motion", "supervision"])
+def test_an_unknown_part_is_named(part: str, scene: Scene) -> None:
+    parts: dict[str, Any] = {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"}
+    method = RecipeMethod(Recipe("mine", **{**parts, part: "nothing"}), PARTS)
+    with pytest.raises(UserError, match=f"recipe mine: expected {part} among .*found 'nothing'"):
+        method.fit(scene.training, TINY, "cpu", 0, quiet)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [({"levle": 2}, "'levle'"), ({"levels": 2.5}, "2.5"), ({"ramp": "0.5"}, "'0.5'"), ({"levels": True}, "True")],
+)
+def test_an_unknown_or_mistyped_setting_is_named(overrides: dict[str, Any], found: str) -> None:
+    recipe = Recipe("mine", "tfp", "rig", "static", "pixel", settings=overrides)
+    with pytest.raises(UserError, match=f"recipe mine: expected .*found {found}"):
+        RecipeMethod(recipe, PARTS)
+
+
+def test_a_device_that_is_not_there_is_a_user_error(scene: Scene) -> None:
+    with pytest.raises(UserError, match="device: expected cpu, or a CUDA device.*--device cpu"):
+        METHODS["tfp+static"].fit(scene.training, TINY, "cuda:99", 0, quiet)
+
+
+def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path) -> None:
+    method, path = METHODS["tfp+static"], tmp_path / "fit.safetensors"
+    camera = scene.cameras["cam_03"]
+
+    def fit(training: TrainingScene = scene.training, budget: Budget = TINY, seed: int = 0) -> np.ndarray:
+        return method.fit(training, budget, "cpu", seed, quiet, path).render(camera, 2000.0)
+
+    first = fit()
+    np.testing.assert_array_equal(fit(), first)
+    foreign: list[dict[str, Any]] = [
+        {"seed": 1},
+        {"budget": Budget(0.02)},
+        {"training": dataclasses.replace(scene.training, revision="0" * 64)},
+    ]
+    for other in foreign:
+        with pytest.raises(UserError, match="fit.safetensors: expected a checkpoint of this scene, recipe"):
+            fit(**other)
+
+
+def test_recipes_that_are_compared_differ_in_one_part() -> None:
+    recipes = {r.name: r.as_dict() for r in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED, *POSED)}
+
+    def differ(a: str, b: str) -> set[str]:
+        return {k for k in recipes[a] if recipes[a][k] != recipes[b][k]} - {"name"}
+
+    for motion in ("d3dgs", "stg", "4dgs"):
+        assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"}
+        # Spk2ImgNet's pictures take time, so a quick fit has fewer of them, and 4DGS fewer steps.
+        assert differ(f"tfi+{motion}", f"spk2img+{motion}") == {"images"} | (
+            {"settings"} if motion != "d3dgs" else set()
+        )
+    for images in ("tfi", "tfp"):
+        assert differ(f"{images}+d3dgs", f"{images}+4dgs") == {"motion"} == differ(f"{images}+stg", f"{images}+4dgs")
+    for name in ("dy-spikegs", *(r.name for r in SUPERVISED)):
+        assert differ("tfp+4dgs", name) == {"supervision"}
+    for start in ("colmap", "dust3r"):
+        assert differ(f"tfi+{start}+4dgs", f"tfi+{start}+4dgs+spss") == {"supervision"}
+        assert differ("tfi+4dgs", f"tfi+{start}+4dgs") == {"initialization"}
+    for name in published(1, "uncalibrated").rows:
+        assert differ(name.replace("+colmap", "").replace("-uncalibrated", ""), name) == {"initialization"}
+    assert differ("tfp+4dgs", "tfp+dust3r+4dgs") == {"initialization"}
+    assert differ("tfp+4dgs", "tfp+static") == {"motion", "settings"}
+    static, moving = (METHODS[name].settings for name in ("tfp+static", "tfp+4dgs"))
+    assert static.coarse_steps == moving.coarse_steps + moving.fine_steps, "the floor has as many steps"

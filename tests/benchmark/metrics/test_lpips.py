@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from reference_networks import published_networks
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics import lpips as module
+from spike4dgs.benchmark.metrics.lpips import TRUNKS, empty_trunk, lpips, make_network
+from spike4dgs.benchmark.weights import VARIABLE, WeightFile
+
+NETS = ("alex", "vgg", "squeeze")
+
+
+def picture(seed: int, height: int = 48, width: int = 64) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_equals_the_published_package_on_its_random_trunks(net: str, published: dict[str, NDArray]) -> None:
+    state = {k: torch.from_numpy(v) for k, v in published.items() if k.startswith(f"{net}/features.")}
+    trunk = empty_trunk(net)
+    trunk.load_state_dict({k.removeprefix(f"{net}/features."): v for k, v in state.items()})
+    found = make_network(net, trunk).distance(published["a"], published["b"])
+    assert found == pytest.approx(float(published[f"{net}/value"][0]), abs=1e-6)
+    assert found > 1e-3, "the comparison means something"
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_the_heads_are_those_of_the_published_package(net: str, published: dict[str, NDArray]) -> None:
+    heads = make_network(net, empty_trunk(net)).weights
+    assert len(heads) == sum(k.startswith(f"{net}/head.") for k in published)
+    for i, head in enumerate(heads):
+        np.testing.assert_array_equal(head.numpy(), published[f"{net}/head.{i}"])
+
+
+@pytest.fixture(scope="module")
+def published() -> dict[str, NDArray]:
+    return published_networks()
+
+
+def plain_distance(net: str, trunk: torch.nn.Sequential, a: NDArray, b: NDArray) -> float:
+    """The formula with loops over layers and numpy sums in float64."""
+    heads = make_network(net, trunk).weights
+    outputs = []
+    for image in (a, b):
+        channels = [(image / 127.5 - 1 - m) / s for m, s in ((-0.03, 0.458), (-0.088, 0.448), (-0.188, 0.45))]
+        x, found = torch.tensor(np.stack(channels)[None]), []
+        with torch.no_grad():
+            for i, layer in enumerate(trunk.double()):
+                x = layer(x)
+                if i in module._TAPS[net]:
+                    found.append(x[0].numpy())
+        outputs.append(found)
+    trunk.float()
+    total = 0.0
+    for f, g, head in zip(*outputs, heads, strict=True):
+        f, g = (v / (np.sqrt((v**2).sum(0)) + 1e-10) for v in (f, g))
+        total += float((head.numpy().astype(np.float64)[:, None, None] * (f - g) ** 2).sum(0).mean())
+    return total
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_equals_the_formula_in_float64(net: str) -> None:
+    torch.manual_seed(3)
+    trunk = empty_trunk(net).eval()
+    a, b = picture(1), picture(2)
+    expected = plain_distance(net, trunk, a, b)
+    assert make_network(net, trunk).distance(a, b) == pytest.approx(expected, rel=1e-4)
+    assert make_network(net, trunk).distance(a, a) == 0.0
+
+
+@pytest.mark.parametrize(("net", "parameters"), [("alex", 2_469_696), ("vgg", 14_714_688), ("squeeze", 722_496)])
+def test_trunks_have_the_published_number_of_parameters(net: str, parameters: int) -> None:
+    assert sum(p.numel() for p in empty_trunk(net).parameters()) == parameters
+
+
+def test_weights_come_from_the_users_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(4)
+    trunk = empty_trunk("squeeze")
+    state = {f"features.{k}": v for k, v in trunk.state_dict().items()} | {"classifier.1.weight": torch.zeros(2, 2)}
+    path = tmp_path / "trunk.pth"
+    torch.save(state, path)
+    size, sha256 = path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+    monkeypatch.setitem(TRUNKS, "squeeze", WeightFile(path.name, size, sha256, "a test", "nowhere"))
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    a, b = picture(1), picture(2)
+    assert lpips("squeeze", a, b) == make_network("squeeze", trunk).distance(a, b)
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (picture(0), picture(0, 48, 65)),
+        (picture(0) / 255, picture(0)),
+        (picture(0)[..., None], picture(0)[..., None]),
+        (picture(0, 31, 64), picture(0, 31, 64)),
+    ],
+)
+def test_other_images_are_refused(a: NDArray, b: NDArray) -> None:
+    network = make_network("squeeze", empty_trunk("squeeze"))
+    with pytest.raises(UserError, match="LPIPS: expected two 8-bit gray images of one size, at least 32x32, found"):
+        network.distance(a, b)
+
+
+def test_the_smallest_image_suits_all_trunks() -> None:
+    for net in NETS:
+        assert make_network(net, empty_trunk(net)).distance(picture(0, 32, 32), picture(1, 32, 32)) > 0

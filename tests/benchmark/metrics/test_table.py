@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes
+from spike4dgs.benchmark.metrics.measure import measure as measure_pair
+from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, PRIMARY, Images
+
+EVERYWHERE = np.ones((24, 40), bool)
+CHOSEN = select_metrics(("psnr",))  # the metrics of linear images, which need nothing
+
+
+def measure(truth: NDArray, prediction: NDArray, moving: NDArray, gain: float | None, where: str = "x") -> Values:
+    """The values of the linear metrics of one image, after the checks that scoring does."""
+    check_images(truth, prediction, moving, where)
+    return measure_pair(ImagePair(truth, prediction, moving, where), gain, CHOSEN.metrics).values
+
+
+def summary(per_image: dict[str, Values]) -> tuple[Values, dict[str, str]]:
+    return scene_means(per_image), scene_notes(per_image, {}, CHOSEN)
+
+
+def images(seed: int = 0, noise: float = 0.1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    rng = np.random.default_rng(seed)
+    truth = cv2.GaussianBlur(rng.random((24, 40)).astype(np.float32), (5, 5), 1.0)
+    return truth, np.clip(truth + noise * rng.standard_normal(truth.shape), 0, 1).astype(np.float32)
+
+
+def region(seed: int = 1) -> NDArray[np.bool_]:
+    return np.random.default_rng(seed).random((24, 40)) < 0.2
+
+
+def opencv_ssim(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    """SSIM map of Wang et al. (2004), written from the formula with OpenCV's Gaussian filter."""
+    x, y = a.astype(np.float64), b.astype(np.float64)
+
+    def blur(image: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_REFLECT)
+
+    c1, c2 = 0.01**2, 0.03**2
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    return (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(0.1, 20.0), (0.01, 40.0), (-0.1, 20.0), (0.5, 6.0206)])
+def test_psnr_of_a_constant_offset_is_the_closed_form(offset: float, expected: float) -> None:
+    truth = np.full((24, 40), 0.5)
+    values = measure(truth, truth + offset, region(), 1.0, "x")
+    assert values["psnr"] == pytest.approx(expected, abs=1e-4)
+    assert values["psnr_dynamic"] == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_equal_scikit_image_and_opencv(seed: int) -> None:
+    truth, prediction = images(seed)
+    moving = region(seed)
+    values = measure(truth, prediction, moving, 1.0, "x")
+    t, p = truth.astype(np.float64), prediction.astype(np.float64)
+    assert values["psnr"] == pytest.approx(peak_signal_noise_ratio(t, p, data_range=1), abs=1e-9)
+    assert values["psnr"] == pytest.approx(cv2.PSNR(t, p, 1.0), abs=1e-9)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
+    assert values["ssim"] == pytest.approx(structural_similarity(t, p, **options), abs=1e-9)
+    by_hand = opencv_ssim(truth, prediction)
+    assert values["ssim"] == pytest.approx(by_hand[5:-5, 5:-5].mean(), abs=1e-6)
+    assert values["ssim_dynamic"] == pytest.approx(by_hand[moving].mean(), abs=1e-6)
+    assert values["psnr_dynamic"] == pytest.approx(-10 * math.log10(np.mean((t - p)[moving] ** 2)), abs=1e-9)
+
+
+def test_dynamic_metrics_see_only_the_moving_region() -> None:
+    truth, _ = images()
+    moving = np.zeros_like(EVERYWHERE)
+    moving[8:16, 10:30] = True
+    outside = np.where(moving, truth, 1 - truth)
+    values = measure(truth, outside, moving, 1.0, "x")
+    assert values["psnr_dynamic"] == MAX_PSNR_DB
+    assert values["psnr"] is not None and values["psnr"] < 20
+    everywhere = measure(truth, outside, EVERYWHERE, 1.0, "x")
+    assert everywhere["psnr_dynamic"] == pytest.approx(everywhere["psnr"])
+
+
+def test_radiance_is_clipped_to_white_and_black() -> None:
+    truth, prediction = images()
+    bright = np.where(truth > 0.6, 3.0, truth).astype(np.float32)
+    shown = np.where(truth > 0.6, 1.0, prediction).astype(np.float32)
+    negative = np.where(shown < 0.3, -2.0, shown).astype(np.float32)
+    assert measure(bright, shown, EVERYWHERE, 1.0, "x") == measure(np.minimum(bright, 1), shown, EVERYWHERE, 1.0, "x")
+    assert measure(bright, negative, EVERYWHERE, 1.0, "x") == measure(
+        bright, np.maximum(negative, 0), EVERYWHERE, 1.0, "x"
+    )
+
+
+@given(gain=st.floats(0.2, 5), seed=st.integers(0, 3))
+def test_aligned_metrics_do_not_depend_on_exposure(gain: float, seed: int) -> None:
+    truth, prediction = images(seed)
+    reference = measure(truth, prediction, EVERYWHERE, fit_gain([(truth, prediction)]), "x")
+    dimmed = prediction.astype(np.float64) / gain
+    values = measure(truth, dimmed, EVERYWHERE, fit_gain([(truth, dimmed)]), "x")
+    for metric in METRICS.values():
+        if metric.aligned:
+            assert values[metric.id] == pytest.approx(reference[metric.id], abs=1e-6)
+
+
+def test_the_gain_is_the_least_squares_one_over_all_images_of_a_scene() -> None:
+    pairs = [images(seed) for seed in range(3)]
+    dimmed = [(t, (p * 0.4).astype(np.float32)) for t, p in pairs]
+    gain = fit_gain(dimmed)
+    assert gain is not None
+    stacked = np.concatenate([p.ravel() for _, p in dimmed])[:, None].astype(np.float64)
+    expected = np.linalg.lstsq(stacked, np.concatenate([t.ravel() for t, _ in dimmed]).astype(np.float64), rcond=None)
+    assert gain == pytest.approx(expected[0][0], rel=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_predictions_without_a_positive_gain_have_no_aligned_values(value: float) -> None:
+    truth, _ = images()
+    prediction = np.full_like(truth, value)
+    gain = fit_gain([(truth, prediction)])
+    assert gain is None
+    metrics, notes = summary({"cam/000001": measure(truth, prediction, EVERYWHERE, gain, "x")})
+    for m in CHOSEN.metrics:
+        assert (metrics[m.id] is None) == (m.aligned or m.images is Images.LATER)
+        assert (notes.get(m.id) == "no positive gain fits the predictions") == m.aligned
+
+
+def test_scene_values_are_means_of_images_and_never_pooled() -> None:
+    truth = np.full((24, 40), 0.5)
+    per_image = {f"c/{i}": measure(truth, truth + e, EVERYWHERE, 1.0, "x") for i, e in enumerate((0.001, 0.1, 0.3))}
+    expected = np.mean([60.0, 20.0, -20 * math.log10(0.3)])
+    assert scene_means(per_image)["psnr"] == pytest.approx(expected, abs=1e-6)
+    pooled = -10 * math.log10(np.mean([1e-6, 1e-2, 9e-2]))
+    assert abs(pooled - expected) > 10
+
+
+def test_identical_images_are_capped_and_noted() -> None:
+    truth, prediction = images()
+    per_image = {
+        "cam/000001": measure(truth, truth, EVERYWHERE, 1.0, "x"),
+        "cam/000002": measure(truth, prediction, EVERYWHERE, 1.0, "x"),
+    }
+    assert per_image["cam/000001"]["psnr"] == MAX_PSNR_DB == per_image["cam/000001"]["psnr_dynamic"]
+    assert per_image["cam/000001"]["ssim"] == pytest.approx(1)
+    metrics, notes = summary(per_image)
+    assert metrics["psnr"] == pytest.approx((MAX_PSNR_DB + per_image["cam/000002"]["psnr"]) / 2)
+    assert notes["psnr"] == "1 without any error count as 100 dB, the first cam/000001"
+    assert "ssim" not in notes
+
+
+def test_an_image_without_motion_has_no_dynamic_value_and_is_noted() -> None:
+    truth, prediction = images()
+    still = measure(truth, prediction, ~EVERYWHERE, 1.0, "x")
+    assert still["psnr_dynamic"] is None and still["ssim_dynamic_aligned"] is None and still["psnr"] is not None
+    moving = measure(truth, prediction, region(), 1.0, "x")
+    metrics, notes = summary({"a": still, "b": moving})
+    assert metrics["psnr_dynamic"] == moving["psnr_dynamic"]
+    assert notes["psnr_dynamic"] == "mean over the 1 of 2 images that have a moving region"
+    metrics, notes = summary({"a": still})
+    assert metrics["psnr_dynamic"] is None and notes["psnr_dynamic"] == "no image has a moving region"
+
+
+@pytest.mark.parametrize(
+    ("prediction", "moving", "message"),
+    [
+        (np.zeros((24, 39)), EVERYWHERE, "expected a gray image of shape (24, 40), found shape (24, 39)"),
+        (np.zeros((24, 40, 3)), EVERYWHERE, "found shape (24, 40, 3)"),
+        (np.zeros((24, 40), np.uint8), EVERYWHERE, "expected a prediction in floating point, found uint8"),
+        (np.full((24, 40), np.nan), EVERYWHERE, "expected a finite prediction, found 960 pixels that are not"),
+        (np.full((24, 40), np.inf), EVERYWHERE, "expected a finite prediction"),
+        (np.zeros((24, 40)), np.ones((24, 40)), "expected a bool mask"),
+        (np.zeros((24, 40)), np.ones((24, 41), bool), "expected a bool mask"),
+    ],
+)
+def test_bad_images_are_refused(prediction: NDArray, moving: NDArray, message: str) -> None:
+    with pytest.raises(UserError, match="cam_01/000004.exr") as e:
+        measure(np.zeros((24, 40)), prediction, moving, 1.0, "cam_01/000004.exr")
+    assert message in str(e.value)
+
+
+def test_images_below_the_window_are_refused() -> None:
+    small = np.zeros((10, 40))
+    with pytest.raises(UserError, match="at least 11x11 pixels"):
+        measure(small, small, small > 1, 1.0, "x")
+
+
+def test_the_table_describes_every_metric_once() -> None:
+    linear = [
+        f"{metric}{region}{aligned}"
+        for aligned in ("", "_aligned")
+        for region in ("", "_dynamic")
+        for metric in ("psnr", "ssim")
+    ]
+    shown = ["lpips_alex", "lpips_vgg", "lpips_squeeze", "flip", "brisque", "niqe", "metaiqa"]
+    assert list(METRICS) == [*linear, *shown, "temporal_error"]
+    assert [m.id for m in METRICS.values() if m.takes == "srgb8"] == shown
+    assert {m.id for m in METRICS.values() if m.higher_is_better} == {*linear, "metaiqa"}
+    assert PRIMARY in METRICS
+    for m in METRICS.values():
+        assert m.title and m.definition and m.implementation and m.digits > 0 < m.tolerance
+    assert METRICS["psnr"].format(21.987) == "21.99" and METRICS["ssim"].format(None) == "-"

@@ -1,0 +1,107 @@
+"""Where tasks run: the same results in the same order everywhere, and clear errors."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.runs.executors import chunked, executor
+from spike4dgs.generators.audit import errors
+
+
+class Square:
+    """A task that counts its calls, to show that it stays with its worker."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, chunk):
+        self.calls += 1
+        time.sleep(0.02 * (chunk[0] % 3))
+        return [x * x for x in chunk], self.calls, os.getpid()
+
+
+def die(chunk):
+    if chunk[0] == 2:
+        os._exit(3)
+    return chunk
+
+
+def fail(chunk):
+    raise UserError("cam_00: expected light, found none. Switch it on")
+
+
+def test_chunks_are_neighbours():
+    assert chunked(list(range(7)), 3) == [[0, 1, 2], [3, 4, 5], [6]]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_order(workers):
+    chunks = chunked(list(range(20)), 2)
+    with executor(workers) as run:
+        found = list(run(Square(), chunks))
+    assert [x for squares, _, _ in found for x in squares] == [k * k for k in range(20)]
+    processes = {pid for _, _, pid in found}
+    assert (os.getpid() in processes) == (workers == 1) and len(processes) <= workers
+    assert max(calls for _, calls, _ in found) >= 10 / workers  # one task object for each worker
+
+
+def test_a_worker_that_dies_is_one_error():
+    with executor(2) as run, pytest.raises(UserError, match="a worker process.*run the same command again"):
+        list(run(die, [[1], [2], [3]]))
+
+
+def test_errors_of_tasks_come_through():
+    with executor(2) as run, pytest.raises(UserError, match="Switch it on"):
+        list(run(fail, [[1], [2]]))
+
+
+def test_workers_end_with_a_run_that_is_given_up():
+    with executor(2) as run:
+        results = run(Square(), [[k] for k in range(50)])
+        pid = next(results)[2]
+        results.close()
+    for _ in range(100):
+        status = Path(f"/proc/{pid}/status")
+        if not status.exists() or "zombie" in status.read_text():
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("the worker still runs")
+
+
+def test_wrong_arguments_are_one_error():
+    with pytest.raises(UserError, match="--workers"), executor(0):
+        pass
+    with pytest.raises(UserError, match="one of them"), executor(2, "tcp://127.0.0.1:1"):
+        pass
+
+
+def test_a_scheduler_that_does_not_answer_is_one_error():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
+    with pytest.raises(UserError, match=f"--scheduler: expected a dask scheduler at tcp://127.0.0.1:{port}"):
+        with executor(1, f"tcp://127.0.0.1:{port}"):
+            pass
+
+
+def test_audit_errors_against_closed_forms():
+    truth = np.full((10, 10), 0.5, np.float32)
+    image, moving = truth.copy(), np.zeros((10, 10), bool)
+    image[:5] += 0.05
+    moving[:1] = True
+    found = errors(image, truth, moving)
+    assert found["psnr_db"] == pytest.approx(-10 * np.log10(0.05**2 / 2), abs=1e-3)
+    assert found["psnr_db_moving"] == pytest.approx(-20 * np.log10(0.05), abs=1e-3)
+    assert found["mean_percent"] == pytest.approx(5, abs=1e-3) and found["mean_percent_moving"] == pytest.approx(
+        10, abs=1e-3
+    )
+    assert found["mean_absolute"] == pytest.approx(0.025, abs=1e-4)
+    assert "psnr_db_moving" not in errors(image, truth, np.zeros((10, 10), bool))

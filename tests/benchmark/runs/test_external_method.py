@@ -1,0 +1,136 @@
+"""A method of another package is found, fitted, scored and ranked; another program's pictures are scored and ranked."""
+
+from __future__ import annotations
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_scenes import write_small_scene
+from skimage.metrics import peak_signal_noise_ratio
+from toy_world import ToyWorld
+
+from spike4dgs.baselines.recipes import METHODS
+from spike4dgs.benchmark.cli import main
+from spike4dgs.benchmark.method import Budget, find_methods
+from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The example package, built and installed by pip into a folder of its own, which is on the path."""
+    root = tmp_path_factory.mktemp("external")
+    source, target = shutil.copytree(EXAMPLES / "external_method", root / "source"), root / "site"
+    offline = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check", "--quiet")
+    command = [sys.executable, "-m", "pip", "install", *offline, "--target", str(target), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(target))
+        yield target
+    sys.modules.pop("plane_blend", None)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return open_scene(write_small_scene(tmp_path / "scene"))
+
+
+def board(folder: Path) -> dict[str, dict[str, Any]]:
+    """Rows of the only board, by method."""
+    (contest,) = json.loads((folder / "leaderboard.json").read_text())["boards"]
+    return {row["method"]: row for row in contest["rows"]}
+
+
+def predictions_of_the_script(scene: Scene, out: Path) -> Path:
+    script = EXAMPLES / "predictions_only.py"
+    subprocess.run([sys.executable, "-W", "error", str(script), str(scene.root), str(out)], check=True)
+    return out
+
+
+def test_the_method_is_found_through_its_entry_point(installed: Path) -> None:
+    methods = find_methods()
+    assert methods["plane-blend"].name == "plane-blend"
+    assert Path(sys.modules["plane_blend"].__file__ or "").parent == installed
+    assert set(METHODS) <= set(methods), "beside those of this distribution"
+
+
+def test_it_is_fitted_scored_and_ranked_beside_others(installed: Path, scene: Scene, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = [str(scene.root), "--methods", "plane-blend", "nearest-view", "--out", str(out)]
+    assert main(["run-benchmark", *arguments]) == 0
+    record = json.loads((out / "results/plane-blend.json").read_text())
+    assert record["method"]["params"] == {"planes": 24, "half_window_ticks": 20}
+    assert record["method"]["version"] == "0.1.0"
+    assert record["scenes"][scene.id]["status"] == "ok"
+    assert set(record["scenes"][scene.id]["per_image"]) == {t.name for t in scene.targets}
+    rows = board(out / "leaderboard")
+    assert sorted(row["rank"] for row in rows.values()) == [1, 2]
+    assert all(row["label"] == "verified" for row in rows.values())
+    better, worse = sorted(rows.values(), key=lambda row: row["rank"])
+    assert better["mean"]["psnr"] >= worse["mean"]["psnr"]
+
+
+def test_the_example_reconstructs_something(installed: Path) -> None:
+    """Where parallax is large, two pictures warped onto the best plane beat the nearest camera's picture."""
+    world = ToyWorld()
+    values = {}
+    for name in ("plane-blend", "nearest-view"):
+        model = find_methods()[name].fit(world.training, Budget(), "cpu", 0, lambda *_: None)
+        image = model.render(world.held_out, 120 * 50.0)
+        truth = world.look(world.held_out, 0.5)[0]
+        values[name] = peak_signal_noise_ratio(truth, np.clip(image, 0, 1).astype(np.float64), data_range=1)
+    assert values["plane-blend"] > values["nearest-view"] + 1, values
+
+
+def test_the_warp_follows_the_cameras(installed: Path) -> None:
+    """A bright point on the plane is where the target camera sees it, to a tenth of a pixel."""
+    import plane_blend
+
+    world = ToyWorld()
+    source, target = world.cameras[0], world.held_out
+    point = target.unproject(np.array([[40.3, 22.8]]), np.array([3.1]))
+    at = source.project(point)[0][0]
+    y, x = np.mgrid[: source.height, : source.width] + 0.5
+    blob = np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 8).astype(np.float32)
+    seen = plane_blend.warp(blob, source, target, 3.1).astype(np.float64)
+    centre = [(seen * axis).sum() / seen.sum() for axis in (x, y)]
+    np.testing.assert_allclose(centre, [40.3, 22.8], atol=0.1)
+
+
+def test_pictures_of_another_program_are_scored_and_ranked(scene: Scene, tmp_path: Path) -> None:
+    predictions = predictions_of_the_script(scene, tmp_path / "pictures")
+    result, folder = tmp_path / "result.json", tmp_path / "board"
+    assert main(["score", str(predictions), str(scene.root), "--out", str(result)]) == 0
+    files = ["--predictions", str(predictions), "--scenes", str(scene.root)]
+    assert main(["submit", str(result), *files, "--leaderboard", str(folder)]) == 0
+    row = board(folder)["mean-of-cameras"]
+    assert row["rank"] == 1 and row["label"] == "verified" and row["mean"]["psnr"] > 5
+
+
+def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, tmp_path: Path) -> None:
+    predictions = predictions_of_the_script(scene, tmp_path / "pictures")
+    for target in scene.targets:
+        window = (max(0, target.tick - 20), min(scene.n_ticks, target.tick + 20))
+        counts = [scene.stream(camera).counts(*window) for camera in scene.train]
+        expected = np.mean(counts, axis=0) / (window[1] - window[0]) / scene.radiance_gain
+        np.testing.assert_allclose(read_exr(predictions / f"{target.name}.exr"), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["predictions_only.py", "external_method/plane_blend.py"])
+def test_the_examples_import_nothing_of_this_project(name: str) -> None:
+    tree = ast.parse((EXAMPLES / name).read_text())
+    found = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    found |= {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    others = {module.split(".")[0] for module in found} - set(sys.stdlib_module_names)
+    assert others <= {"numpy", "OpenEXR", "cv2"}

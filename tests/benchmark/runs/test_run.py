@@ -1,0 +1,337 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import dummy_methods
+from dummy_methods import CountMethod, FailingMethod, run
+from PIL import Image
+
+from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.runs.cell import FitClock
+from spike4dgs.benchmark.runs.run import run_benchmark
+from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.leaderboard.submit import read_entry
+
+# Also the state of the checkout, which somebody may change while the tests run.
+TIMINGS = ("fit_seconds", "render_fps", "peak_memory_mb", "fitted_with")
+
+
+def without_timings(record: dict[str, Any]) -> dict[str, Any]:
+    cells = {s: {k: v for k, v in c.items() if k not in TIMINGS} for s, c in record["scenes"].items()}
+    return {**record, "scenes": cells, "created": None, "command": None, "harness": None}
+
+
+def prediction_bytes(out: Path) -> dict[str, bytes]:
+    paths = sorted((out / "predictions").rglob("*"))
+    return {p.relative_to(out).as_posix(): p.read_bytes() for p in paths if p.is_file() and p.suffix != ".json"}
+
+
+def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_path: Path) -> None:
+    first, again = CountMethod(), CountMethod()
+    records = run(tmp_path / "out", [small_scene], first)
+    assert first.fits == 1 and records == [json.loads((tmp_path / "out/results/counts.json").read_text())]
+    assert run(tmp_path / "out", [small_scene], again)[0]["scenes"] == records[0]["scenes"]
+    assert again.fits == 0
+    assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
+
+
+@pytest.mark.parametrize(
+    ("params", "settings"),
+    [
+        ({"extra": 1}, {}),
+        ({}, {"seed": 1}),
+        ({}, {"budget": recipes.Budget(0.5)}),
+    ],
+)
+def test_whatever_changes_the_result_changes_the_key(
+    small_scene: Path, tmp_path: Path, params: dict[str, Any], settings: dict[str, Any]
+) -> None:
+    run(tmp_path / "out", [small_scene], CountMethod())
+    changed = CountMethod("counts", **params)
+    run(tmp_path / "out", [small_scene], changed, **settings)
+    assert changed.fits == 1
+
+
+def test_another_revision_of_the_scene_is_another_key(tmp_path: Path) -> None:
+    from small_scenes import write_small_scene
+
+    from spike4dgs.benchmark.scene.manifest import write_manifest
+
+    scene = write_small_scene(tmp_path / "scene")
+    run(tmp_path / "out", [scene], CountMethod())
+    (scene / "README.md").write_text("changed")
+    write_manifest(scene)
+    again = CountMethod()
+    run(tmp_path / "out", [scene], again)
+    assert again.fits == 1
+
+
+def test_damaged_predictions_are_made_again(small_scene: Path, tmp_path: Path) -> None:
+    run(tmp_path / "out", [small_scene], CountMethod())
+    before = prediction_bytes(tmp_path / "out")
+    path = tmp_path / "out/predictions/counts/pattern-0/cam_03/000040.exr"
+    path.write_bytes(path.read_bytes()[:-1] + b"\0")
+    again = CountMethod()
+    run(tmp_path / "out", [small_scene], again)
+    assert again.fits == 1 and prediction_bytes(tmp_path / "out") == before
+
+
+def test_predictions_are_what_the_model_rendered(small_scene: Path, tmp_path: Path) -> None:
+    method = CountMethod()
+    models = []
+    fit = method.fit
+    method.fit = lambda *a, **k: models.append(fit(*a, **k)) or models[-1]  # type: ignore[method-assign]
+    run(tmp_path / "out", [small_scene], method)
+    found = read_exr(tmp_path / "out/predictions/counts/pattern-0/cam_03/000060.exr")
+    assert np.array_equal(found, (models[0].image + 1e-6 * 3000).astype(np.float32).astype(np.float16))
+
+
+def test_a_fit_sees_only_the_training_views(small_scene: Path, tmp_path: Path) -> None:
+    seen: list[TrainingScene] = []
+
+    class Nosy(CountMethod):
+        def fit(self, scene: TrainingScene, *args: Any, **kwargs: Any) -> Any:
+            seen.append(scene)
+            return super().fit(scene, *args, **kwargs)
+
+    run(tmp_path / "out", [small_scene], Nosy())
+    assert type(seen[0]) is TrainingScene
+    assert [c.id for c in seen[0].cameras] == ["cam_00", "cam_01", "cam_02"]
+    assert not any("cam_03" in s.source for s in seen[0].streams)
+
+
+@pytest.mark.parametrize(
+    ("result", "reason"),
+    [
+        (ValueError("no luck"), "ValueError: no luck"),
+        (MemoryError(), "MemoryError"),
+        (UserError("scene: expected light, found none; add some"), "scene: expected light, found none; add some"),
+        (np.zeros((3, 4), np.float32), "expected a floating-point array of shape (24, 40), found float32 (3, 4)"),
+        (np.zeros((24, 40), np.uint8), "found uint8 (24, 40)"),
+        (None, "found NoneType"),
+        (np.full((24, 40), np.nan), "expected finite radiance, found NaN or infinity"),
+        (np.full((24, 40), 1e6), "expected a finite gray image within +-65504"),
+    ],
+)
+def test_one_failure_never_stops_the_rest(small_scene: Path, tmp_path: Path, result: Any, reason: str) -> None:
+    bad, good = run(tmp_path, [small_scene], FailingMethod("bad", result), CountMethod("good"))
+    assert good["scenes"]["pattern-0"]["status"] == "ok" and good["mean"]["psnr"] > 5
+    cell = bad["scenes"]["pattern-0"]
+    assert cell["status"] == "failed" and reason in cell["error"] and bad["mean"]["psnr"] is None
+    log = (tmp_path / "logs/bad__pattern-0.log").read_text()
+    assert "Traceback" in log and type(result).__name__ in log or "UserError" in log
+    assert not (tmp_path / "predictions/bad/pattern-0").exists()
+
+
+def test_a_failed_cell_is_tried_again(small_scene: Path, tmp_path: Path) -> None:
+    run(tmp_path, [small_scene], FailingMethod("counts", ValueError("no luck")))
+    record = run(tmp_path, [small_scene], CountMethod("counts"))[0]
+    assert record["scenes"]["pattern-0"]["status"] == "ok"
+    assert not list((tmp_path / "logs").iterdir())
+
+
+@pytest.mark.parametrize("victim", ["first", "second"])
+def test_a_killed_run_resumes_and_equals_an_uninterrupted_one(small_scene: Path, tmp_path: Path, victim: str) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    expected = run(whole, [small_scene], CountMethod("first"), CountMethod("second"), seed=3)
+    script = Path(dummy_methods.__file__)
+    done = subprocess.run([sys.executable, str(script), str(killed), str(small_scene), victim, "2"])
+    assert done.returncode == -signal.SIGKILL
+    assert not (killed / "predictions" / victim).exists()
+    first, second = CountMethod("first"), CountMethod("second")
+    steps: list[str] = []
+    for method in (first, second):
+        fit = method.fit
+
+        def watched(scene: Any, budget: Any, device: str, seed: int, progress: Any, checkpoint: Any = None, fit=fit):
+            def both(done: int, total: int, note: str = "") -> None:
+                steps.append(note)
+                progress(done, total, note)
+
+            return fit(scene, budget, device, seed, both, checkpoint)
+
+        method.fit = watched  # type: ignore[method-assign]
+    found = run(killed, [small_scene], first, second, seed=3)
+    assert steps[:2] == ["step 2", "step 3"], "the fit goes on where its checkpoint was"
+    assert first.fits == (victim == "first")
+    assert prediction_bytes(killed) == prediction_bytes(whole)
+    assert [without_timings(r) for r in found] == [without_timings(r) for r in expected]
+
+
+def test_the_fit_time_of_a_resumed_fit_is_the_sum_of_its_parts(tmp_path: Path) -> None:
+    path, checkpoint = tmp_path / "clock.json", tmp_path / "checkpoint"
+
+    def part(seconds: float) -> FitClock:
+        """The clock of the next part, after one that wrote its last checkpoint `seconds` after its start."""
+        checkpoint.write_text("half done")
+        written = json.loads(path.read_text())["started_unix"] + seconds
+        os.utime(checkpoint, (written, written))
+        return FitClock(path, checkpoint)
+
+    assert FitClock(path, checkpoint).before == 0
+    assert part(40.0).before == pytest.approx(40, abs=1e-3), "what came after is lost with the kill, and done again"
+    third = part(30.0)
+    assert third.before == pytest.approx(70, abs=1e-3) and third.seconds() >= third.before
+    checkpoint.unlink()
+    assert FitClock(path, checkpoint).before == 0, "without a checkpoint everything is done again"
+
+
+def test_two_runs_cannot_share_a_folder(small_scene: Path, tmp_path: Path) -> None:
+    class Second(CountMethod):
+        def fit(self, *args: Any, **kwargs: Any) -> Any:
+            with pytest.raises(UserError, match="a run in progress"):
+                run(tmp_path, [small_scene], CountMethod())
+            return super().fit(*args, **kwargs)
+
+    assert run(tmp_path, [small_scene], Second())[0]["scenes"]["pattern-0"]["status"] == "ok"
+
+
+@pytest.mark.parametrize("name", ["spikes/cam_01.dat", "images/cam_03/000040.exr", "masks/cam_03/000020.png"])
+def test_a_damaged_scene_is_refused_before_any_work(small_scene: Path, tmp_path: Path, name: str) -> None:
+    path = small_scene / name
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+    method = CountMethod()
+    with pytest.raises(UserError, match=name):
+        run(tmp_path / "out", [small_scene], method)
+    assert method.fits == 0
+
+
+def test_scenes_and_methods_are_checked_before_any_work(small_scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="distinct scenes"):
+        run(tmp_path / "out", [small_scene, small_scene], CountMethod())
+    with pytest.raises(UserError, match="expected a name of letters"):
+        run(tmp_path / "out", [small_scene], CountMethod("a/b"))
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two methods and a failing one, found as those of another package are: by entry point."""
+    methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
+    methods["bad"] = FailingMethod("bad", ValueError("no luck"))
+    entry = SimpleNamespace(name="theirs", load=lambda: methods)
+    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+
+
+@pytest.mark.usefixtures("installed")
+def test_run_benchmark_leaves_results_pictures_and_entries(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5")
+    assert code == 0
+    text = capsys.readouterr().out
+    assert "quick+counts" in text and "Results" in text and "verified, rank 1 of" in text
+    for name in ("sheet_pattern-0.png", "scatter.png"):
+        with Image.open(out / name) as image:
+            assert min(image.size) > 300
+    assert read_entry(out / "leaderboard/entries/pattern-0/quick+counts.json")["label"] == "verified"
+    rows = json.loads((out / "leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
+    assert [r["rank"] for r in rows] == [1, 2]
+    record = json.loads((out / "results/counts.json").read_text())
+    assert record["scenes"]["pattern-0"]["budget"] == 0.5
+
+
+@pytest.mark.usefixtures("installed")
+def test_run_benchmark_exits_1_where_a_cell_failed(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run_benchmark((small_scene,), methods=("bad", "quick+counts"), out=out, device="cpu") == 1
+    shown = capsys.readouterr()
+    assert "failed: bad on pattern-0" in shown.err
+    assert "bad (failed)" in shown.out
+    rows = json.loads((out / "leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
+    assert [(r["method"], r["rank"]) for r in rows] == [("quick+counts", 1), ("bad", None)]
+
+
+@pytest.mark.usefixtures("installed")
+def test_another_record_in_a_shared_leaderboard_needs_replace(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def go(seed: int, replace: bool = False) -> int:
+        return run_benchmark(
+            (small_scene,),
+            methods=("quick+counts",),
+            out=tmp_path / "out",
+            seed=seed,
+            device="cpu",
+            leaderboard=tmp_path / "board",
+            replace=replace,
+        )
+
+    assert go(0) == 0 and go(0) == 0
+    assert go(1) == 1
+    assert "pass --replace" in capsys.readouterr().err
+    assert go(1, replace=True) == 0
+    assert read_entry(tmp_path / "board/entries/pattern-0/quick+counts.json")["record"]["method"]["seed"] == 1
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"methods": ("nonsense",)}, "--methods: expected names among bad, counts, quick+counts, found nonsense"),
+        ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, found '0'"),
+        ({"budget": "nan"}, "or a positive number, found 'nan'"),
+        ({"budget": "fast"}, "or a positive number, found 'fast'"),
+        ({"device": "tpu"}, "--device: expected auto, cpu or cuda, found 'tpu'"),
+        ({"device": "cuda:99"}, "--device: expected a CUDA device of this machine, found 'cuda:99'"),
+        ({"scenes": ()}, "scenes: expected at least one scene folder"),
+        ({"scenes": (Path("nowhere"),)}, "nowhere: expected a scene folder, found no such folder"),
+    ],
+)
+def test_bad_arguments_are_user_errors(
+    small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError) as e:
+        run_benchmark(**{"scenes": (small_scene,), "out": tmp_path / "out", **arguments})
+    assert message in str(e.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load() -> None:
+        raise ImportError("no libfoo")
+
+    entry = SimpleNamespace(name="theirs", value="theirs.recipes:METHODS", load=load)
+    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+    with pytest.raises(UserError, match="entry point theirs: expected theirs.recipes:METHODS, found ImportError"):
+        recipes.find_methods()
+
+
+def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [SimpleNamespace(name=n, load=lambda: {"same": CountMethod("same")}) for n in "ab"]
+    monkeypatch.setattr(recipes, "entry_points", lambda group: entries)
+    with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
+        recipes.find_methods()
+
+
+def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == "cpu" == choose_device("cpu")
+
+
+def test_a_method_without_its_weights_is_skipped_and_the_record_has_no_path(small_scene: Path, tmp_path: Path) -> None:
+    error = WeightsError(f"{tmp_path}/net.pth: expected weights, found no such file", "needs net.pth")
+    (record,) = run(tmp_path / "out", [small_scene], FailingMethod("learned", error))
+    (cell,) = record["scenes"].values()
+    assert (cell["status"], cell["error"]) == ("skipped", "needs net.pth")
+    assert str(tmp_path) not in json.dumps(record["scenes"])
+    assert str(tmp_path) in (tmp_path / "out/logs/learned__pattern-0.log").read_text()

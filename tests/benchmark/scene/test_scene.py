@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, array_cameras, write_small_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file, write_json
+from spike4dgs.benchmark.scene.images import read_exr, read_mask, write_exr
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.scene.writer import read_colmap
+
+
+def test_a_written_scene_is_read_back(small_scene: Path) -> None:
+    scene = open_scene(small_scene)
+    assert (scene.id, scene.n_ticks, scene.rate_hz, scene.radiance_gain) == ("pattern-0", TICKS, 20000.0, GAIN)
+    assert scene.train == ("cam_00", "cam_01", "cam_02") and scene.test == ("cam_03",)
+    assert scene.targets == tuple(Target("cam_03", t) for t in (20, 40, 60))
+    assert scene.targets[0].name == "cam_03/000020"
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    for made in array_cameras():
+        read = scene.cameras[made.id]
+        assert np.abs(read.project(points)[0] - made.project(points)[0]).max() < 1e-6
+        assert (read.width, read.height) == (WIDTH, HEIGHT)
+    truth, moving = scene.ground_truth(scene.targets[1]), scene.moving(scene.targets[1])
+    assert truth.shape == moving.shape == (HEIGHT, WIDTH) and truth.dtype == np.float32 and moving.dtype == bool
+    assert scene.revision == sha256_file(small_scene / "manifest.json")
+
+
+def test_streams_carry_the_radiance_upright(small_scene: Path) -> None:
+    scene = open_scene(small_scene)
+    rate = scene.stream("cam_03").counts(0, 40) / 40 / GAIN
+    truth = scene.ground_truth(Target("cam_03", 20))
+    assert np.abs(rate - truth).mean() < 0.05
+    assert np.abs(rate[::-1] - truth).mean() > 0.1
+
+
+def test_training_holds_the_training_cameras_only(small_scene: Path) -> None:
+    training = open_scene(small_scene).training
+    assert [c.id for c in training.cameras] == ["cam_00", "cam_01", "cam_02"]
+    assert len(training.streams) == 3 and training.radiance_gain == GAIN
+    assert training.duration_us == 4000.0
+    assert [training.tick(t) for t in (-5.0, 0.0, 49.9, 50.0, 3999.0, 9999.0)] == [0, 0, 0, 1, 79, 79]
+
+
+def test_the_colmap_model_has_the_same_cameras(small_scene: Path) -> None:
+    scene = open_scene(small_scene)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    for camera in read_colmap(small_scene / "sparse/0"):
+        assert np.abs(camera.project(points)[0] - scene.cameras[camera.id].project(points)[0]).max() < 0.01
+
+
+def test_transforms_follow_nerfstudio(small_scene: Path) -> None:
+    frames = json.loads((small_scene / "transforms_test.json").read_text())["frames"]
+    image = next(f for f in frames if f["file_path"] == "images/cam_03/000040.exr")
+    assert (image["tick"], image["t_us"], image["time"]) == (40, 2000.0, 0.5)
+    assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "transform_matrix"} <= set(image)
+
+
+def test_scenes_may_state_what_else_they_hold(tmp_path: Path) -> None:
+    extras = {
+        "ground_truth": {"every_ticks": 20},
+        "conventional": {"rate_hz": 60, "exposure_us": 8333},
+        "events": {"contrast": 0.2},
+        "calibration": {"flat_ticks": 4000},
+        "instances": {"1": "car", "2": "wheel"},
+    }
+    scene = open_scene(write_small_scene(tmp_path / "scene", extras=extras))
+    assert {key: scene.meta[key] for key in extras} == extras
+    with pytest.raises(UserError, match=r"Additional properties are not allowed \('weather' was unexpected\)"):
+        write_small_scene(tmp_path / "other", extras={"weather": {}})
+    with pytest.raises(UserError, match="at instances: 'car' does not match"):
+        write_small_scene(tmp_path / "third", extras={"instances": {"car": "1"}})
+    with pytest.raises(UserError, match="at events"):
+        write_small_scene(tmp_path / "fourth", extras={"events": 3})  # type: ignore[dict-item]
+
+
+def edit_json(name: str, edit: Callable[[dict[str, Any]], Any], rehash: bool = True) -> Callable[[Path], None]:
+    """Change a description file, and make the manifest agree, as a program that writes foreign scenes would."""
+
+    def apply(root: Path) -> None:
+        data = json.loads((root / name).read_text())
+        edit(data)
+        write_json(root / name, data)
+        if rehash:
+            write_manifest(root)
+
+    return apply
+
+
+def edit_bytes(name: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    return lambda root: (root / name).write_bytes(edit((root / name).read_bytes())) and None
+
+
+def flip(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 8]) + data[middle + 1 :]
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda root: (root / name).unlink()
+
+
+def set_meta(**values: Any) -> Callable[[Path], None]:
+    return edit_json("scene.json", lambda meta: meta.update(values))
+
+
+GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"}
+
+
+@pytest.mark.parametrize(
+    ("damage", "where", "message"),
+    [
+        (shutil.rmtree, "scene", "expected a scene folder, found no such folder"),
+        (remove("scene.json"), "scene.json", "found no such file"),
+        (edit_bytes("scene.json", lambda b: b[:50]), "scene.json", "found damaged text"),
+        (edit_bytes("scene.json", lambda b: b"\xff\xfe" + b), "scene.json", "found damaged text"),
+        (edit_bytes("scene.json", lambda b: b"[1]"), "scene.json", "a JSON object), found list"),
+        (
+            edit_bytes("scene.json", lambda b: b'{"camera_angle_x": 0.7, "frames": []}'),
+            "scene.json",
+            "found schema None",
+        ),
+        (set_meta(schema="spike4dgs-scene/2"), "scene.json", "found schema 'spike4dgs-scene/2'"),
+        (edit_json("scene.json", lambda m: m.pop("rate_hz")), "scene.json", "'rate_hz' is a required property"),
+        (set_meta(rate_hz=0), "scene.json", "at rate_hz"),
+        (set_meta(n_ticks=2.5), "scene.json", "at n_ticks"),
+        (set_meta(units="mm"), "scene.json", "at units"),
+        (set_meta(colour=True), "scene.json", "Additional properties are not allowed ('colour' was unexpected)"),
+        (set_meta(sensor={"model": "x"}), "scene.json", "at sensor: 'rows_bottom_up' is a required property"),
+        (set_meta(id="../other"), "scene.json", "at id"),
+        (set_meta(default_split="left"), "scene.json", "expected default_split among the splits, found 'left'"),
+        (
+            set_meta(splits={"center": {"train": ["cam_00", "cam_03"], "test": ["cam_03"]}}),
+            "scene.json",
+            "expected split center of known, distinct cameras, found cam_03 in both parts",
+        ),
+        (
+            set_meta(splits={"center": {"train": ["cam_00", "cam_77"], "test": ["cam_03"]}}),
+            "scene.json",
+            "found cam_77 without pose or stream",
+        ),
+        (set_meta(splits={"center": {"train": [], "test": ["cam_03"]}}), "scene.json", "at splits/center/train"),
+        (set_meta(gaps=[GAP]), "scene.json", "expected a recording without gaps, found 1 gap(s)"),
+        (set_meta(gaps=[{"camera": "cam_01"}]), "scene.json", "at gaps/0"),
+        (edit_json("scene.json", lambda m: m.update(title="x"), rehash=False), "scene.json", "expected"),
+        (remove("manifest.json"), "manifest.json", "found no such file"),
+        (edit_json("manifest.json", lambda m: m.update(schema="x"), rehash=False), "manifest.json", "schema"),
+        (edit_json("manifest.json", lambda m: m.update(files=3), rehash=False), "manifest.json", "bytes, sha256"),
+        (edit_json("manifest.json", lambda m: m["files"].pop("scene.json"), rehash=False), "scene.json", "no entry"),
+        (remove("transforms_train.json"), "transforms_train.json", "no such file"),
+        (remove("targets.json"), "targets.json", "no such file"),
+        (
+            edit_json("transforms_test.json", lambda d: d["frames"][0].pop("fl_x")),
+            "transforms_test.json",
+            "for camera cam_03, found KeyError('fl_x')",
+        ),
+        (
+            edit_json("transforms_train.json", lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)),
+            "transforms_train.json",
+            "cam_01: expected a rotation matrix",
+        ),
+        (
+            edit_json("transforms_train.json", lambda d: d["frames"].pop()),
+            "scene.json",
+            "cam_02 without pose or stream",
+        ),
+        (edit_json("transforms_train.json", lambda d: d.update(frames=5)), "transforms_train.json", "frames"),
+        (edit_json("transforms_train.json", lambda d: d.update(frames=["a"])), "transforms_train.json", "frames"),
+        (edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03"})), "targets.json", "'tick'"),
+        (
+            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_09", "tick": 1})),
+            "targets.json",
+            "found cam_09 at tick 1",
+        ),
+        (
+            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03", "tick": TICKS})),
+            "targets.json",
+            f"found cam_03 at tick {TICKS}",
+        ),
+        (
+            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_00", "tick": 20})),
+            "targets.json",
+            "found cam_00 at tick 20",
+        ),
+        (
+            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03", "tick": 20})),
+            "targets.json",
+            "cam_03 at tick 20 twice",
+        ),
+    ],
+)
+def test_a_scene_that_is_none_is_refused_in_one_line(
+    small_scene: Path, damage: Callable[[Path], None], where: str, message: str
+) -> None:
+    damage(small_scene)
+    with pytest.raises(UserError) as e:
+        open_scene(small_scene)
+    assert where in str(e.value).partition(": expected")[0]
+    assert message in str(e.value) and "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "name", "message"),
+    [
+        (edit_bytes("spikes/cam_01.dat", flip), "spikes/cam_01.dat", "expected sha256"),
+        (edit_bytes("spikes/cam_01.dat", lambda b: b[:-120]), "spikes/cam_01.dat", "bytes (truncated)"),
+        (edit_bytes("spikes/cam_01.dat", lambda b: b + b"\0"), "spikes/cam_01.dat", "bytes (longer)"),
+        (remove("spikes/cam_01.dat"), "spikes/cam_01.dat", "no such file"),
+        (edit_bytes("images/cam_03/000020.exr", flip), "images/cam_03/000020.exr", "expected sha256"),
+        (remove("images/cam_03/000020.exr"), "images/cam_03/000020.exr", "no such file"),
+        (edit_bytes("masks/cam_03/000020.png", flip), "masks/cam_03/000020.png", "expected sha256"),
+        (remove("masks/cam_03/000020.png"), "masks/cam_03/000020.png", "no such file"),
+    ],
+)
+def test_damaged_data_is_refused_by_whoever_reads_it(
+    small_scene: Path, damage: Callable[[Path], None], name: str, message: str
+) -> None:
+    damage(small_scene)
+    with pytest.raises(UserError) as e:
+        read_everything(open_scene(small_scene))
+    assert name in str(e.value).partition(": expected")[0] and message in str(e.value)
+    assert [name in line for line in open_scene(small_scene).manifest.problems()] == [True]
+
+
+def read_everything(scene: Scene) -> None:
+    _ = scene.training
+    for t in scene.targets:
+        scene.ground_truth(t)
+        scene.moving(t)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda b: b[:-7], "expected whole ticks of 120 bytes (40x24)"),
+        (lambda b: b[:-120], "expected 80 ticks, found 79"),
+        (lambda b: b"", "found 0 bytes"),
+    ],
+)
+def test_a_truncated_stream_with_a_manifest_that_agrees_is_refused(
+    small_scene: Path, edit: Callable[[bytes], bytes], message: str
+) -> None:
+    edit_bytes("spikes/cam_02.dat", edit)(small_scene)
+    write_manifest(small_scene)
+    with pytest.raises(UserError) as e:
+        _ = open_scene(small_scene).training
+    assert "spikes/cam_02.dat" in str(e.value) and message in str(e.value)
+
+
+def test_gaps_can_be_accepted(small_scene: Path) -> None:
+    set_meta(gaps=[GAP])(small_scene)
+    assert open_scene(small_scene, allow_gaps=True).meta["gaps"] == [GAP]
+
+
+def test_any_change_changes_the_revision(small_scene: Path, tmp_path: Path) -> None:
+    before = open_scene(small_scene).revision
+    assert open_scene(write_small_scene(tmp_path / "again")).revision == before, "same seed, same bytes"
+    edit_bytes("spikes/cam_00.dat", flip)(small_scene)
+    write_manifest(small_scene)
+    assert open_scene(small_scene).revision != before
+
+
+def test_images_that_are_none_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.exr").write_bytes(b"not an image")
+    (tmp_path / "a.png").write_bytes(b"not an image")
+    with pytest.raises(UserError, match=r"a\.exr: expected an EXR image, found damaged data"):
+        read_exr(tmp_path / "a.exr")
+    with pytest.raises(UserError, match=r"a\.png: expected a mask image, found damaged data"):
+        read_mask(tmp_path / "a.png")
+    image = np.random.default_rng(0).random((16, 20)).astype(np.float32)
+    write_exr(tmp_path / "b.exr", image, 5.0)
+    data = (tmp_path / "b.exr").read_bytes()
+    (tmp_path / "b.exr").write_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match=r"b\.exr"):
+        read_exr(tmp_path / "b.exr")
+
+
+def test_colour_images_are_refused(tmp_path: Path) -> None:
+    import OpenEXR
+
+    rgb = np.zeros((16, 20, 3), np.float16)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": rgb}).write(str(tmp_path / "c.exr"))
+    with pytest.raises(UserError, match=r"expected a gray image \(channel Y\), found channels \['B', 'G', 'R'\]"):
+        read_exr(tmp_path / "c.exr")

@@ -1,0 +1,76 @@
+"""Bit kernels against numpy's unpackbits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.benchmark.spikes import bits
+
+
+def reference(packed: np.ndarray, width: int, height: int, flip: bool) -> np.ndarray:
+    plain = np.unpackbits(packed, axis=1, count=width * height, bitorder="little").reshape(-1, height, width)
+    return plain[:, ::-1] if flip else plain
+
+
+def random_rows(n: int, width: int, height: int, seed: int) -> np.ndarray:
+    """Random bytes; the padding bits of the last byte are random too, and nobody may read them."""
+    return np.random.default_rng(seed).integers(0, 256, (n, (width * height + 7) // 8), dtype=np.uint8)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 40), st.integers(1, 41), st.integers(1, 23), st.booleans(), st.integers(0, 99))
+def test_unpack_and_count_equal_numpy(n: int, width: int, height: int, flip: bool, seed: int) -> None:
+    packed = random_rows(n, width, height, seed)
+    expected = reference(packed, width, height, flip)
+    np.testing.assert_array_equal(bits.unpack(packed, width, height, flip), expected)
+    counts = bits.count_bits(packed, width * height).reshape(height, width)
+    np.testing.assert_array_equal(counts[::-1] if flip else counts, expected.sum(0))
+
+
+@pytest.mark.parametrize("n", [254, 255, 256, 510, 511, 4000])
+@pytest.mark.parametrize("byte", [0, 255, 0b10010110])
+def test_counts_cross_the_limit_of_the_vertical_counter(n: int, byte: int) -> None:
+    packed = np.full((n, 5), byte, np.uint8)
+    expected = n * np.unpackbits(packed[0], count=37, bitorder="little").astype(int)
+    np.testing.assert_array_equal(bits.count_bits(packed, 37), expected)
+
+
+def test_the_longest_window_and_more_bytes_than_a_block() -> None:
+    ones = np.full((65535, 1), 255, np.uint8)
+    assert (bits.count_bits(ones, 8) == 65535).all()
+    packed = random_rows(300, 8 * 2500 + 3, 1, 5)
+    np.testing.assert_array_equal(bits.count_bits(packed, 20003), reference(packed, 20003, 1, False).sum(0)[0])
+
+
+def test_memory_maps_and_strided_rows(tmp_path: Path) -> None:
+    packed = random_rows(30, 17, 5, 1)
+    packed.tofile(tmp_path / "a.dat")
+    mapped = np.memmap(tmp_path / "a.dat", np.uint8, "r", shape=packed.shape)
+    np.testing.assert_array_equal(bits.unpack(mapped[3:20], 17, 5, True), reference(packed[3:20], 17, 5, True))
+    np.testing.assert_array_equal(bits.count_bits(packed[::3], 85), bits.count_bits(packed[::3].copy(), 85))
+    assert packed.flags.writeable  # the caller's array keeps its flags
+
+
+@pytest.mark.parametrize("width", [400, 401])
+def test_threads_change_no_bit(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = random_rows(200, width, 250, 3)
+    results = []
+    for cores in ({0}, {0, 1}, {0, 1, 2, 3, 4}):
+        monkeypatch.setattr(bits.os, "sched_getaffinity", lambda _, c=cores: c)
+        results.append((bits.unpack(packed, width, 250, True), bits.count_bits(packed, width * 250)))
+    for other in results[1:]:
+        np.testing.assert_array_equal(results[0][0], other[0])
+        np.testing.assert_array_equal(results[0][1], other[1])
+
+
+def test_an_error_in_a_thread_is_raised() -> None:
+    def fail(start: int, stop: int) -> None:
+        raise ValueError(f"{start}")
+
+    with pytest.raises(ValueError):
+        bits.in_threads(fail, 10)

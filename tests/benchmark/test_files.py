@@ -1,0 +1,167 @@
+"""Writing where it cannot be done: one line that says what to do, and nothing half written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dummy_methods import CountMethod, run
+from small_scenes import array_cameras
+
+from spike4dgs.benchmark.cli import main
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import atomic_path, write_json, writing
+from spike4dgs.benchmark.scene.images import write_exr, write_mask
+from spike4dgs.benchmark.scene.writer import write_colmap
+from spike4dgs.benchmark.spikes.stream import SpikeWriter
+
+BIG = np.random.default_rng(0).random((200, 300)).astype(np.float32)
+
+
+def write_stream(path: Path) -> None:
+    with SpikeWriter(path, 80, 10) as writer:
+        for _ in range(3):
+            writer.write(np.zeros((500, 100), np.uint8))
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "a.json": lambda path: write_json(path, {"values": list(range(20000))}),
+    "a.exr": lambda path: write_exr(path, BIG, 0.0),
+    "a.png": lambda path: write_mask(path, BIG > 0.5),
+    "a.dat": write_stream,
+}
+each_writer = pytest.mark.parametrize("name", WRITERS)
+
+
+def part_of(path: Path) -> Path:
+    """The temporary name that this process writes under."""
+    stem, suffix = (path.name, "") if path.suffix == ".dat" else (path.stem, path.suffix)
+    return path.with_name(f".{stem}.{os.getpid()}.part{suffix}")
+
+
+def refused(path: Path, write: Callable[[Path], None], message: str) -> None:
+    before = path.read_bytes() if path.is_file() else None
+    with pytest.raises(UserError) as e:
+        write(path)
+    assert str(e.value).startswith(f"{path}: expected ") and message in str(e.value) and "\n" not in str(e.value)
+    assert (path.read_bytes() if path.is_file() else None) == before
+    assert not list(path.parent.glob(".*.part*")) if path.parent.is_dir() else True
+
+
+@each_writer
+def test_a_full_disk(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"old")
+    part_of(path).symlink_to("/dev/full")  # a file on a full disk, as far as a program can tell
+    refused(path, WRITERS[name], "o space left on device")
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+@each_writer
+def test_a_limit_that_is_met_in_the_middle_of_a_file(tmp_path: Path, name: str) -> None:
+    with file_size_limit(4096):
+        refused(tmp_path / name, WRITERS[name], "ile too large")
+    WRITERS[name](tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@each_writer
+def test_a_file_in_place_of_a_folder(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_bytes(b"content")
+    refused(tmp_path / "file" / name, WRITERS[name], "file exists; remove what stands in their place")
+    refused(tmp_path / "file/deeper" / name, WRITERS[name], "not a directory; remove what stands in their place")
+    assert (tmp_path / "file").read_bytes() == b"content"
+
+
+@each_writer
+def test_a_folder_in_place_of_a_file(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    refused(tmp_path / name, WRITERS[name], "is a directory; remove the folder of that name")
+
+
+@contextmanager
+def as_ordinary_user() -> Iterator[None]:
+    """As one whom permissions stop: root may write anywhere."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+@each_writer
+def test_an_unwritable_folder(tmp_path: Path, name: str) -> None:
+    def write(path: Path) -> None:
+        with as_ordinary_user():
+            WRITERS[name](path)
+
+    WRITERS[name](tmp_path / name)  # with what it imports
+    tmp_path.chmod(0o555)
+    refused(tmp_path / name, write, "permission denied; change its permissions, or choose another folder")
+
+
+@pytest.mark.parametrize(("code", "message"), [(errno.EROFS, "read-only file system"), (errno.EACCES, "permission")])
+def test_what_the_system_says_is_passed_on(tmp_path: Path, code: int, message: str) -> None:
+    with pytest.raises(UserError, match=message), writing(tmp_path / "a"):
+        raise OSError(code, os.strerror(code))
+
+
+def test_an_error_of_the_program_stays_one(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "a.json"):
+        raise FileNotFoundError(errno.ENOENT, "no such file", "something-else")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_colmap_model_that_is_cut_off_is_noticed(tmp_path: Path) -> None:
+    with file_size_limit(100), pytest.raises(UserError, match="sparse: expected .* free some disk space"):
+        write_colmap(tmp_path / "sparse", array_cameras(), np.zeros((100, 3)))
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UserError, match="file: expected folders on the way to the file, found file exists"):
+        write_colmap(tmp_path / "file", array_cameras(), np.zeros((0, 3)))
+
+
+def test_a_run_says_so_before_any_work(small_scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    method = CountMethod()
+    with pytest.raises(UserError, match="file/out: expected folders on the way"):
+        run(tmp_path / "file/out", [small_scene], method)
+    assert method.fits == 0
+
+
+def test_a_command_that_cannot_write_exits_with_2(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    assert main(["export-spikecv", str(small_scene), "--out", str(tmp_path / "file/out")]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: ") and shown.count("\n") == 1 and "not a directory" in shown
+
+
+def test_a_killed_writer_leaves_no_file_under_the_final_name(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys\nfrom pathlib import Path\nimport numpy as np\n"
+        "from spike4dgs.benchmark.spikes.stream import SpikeWriter\n"
+        "with SpikeWriter(Path(sys.argv[1]), 8, 2) as w:\n"
+        "    w.write(np.zeros((9, 2), np.uint8)); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.dat")])
+    assert all(p.name.startswith(".") for p in tmp_path.iterdir())

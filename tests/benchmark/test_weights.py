@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from spike4dgs.benchmark import weights
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.neural_trunks import alexnet_features, load_into, read_state
+from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.weights import ALEXNET, METAIQA, VARIABLE, WeightFile, WeightsError, find_weights, hub_folder
+
+CONTENT = b"weights"
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+FILE = WeightFile("w.pth", len(CONTENT), SHA256, "a test", "https://example.org/w.pth")
+
+
+@pytest.fixture(autouse=True)
+def empty_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No weights of this machine: torch hub's folder is an empty one."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    folder = tmp_path / "torch/hub/checkpoints"
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize("variable", ["TORCH_HOME", "XDG_CACHE_HOME", None])
+def test_the_hub_folder_is_torchs(variable: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    if variable:
+        monkeypatch.setenv(variable, str(tmp_path / "elsewhere"))
+    assert hub_folder() == Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def test_files_are_found_in_the_given_folder_then_in_the_hubs(
+    empty_hub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (empty_hub / "w.pth").write_bytes(CONTENT)
+    assert find_weights(FILE).path == empty_hub / "w.pth"
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    assert find_weights(FILE).path == empty_hub / "w.pth"
+    (tmp_path / "w.pth").write_bytes(CONTENT)
+    assert find_weights(FILE).path == tmp_path / "w.pth"
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "w.pth"))
+    found = find_weights(FILE)
+    assert (found.path, found.sha256) == (tmp_path / "w.pth", SHA256)
+
+
+def test_an_absent_file_is_named_with_all_that_helps(
+    empty_hub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "mine"))
+    with pytest.raises(WeightsError) as e:
+        find_weights(ALEXNET)
+    text = str(e.value)
+    for part in (
+        ALEXNET.name,
+        "244408911 bytes",
+        str(ALEXNET.sha256),
+        str(empty_hub),
+        str(tmp_path / "mine"),
+        VARIABLE,
+    ):
+        assert part in text
+    assert ALEXNET.source in text and "\n" not in text
+    assert ALEXNET.name in e.value.reason and str(tmp_path) not in e.value.reason
+
+
+def test_another_file_of_the_name_is_refused_and_hashed_anew_after_a_change(empty_hub: Path) -> None:
+    path = empty_hub / "w.pth"
+    path.write_bytes(b"Weights")
+    with pytest.raises(WeightsError, match=rf"w\.pth: expected .*{SHA256}.*found 7 bytes with sha256 (?!{SHA256})"):
+        find_weights(FILE)
+    path.write_bytes(CONTENT)
+    os.utime(path, ns=(1, 1))
+    assert find_weights(FILE).sha256 == SHA256
+
+
+def test_the_names_of_torch_hubs_files_hold_the_start_of_their_hashes() -> None:
+    for file in (weights.ALEXNET, weights.VGG16, weights.SQUEEZENET):
+        found = re.search(r"-([0-9a-f]{8})\.pth$", file.name)
+        assert found and file.sha256 and file.sha256.startswith(found[1]) and len(file.sha256) == 64
+
+
+def test_auto_leaves_out_what_lacks_weights_and_says_so() -> None:
+    selection = select_metrics()
+    assert set(selection.absent) == {"lpips_alex", "lpips_vgg", "lpips_squeeze", "metaiqa"}
+    assert all(m.weights is None for m in selection.metrics) and set(selection.weights.values()) == {None}
+    assert set(selection.weights) | set(selection.absent) == set(METRICS)
+    assert "needs the file vgg16-397923af.pth" in selection.absent["lpips_vgg"]
+
+
+def test_a_metric_that_is_asked_for_needs_its_weights(empty_hub: Path) -> None:
+    with pytest.raises(UserError, match=r"vgg16-397923af\.pth: expected .* 553433881 bytes"):
+        select_metrics(("auto", "lpips_vgg"))
+    (empty_hub / METAIQA.name).write_bytes(CONTENT)
+    selection = select_metrics(("metaiqa",))
+    assert selection.weights["metaiqa"] == SHA256
+    assert selection.weights["psnr"] is None and selection.absent["flip"] == "not asked for"
+
+
+def test_a_selection_can_be_narrowed() -> None:
+    selection = select_metrics().among(["psnr", "flip", "lpips_alex"])
+    assert [m.id for m in selection.metrics] == ["psnr", "flip"]
+    assert set(selection.weights) | set(selection.absent) == set(METRICS)
+
+
+def test_unknown_metrics_are_refused() -> None:
+    with pytest.raises(UserError, match="--metrics: expected auto or ids among psnr, .*, found vmaf"):
+        select_metrics(("auto", "vmaf"))
+
+
+def test_state_dicts_are_read_from_both_kinds_of_file(tmp_path: Path) -> None:
+    state = {"a": torch.arange(3.0)}
+    torch.save(state, tmp_path / "s.pth")
+    torch.save(state, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    save_file(state, tmp_path / "s.safetensors")
+    for name in ("s.pth", "old.pth", "s.safetensors"):
+        assert torch.equal(read_state(tmp_path / name)["a"], state["a"])
+
+
+class Surprise:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, ("surprise",)
+
+
+def test_files_that_are_no_tensors_are_refused_and_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save(Surprise(), tmp_path / "code.pth")
+    torch.save([torch.zeros(1)], tmp_path / "list.pth")
+    torch.save({"epoch": 3}, tmp_path / "epoch.pth")
+    (tmp_path / "cut.pth").write_bytes(b"PK\x03\x04 and no more")
+    (tmp_path / "cut.safetensors").write_bytes(b"no header")
+    (tmp_path / "empty.pth").touch()
+    for path in tmp_path.glob("*.*"):
+        with pytest.raises(UserError, match=rf"{path.name}: expected a (file of|mapping from names to) tensors"):
+            read_state(path)
+    assert not (tmp_path / "surprise").exists()
+
+
+def test_only_the_networks_own_tensors_are_taken() -> None:
+    network = alexnet_features()
+    state = dict(network.state_dict())
+    loaded = load_into(alexnet_features(), state, "f")
+    assert not any(p.requires_grad for p in loaded.parameters()) and not loaded.training
+    with pytest.raises(UserError, match=r"f: expected the 10 tensors of the network, found no 0\.bias"):
+        load_into(network, {k: v for k, v in state.items() if k != "0.bias"}, "f")
+    with pytest.raises(UserError, match=r"f: expected only the 10 tensors of the network, found also extra"):
+        load_into(network, {**state, "extra": torch.zeros(1)}, "f")
+    with pytest.raises(UserError, match=r"f: expected 0\.bias of shape \(64,\), found \(63,\)"):
+        load_into(network, {**state, "0.bias": torch.zeros(63)}, "f")

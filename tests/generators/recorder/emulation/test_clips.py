@@ -1,0 +1,239 @@
+"""Recordings of emulated cameras: the scene that they show, whatever fails, and however slow the consumer is."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated_rig import BLOCK, N, emulate, profile_of
+from recorder_rig import FRAME, HEIGHT, TICKS, WIDTH, check_identical, check_recording, finish, record, source_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.generators.recorder.capture import capture
+from spike4dgs.generators.recorder.checks import find_cameras
+from spike4dgs.generators.recorder.emulation import backend as emulator
+from spike4dgs.generators.recorder.emulation.backend import EmulatedReads
+from spike4dgs.generators.recorder.emulation.camera import Fault, UInt8
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles
+from spike4dgs.generators.recorder.frames.clip import CameraClip
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.usb.reads import Completion
+from spike4dgs.generators.recorder.usb.transport import open_link
+
+
+@pytest.fixture(scope="module")
+def nine(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return source_scene(tmp_path_factory.mktemp("nine") / "scene")
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return source_scene(tmp_path_factory.mktemp("two") / "scene", cameras=2, ticks=N)
+
+
+@pytest.mark.parametrize("queued", [True, False])
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows", "line-tagged"])
+def test_a_recording_of_nine_cameras_is_the_scene_that_they_show(
+    nine: Scene, layout: str, queued: bool, tmp_path: Path
+) -> None:
+    profile = profile_of(nine, layout=layout)
+    clip = record(tmp_path / "clip", profile, emulate(nine, profile), TICKS, queued)
+    assert clip.complete and all(c.stats.queued == queued for c in clip.cameras)
+    assert clip.sync == ("frame tags" if layout == "tagged-rows" else "arrival times")
+    check_identical(tmp_path / "clip", nine)
+
+
+def test_cameras_that_see_the_scene_upside_down_record_it_upright(two: Scene, tmp_path: Path) -> None:
+    profile = profile_of(two)
+    first, second = profile.cameras
+    profile = replace(profile, cameras=(replace(first, rows="top-down"), replace(second, mirrored=True)))
+    record(tmp_path / "clip", profile, emulate(two, profile), N)
+    check_identical(tmp_path / "clip", two)
+
+
+def test_cameras_that_send_from_the_moment_they_have_power_agree_on_a_tick(two: Scene) -> None:
+    profile = profile_of(two, layout="tagged-rows")
+    profile = replace(profile, cameras=tuple(replace(c, start=(), stop=()) for c in profile.cameras))
+    backend = emulate(two, profile)
+    devices = find_cameras(profile, backend)
+    clip = capture(profile, {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}, N / 20000)
+    assert clip.complete and clip.sync == "frame tags"
+    frames, origins = make_layout("tagged-rows", WIDTH, HEIGHT), set()
+    for camera in clip.cameras:
+        payload = np.empty((N, FRAME), np.uint8)
+        counts = frames.unpack(camera.frames, payload)
+        assert counts is not None
+        np.testing.assert_array_equal(payload, two.stream(camera.camera).packed[counts % N])
+        origins.add(int(counts[0]))
+    assert len(origins) == 1
+
+
+def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object) -> CameraClip:
+    """Record with a fault of cam_01; checks that cam_00 has everything, and returns cam_01's clip."""
+    profile = profile_of(scene, **changes)
+    clip = record(out, profile, emulate(scene, profile, fault), N, queued)
+    check_recording(out, scene, clip)
+    sound, failed = clip.cameras
+    assert not sound.gaps and sound.stats.end == "ok"
+    with pytest.raises(UserError, match="pass --allow-gaps"):
+        open_scene(out)
+    return failed
+
+
+@pytest.mark.parametrize("queued", [True, False])
+@pytest.mark.parametrize("kind", ["stall", "overflow", "unplugged"])
+def test_a_camera_that_fails_keeps_what_came_before(two: Scene, kind: str, queued: bool, tmp_path: Path) -> None:
+    tick, offset = 77, 33
+    failed = fail(two, tmp_path / "clip", Fault("cam_01", kind, tick, offset), queued)
+    # Only of a queued read does libusb tell how much of it came before it failed.
+    first = tick if queued else (tick * FRAME + offset) // BLOCK * BLOCK // FRAME
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(first, N - first, kind)]
+    assert failed.stats.end == kind
+
+
+@pytest.mark.parametrize("queued", [True, False])
+def test_a_camera_that_falls_silent_keeps_all_that_came(two: Scene, queued: bool, tmp_path: Path) -> None:
+    failed = fail(two, tmp_path / "clip", Fault("cam_01", "time-out", 77, 33), queued, timeout_ms=1000)
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, "time-out")]
+
+
+@pytest.mark.parametrize("queued", [True, False])
+def test_a_short_read_in_a_frame_ends_a_camera_without_tags(two: Scene, queued: bool, tmp_path: Path) -> None:
+    failed = fail(two, tmp_path / "clip", Fault("cam_01", "short read", 77, 33), queued)
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, "short read")]
+
+
+@pytest.mark.parametrize(
+    ("lost", "gap"), [(0, []), (1, [(77, 1)]), (168, [(77, 2)]), (5 * 168 - 33, [(77, 5)]), (5 * 168, [(77, 6)])]
+)
+@pytest.mark.parametrize("kind", ["short read", "lost bytes"])
+def test_tags_find_the_next_frame_after_a_loss(
+    two: Scene, kind: str, lost: int, gap: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    profile = profile_of(two, layout="tagged-rows")
+    backend = emulate(two, profile, Fault("cam_01", kind, 77, 33, lost))
+    clip = record(tmp_path / "clip", profile, backend, N)
+    check_recording(tmp_path / "clip", two, clip)
+    assert [(g.first_tick, g.ticks) for g in clip.cameras[1].gaps] == gap
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", r"camera cam_01 \(serial EMULATED0001\): expected a device with this serial number"),
+        ("duplicate serial", r"camera cam_01 \(serial EMULATED0001\): expected one device with this serial number"),
+        ("high speed", r"camera cam_01 \(serial EMULATED0001\): expected a SuperSpeed link .* found High Speed"),
+    ],
+)
+def test_arrays_that_are_not_recorded(two: Scene, kind: str, message: str, tmp_path: Path) -> None:
+    profile = profile_of(two)
+    with pytest.raises(UserError, match=message):
+        record(tmp_path / "clip", profile, emulate(two, profile, Fault("cam_01", kind)), N)
+    assert not (tmp_path / "clip").exists()
+
+
+def test_a_camera_that_fails_in_the_rehearsal_is_not_recorded(two: Scene, tmp_path: Path) -> None:
+    profile = profile_of(two)
+    with pytest.raises(UserError, match="camera cam_01: expected data after its start sequence, found stall"):
+        record(tmp_path / "clip", profile, emulate(two, profile, Fault("cam_01", "stall", start=0)), N)
+    assert not (tmp_path / "clip").exists()
+
+
+# A consumer that is too slow.
+
+STUCK, LAST, SLOTS, FLYING = 6, 14, 8, 4  # reads counted from 0
+
+
+class Steps:
+    """Lets reads end one by one, so that the consumer falls behind by a known number of them.
+
+    A read ends when the consumer has had all frames before it. But while the consumer is stuck in read STUCK of cam_01,
+    its reads up to LAST end. The ring's SLOTS then hold the reads from STUCK on; those after them have no place, up to
+    the last that was submitted meanwhile, LAST + FLYING.
+    """
+
+    def __init__(self, frame_bytes: int, files: StreamFiles) -> None:
+        self.frame_bytes, self.files = frame_bytes, files
+        self.armed = False
+        self.ended = {"cam_00": 0, "cam_01": 0}
+        self.had = {"cam_00": 0, "cam_01": 0}  # ticks
+        self.stuck, self.behind = threading.Event(), threading.Event()
+
+    @property
+    def lost(self) -> tuple[int, int]:
+        """First tick that finds no place, and the first one after it that does."""
+        return self.ticks(STUCK + SLOTS), -(-(LAST + FLYING + 1) * BLOCK // self.frame_bytes)
+
+    def ticks(self, reads: int) -> int:
+        """Whole ticks in this many reads."""
+        return reads * BLOCK // self.frame_bytes
+
+    def allows(self, camera: str) -> bool:
+        n = self.ended[camera]
+        if not self.armed:
+            return True
+        if camera == "cam_01" and n > STUCK and not self.behind.is_set():
+            if n > LAST:  # the read that follows LAST's has been submitted
+                self.behind.set()
+            return n <= LAST and self.stuck.is_set()
+        if camera == "cam_01" and LAST < n <= LAST + FLYING + 1:  # these have no frames
+            return self.had[camera] >= self.lost[0]
+        return self.had[camera] >= self.ticks(n)
+
+    def sink(self, camera: str, first_tick: int, frames: UInt8) -> None:
+        self.files.write(camera, first_tick, frames)
+        if camera == "cam_01" and first_tick + len(frames) == self.ticks(STUCK + 1):
+            self.stuck.set()
+            assert self.behind.wait(60)
+        self.had[camera] = first_tick + len(frames)
+
+
+class SteppedReads(EmulatedReads):
+    """Reads that end when the steps allow it."""
+
+    steps: Steps
+
+    def wait(self, timeout_s: float) -> Completion | None:
+        name = self._camera.profile.id
+        if not self.steps.allows(name):
+            time.sleep(1e-3)
+            return None
+        done = super().wait(timeout_s)
+        self.steps.ended[name] += self.steps.armed and done is not None
+        return done
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_a_consumer_slowed_on_purpose_costs_exactly_the_ticks_that_found_no_place(
+    two: Scene, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = profile_of(two, layout=layout, transfers=FLYING, ring_seconds=0.002)
+    backend = emulate(two, profile, paced=False)
+    monkeypatch.setattr(emulator, "EmulatedReads", SteppedReads)
+    devices = find_cameras(profile, backend)
+    links = {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}
+    with StreamFiles(tmp_path / "clip", profile, N) as files:
+        steps = Steps(make_layout(layout, WIDTH, HEIGHT).frame_bytes, files)
+        monkeypatch.setattr(SteppedReads, "steps", steps, raising=False)
+
+        def on_state(state: str) -> None:
+            steps.armed = state != "OPEN"
+
+        clip = capture(profile, links, N / 20000, on_state=on_state, sink=steps.sink)
+        finish(files, clip)
+    first, stop = steps.lost
+    assert [[(g.first_tick, g.stop_tick, g.reason) for g in c.gaps] for c in clip.cameras] == [
+        [],
+        [(first, stop, "overflow")],
+    ]
+    assert 0 < first < stop < N - 1, "data follow the gap"
+    check_recording(tmp_path / "clip", two, clip)
+    with pytest.raises(
+        UserError, match=f"cam_01 from tick {first}, {stop - first} ticks .overflow.; pass --allow-gaps"
+    ):
+        open_scene(tmp_path / "clip")

@@ -1,0 +1,330 @@
+"""Capture: what the cameras sent is what the clip holds, in its place, whatever goes wrong on the way."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_camera import HEIGHT, WIDTH, FakeCamera, frames_of, layout_of, rig, rig_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators.recorder.capture import STATES, capture
+from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, Clip
+from spike4dgs.generators.recorder.frames.cutting import agree
+from spike4dgs.generators.recorder.frames.layouts import COUNTER, UInt8
+from spike4dgs.generators.recorder.frames.ring import Block, Ring
+from spike4dgs.generators.recorder.profile.profile import RigProfile
+from spike4dgs.generators.recorder.rates import Rate, spikes_per_tick
+from spike4dgs.generators.recorder.usb.reader import Idle
+from spike4dgs.generators.recorder.usb.reads import OVERFLOW, SHORT, STALL, TIME_OUT, UNPLUGGED
+
+N = 200  # ticks of most clips
+SECONDS = N / 20000
+
+
+def make(n: int, layout: str = "plain", **changes: object) -> tuple[RigProfile, list[UInt8], dict[str, FakeCamera]]:
+    profile = rig(n, layout, **changes)
+    frames = [frames_of(i, layout_of(profile), 2 * N) for i in range(n)]
+    return profile, frames, rig_of(frames, profile)
+
+
+def by_name(clip: Clip) -> dict[str, CameraClip]:
+    return {c.camera: c for c in clip.cameras}
+
+
+def check_frames(camera: CameraClip, frames: UInt8, n_ticks: int) -> None:
+    """Every frame is the source's at its tick, and gaps are exactly the other ticks."""
+    np.testing.assert_array_equal(camera.frames, frames[camera.ticks])
+    absent = [t for g in camera.gaps for t in range(g.first_tick, g.stop_tick)]
+    assert sorted([*camera.ticks.tolist(), *absent]) == list(range(n_ticks))
+    assert camera.stats.lost_ticks == len(absent)
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_a_clip_is_what_the_cameras_sent(layout: str) -> None:
+    profile, frames, links = make(3, layout)
+    states: list[str] = []
+    clip = capture(profile, links, SECONDS, on_state=states.append)
+    assert states == list(STATES)
+    assert clip.complete and not clip.interrupted and clip.n_ticks == N
+    assert clip.sync == (FRAME_TAGS if layout == "tagged-rows" else ARRIVAL_TIMES)
+    assert [c.camera for c in clip.cameras] == ["cam_00", "cam_01", "cam_02"]
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        assert camera.ticks.tolist() == list(range(N))
+        check_frames(camera, source, N)
+        assert camera.frames.base is not None, "a view of the ring, not a copy"
+        assert camera.stats.end == "ok" and camera.stats.bytes >= camera.frames.size
+
+
+def test_secondaries_are_started_before_the_primary_and_stopped_after_it() -> None:
+    profile, _, links = make(3)
+    capture(profile, links, SECONDS)
+    once = ["start cam_00", "start cam_02", "start cam_01", "stop cam_01", "stop cam_02", "stop cam_00"]
+    assert links["cam_00"].log[:12] == 2 * once, "the rehearsal, and the capture"
+    assert sorted(links["cam_00"].log[12:]) == [f"close cam_{i:02d}" for i in range(3)]
+
+
+def test_common_counters_decide_which_tick_is_the_first() -> None:
+    profile = rig(3, "tagged-rows")
+    layout = layout_of(profile)
+    ahead = [0, 7, 3]  # frames that a camera has sent before the others; its counter wraps in the middle of it
+    frames = frames_of(0, layout, 3 * N, COUNTER - 5)
+    links = rig_of([frames[a:] for a in ahead], profile)
+    clip = capture(profile, links, SECONDS)
+    assert clip.complete and clip.sync == FRAME_TAGS
+    for camera in clip.cameras:
+        np.testing.assert_array_equal(camera.frames, frames[7 : 7 + N])
+
+
+def test_counters_of_their_own_decide_nothing() -> None:
+    profile = rig(2, "tagged-rows")
+    frames = [frames_of(i, layout_of(profile), 2 * N, first) for i, first in enumerate((10, 3_000_000))]
+    clip = capture(profile, rig_of(frames, profile), SECONDS)
+    assert clip.complete and clip.sync == ARRIVAL_TIMES
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        check_frames(camera, source, N)
+
+
+@pytest.mark.parametrize(("most", "expected"), [(2, None), (3, 1)])
+def test_agreement_takes_the_wrap_of_counters(most: int, expected: int | None) -> None:
+    assert agree([COUNTER - 1, 1, COUNTER - 2], most) == expected
+
+
+@pytest.mark.parametrize("status", [STALL, OVERFLOW, UNPLUGGED])
+def test_a_camera_that_fails_stops_alone(status: str) -> None:
+    profile, frames, links = make(3)
+    links["cam_01"].faults = {30 * 77 + 11: status}
+    cameras = by_name(capture(profile, links, SECONDS))
+    for i, camera in enumerate(cameras.values()):
+        check_frames(camera, frames[i], N)
+    failed = cameras["cam_01"]
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, status)]
+    assert failed.stats.end == status
+    assert not cameras["cam_00"].gaps and not cameras["cam_02"].gaps
+
+
+def test_a_camera_that_falls_silent_is_given_up_after_the_time_limit() -> None:
+    profile, frames, links = make(2)
+    links["cam_00"].stream = frames[0][:150].reshape(-1)
+    cameras = by_name(capture(profile, links, SECONDS))
+    assert [(g.first_tick, g.ticks, g.reason) for g in cameras["cam_00"].gaps] == [(150, 50, TIME_OUT)]
+    check_frames(cameras["cam_00"], frames[0], N)
+    assert not cameras["cam_01"].gaps
+
+
+@pytest.mark.parametrize(
+    ("layout", "offset", "lost"), [("plain", 0, 0), ("plain", 13, 140), ("tagged-rows", 13, 0), ("tagged-rows", 0, 0)]
+)
+def test_a_short_read_ends_a_stream_only_where_nothing_tells_what_follows(layout: str, offset: int, lost: int) -> None:
+    profile, frames, links = make(2, layout)
+    links["cam_00"].faults = {60 * layout_of(profile).frame_bytes + offset: SHORT}
+    camera = by_name(capture(profile, links, SECONDS))["cam_00"]
+    check_frames(camera, frames[0], N)
+    assert camera.stats.lost_ticks == lost and camera.stats.short_reads >= 1
+    assert [(g.first_tick, g.reason) for g in camera.gaps] == ([(60, SHORT)] if lost else [])
+
+
+def test_bytes_that_a_camera_leaves_out_are_found_by_its_counter() -> None:
+    profile, frames, links = make(2, "tagged-rows")
+    size = layout_of(profile).frame_bytes
+    stream = frames[0].reshape(-1)
+    links["cam_00"].stream = np.delete(stream, np.s_[size * 40 + 17 : size * 43 + 5])
+    camera = by_name(capture(profile, links, SECONDS))["cam_00"]
+    check_frames(camera, frames[0], N)
+    assert [(g.first_tick, g.ticks) for g in camera.gaps] == [(40, 4)]
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_a_slow_consumer_costs_ticks_and_shifts_none(layout: str) -> None:
+    profile = rig(2, layout, timeout_ms=60_000, ring_seconds=0.0)  # the smallest ring: twice the reads in flight
+    frames = [frames_of(i, layout_of(profile), 4000) for i in range(2)]
+    links = rig_of(frames, profile)
+    slow = links["cam_00"]
+    slow.limit = 8 * 1024
+    got: dict[str, list[tuple[int, UInt8]]] = {"cam_00": [], "cam_01": []}
+
+    def sink(camera: str, first_tick: int, raw: UInt8) -> None:
+        got[camera].append((first_tick, raw.copy()))
+        if camera == "cam_00" and len(got[camera]) == 3:
+            slow.limit = slow.position + 12 * 1024  # the ring has half of that
+            deadline = time.monotonic() + 20
+            while slow.position < slow.limit and time.monotonic() < deadline:
+                time.sleep(1e-3)
+        elif camera == "cam_00" and len(got[camera]) == 8:  # five blocks waited
+            slow.limit = None
+
+    clip = capture(profile, links, 2000 / 20000, sink=sink)
+    assert not clip.complete
+    for i, camera in enumerate(clip.cameras):
+        assert len(camera.frames) == 0
+        ticks = np.concatenate([first + np.arange(len(raw)) for first, raw in got[camera.camera]])
+        raw = np.concatenate([raw for _, raw in got[camera.camera]])
+        check_frames(replace(camera, frames=raw, ticks=ticks), frames[i], 2000)
+        assert all(g.reason == OVERFLOW for g in camera.gaps)
+    camera = clip.cameras[0]
+    assert camera.stats.slots == 6 and camera.stats.backlog >= 5, "all but the one that the sink holds"
+    assert camera.gaps[0].first_tick > 0
+    first, raw = got["cam_00"][-1]
+    assert first + len(raw) > camera.gaps[0].stop_tick, "later ticks have been kept"
+
+
+def test_an_interruption_keeps_what_every_camera_has() -> None:
+    profile, frames, links = make(3, timeout_ms=60_000)
+    links["cam_00"].stream, links["cam_01"].stream = frames[0][:150].reshape(-1), frames[1][:160].reshape(-1)
+    links["cam_02"].faults = {30 * 20: UNPLUGGED}
+    stop = threading.Event()
+
+    def end(rates: Mapping[str, Rate]) -> None:
+        if rates["cam_00"].ticks == 150 and rates["cam_01"].ticks == 160 and rates["cam_02"].ticks == 20:
+            stop.set()
+
+    clip = capture(profile, links, 400 / 20000, stop=stop, on_rate=end)
+    assert clip.interrupted and clip.n_ticks == 150
+    for i, camera in enumerate(clip.cameras):
+        check_frames(camera, frames[i], 150)
+    assert [len(c.ticks) for c in clip.cameras] == [150, 150, 20]
+
+
+def test_ctrl_c_is_an_interruption_and_not_an_error() -> None:
+    profile, frames, links = make(2, timeout_ms=60_000)
+    for link in links.values():
+        link.limit = 4 * 1024
+    fastest = 0.0
+
+    def press(rates: Mapping[str, Rate]) -> None:
+        nonlocal fastest
+        assert set(rates) == {"cam_00", "cam_01"}
+        fastest = max(fastest, rates["cam_00"].bytes_per_s)
+        if all(rate.ticks == 4096 // 30 for rate in rates.values()):
+            raise KeyboardInterrupt
+
+    clip = capture(profile, links, 400 / 20000, on_rate=press)
+    assert clip.interrupted and clip.complete and clip.n_ticks == 4096 // 30 and fastest > 0
+    check_frames(clip.cameras[0], frames[0], clip.n_ticks)
+    assert links["cam_00"].log[-1].startswith("close")
+
+
+def test_a_camera_that_sends_nothing_is_no_array() -> None:
+    profile, _, links = make(2)
+    links["cam_00"].stream = np.empty(0, np.uint8)
+    with pytest.raises(UserError, match="camera cam_00: expected data after its start sequence, found time-out; check"):
+        capture(profile, links, SECONDS)
+    assert {f"close cam_{i:02d}" for i in range(2)} <= set(links["cam_00"].log)
+
+
+def test_an_interruption_before_the_first_tick_is_an_error() -> None:
+    profile, _, links = make(2)
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(UserError, match="expected a whole tick of every camera"):
+        capture(profile, links, SECONDS, stop=stop)
+
+
+def test_what_the_sink_raises_ends_the_capture() -> None:
+    profile, _, links = make(2)
+
+    def sink(camera: str, first_tick: int, raw: UInt8) -> None:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        capture(profile, links, SECONDS, sink=sink)
+    assert "close cam_01" in links["cam_00"].log
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_cameras_that_cannot_be_stopped_go_on_from_the_rehearsal(layout: str) -> None:
+    profile = rig(2, layout)
+    frames = [frames_of(i, layout_of(profile), 4000) for i in range(2)]
+    links = rig_of(frames, profile)
+    for link in links.values():
+        link.restartable, link.bytes_per_s = False, 1e6
+    clip = capture(profile, links, SECONDS)
+    assert clip.complete and clip.n_ticks == N
+    starts = set()
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        first = int(np.nonzero((source == camera.frames[0]).all(axis=1))[0][0])
+        np.testing.assert_array_equal(camera.frames, source[first : first + N])
+        starts.add(first)
+    assert min(starts) > 0, "what came before the trigger is dropped"
+    if layout == "tagged-rows":
+        assert len(starts) == 1, "the counters say which frames belong together"
+
+
+def test_arrival_is_the_tick_that_was_complete_when_a_read_ended() -> None:
+    profile, _, links = make(1)
+    camera = capture(profile, links, SECONDS).cameras[0]
+    expected = [1024 * (i + 1) // 30 for i in range(len(camera.arrival))]
+    assert camera.arrival[:, 0].tolist() == expected
+    assert (np.diff(camera.arrival[:, 1]) >= 0).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 6), st.lists(st.sampled_from(["take", "put", "pop", "discard"]), max_size=60))
+def test_a_ring_never_overwrites_what_waits(slots: int, steps: list[str]) -> None:
+    ring, flying, waiting, number, position, popped = Ring(slots, 8), [], [], itertools.count(1), 0, False
+    kept = False
+    for step in steps:
+        if step == "take":
+            flying.append(ring.take())
+        elif step in ("put", "discard") and flying:
+            keep = kept = kept or step == "put"
+            n = next(number)
+            flying.pop(0)[:] = n % 256
+            block = ring.put(n % 9, n, keep)
+            assert (block.position, block.bytes) == (position, n % 9)
+            position += n % 9
+            if keep:
+                waiting.append((block, n))
+        elif step == "pop":
+            block = ring.pop()
+            popped = False
+            if waiting:
+                expected, n = waiting.pop(0)
+                popped = expected.data is not None
+                assert block is expected
+                assert block.data is None or (block.data == n % 256).all()
+            else:
+                assert block is None
+        for block, n in waiting:
+            assert block.data is None or (block.data == n % 256).all()
+        held = sum(b.data is not None for b, _ in waiting)
+        assert ring.waiting == held and held + popped <= slots
+    assert ring.position == position
+
+
+def test_an_empty_queue_is_timed_from_the_newest_end() -> None:
+    idle = Idle()
+    for t in (0, 1, 2):
+        idle.submitted(t, False, True)
+    idle.ended(100)
+    idle.submitted(130, True, True)  # the other two have ended as well, and are told about later
+    idle.ended(101)
+    idle.submitted(131, False, True)
+    assert idle.starved == 0
+    idle.ended(110)
+    assert (idle.starved, idle.total_ns, idle.worst_ns) == (1, 20, 20)
+    alone = Idle()
+    for at, end in ((0, 10), (14, 20), (22, 30)):
+        alone.submitted(at, at > 0, True)
+        alone.ended(end)
+    assert (alone.starved, alone.total_ns, alone.worst_ns, alone.reads) == (2, 6, 4, 3)
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_spike_rates_are_counted_in_whole_frames(layout: str) -> None:
+    shape = layout_of(rig(1, layout))
+    pixels = np.zeros((8, shape.payload_bytes), np.uint8)
+    pixels[:, 0] = 0b1011
+    stream = shape.pack(pixels).reshape(-1)
+    block = Block(stream[11:], 11, len(stream) - 11, 0)
+    assert spikes_per_tick(shape, block) == 3 / (WIDTH * HEIGHT)
+    assert math.isnan(spikes_per_tick(shape, Block(stream[11:30], 11, 19, 0)))
+    assert math.isnan(spikes_per_tick(shape, None))

@@ -1,0 +1,219 @@
+"""`record`, the whole way: an emulated array through pyusb into a scene folder that every other command reads."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import array_cameras, write_small_scene
+
+from spike4dgs.benchmark.cli import main
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.generators.recorder import record as command
+from spike4dgs.generators.recorder import sources
+from spike4dgs.generators.recorder.emulation.array import EmulatedArray
+from spike4dgs.generators.recorder.emulation.camera import Fault
+from spike4dgs.generators.recorder.profile.profile import calibration_toml
+from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor.model import Sensor
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Four cameras, 80 ticks, the standard splits, ground truth of two cameras, and calibration recordings."""
+    root = tmp_path_factory.mktemp("source") / "pattern"
+    for i, camera in enumerate(array_cameras()):
+        calibration.write_calibration(root / "calibration", camera, Sensor(noise_seed=(i,), photons=5e4), [i])
+    facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
+    return write_small_scene(root, splits=True, extras={"calibration": facts})
+
+
+def record(*arguments):
+    return main(["record", *map(str, arguments)])
+
+
+def faulty(monkeypatch, *faults, **options):
+    """Emulated arrays fail so."""
+    monkeypatch.setattr(sources, "EmulatedArray", lambda p, s: EmulatedArray(p, s, faults=faults, **options))
+
+
+def same_streams(found, expected, n_ticks=None):
+    for camera in expected.cameras:
+        np.testing.assert_array_equal(found.stream(camera).packed, expected.stream(camera).packed[:n_ticks])
+
+
+@pytest.mark.parametrize("how", [(), ("--continuous",)], ids=["memory", "continuous"])
+def test_an_emulated_capture_is_the_scene_bit_by_bit(scene, tmp_path, capsys, how):
+    assert record("--emulate", scene, "--out", tmp_path / "x", *how) == 0
+    source, capture = open_scene(scene), open_scene(tmp_path / "x")
+    same_streams(capture, source)
+    for name, camera in source.cameras.items():
+        found = capture.cameras[name]
+        np.testing.assert_allclose(found.w2c, camera.w2c, atol=1e-12)
+        assert (found.fx, found.fy, found.cx, found.cy) == (camera.fx, camera.fy, camera.cx, camera.cy)
+    assert (capture.id, capture.train, capture.test) == ("x", source.train, source.test)
+    for split in source.meta["splits"]:
+        assert open_scene(tmp_path / "x", split=split).targets == open_scene(scene, split=split).targets
+    assert not capture.gaps and capture.meta["source"]["kind"] == "recorder"
+    assert set(capture.meta["source"]["cameras"]) == set(source.cameras)
+    assert main(["verify", str(tmp_path / "x")]) == 0
+    out = capsys.readouterr().out
+    assert out.index("armed") < out.index("triggered") < out.index("closed") < out.index("80 ticks of 4 cameras")
+
+
+def test_a_benchmark_on_the_capture_gives_the_scores_of_the_scene(scene, tmp_path):
+    assert record("--emulate", scene, "--out", tmp_path / "pattern-0") == 0  # named as the scene is
+    scores = []
+    for folder in (scene, tmp_path / "pattern-0"):
+        out = tmp_path / f"runs-{len(scores)}"
+        assert main(["run-benchmark", str(folder), "--methods", "nearest-view", "--out", str(out)]) == 0
+        cell = json.loads((out / "results" / "nearest-view.json").read_text())["scenes"]["pattern-0"]
+        scores.append((cell["metrics"], cell["per_image"], cell["predictions_sha256"]))
+    assert scores[0][0]["psnr"] > 15 and len(scores[0][1]) == 3
+    assert scores[0] == scores[1]
+
+
+def test_a_shorter_capture_has_the_truth_of_its_ticks(scene, tmp_path):
+    assert record("--emulate", scene, "--out", tmp_path / "x", "--seconds", 45 / 20000) == 0
+    capture = open_scene(tmp_path / "x")
+    same_streams(capture, open_scene(scene), 45)
+    assert [t.tick for t in capture.targets] == [20, 40]
+    assert sorted(p.stem for p in (tmp_path / "x/images").glob("*/*.exr")) == ["000020", "000030", "000040"]
+    np.testing.assert_array_equal(
+        capture.ground_truth(capture.targets[1]), open_scene(scene).ground_truth(capture.targets[1])
+    )
+
+
+def test_a_camera_that_loses_data_gives_exit_code_3_and_a_gap(scene, tmp_path, monkeypatch, capsys):
+    faulty(monkeypatch, Fault("cam_01", "unplugged", tick=30))
+    assert record("--emulate", scene, "--out", tmp_path / "x", "--preview") == command.LOST_DATA == 3
+    assert "gap: cam_01 from tick 30, 50 ticks (unplugged)" in capsys.readouterr().out
+    with pytest.raises(UserError, match="--allow-gaps"):
+        open_scene(tmp_path / "x")
+    capture, source = open_scene(tmp_path / "x", allow_gaps=True), open_scene(scene)
+    assert [(g.camera, g.first_tick, g.ticks) for g in capture.gaps] == [("cam_01", 30, 50)]
+    for camera in ("cam_00", "cam_02", "cam_03"):
+        np.testing.assert_array_equal(capture.stream(camera).packed, source.stream(camera).packed)
+    np.testing.assert_array_equal(capture.stream("cam_01").packed[:30], source.stream("cam_01").packed[:30])
+    assert not capture.stream("cam_01").packed[30:].any()
+
+
+def test_cameras_that_are_not_there_are_an_error_and_leave_nothing(scene, tmp_path, monkeypatch, capsys):
+    faulty(monkeypatch, Fault("cam_02", "missing"))
+    assert record("--emulate", scene, "--out", tmp_path / "x") == 2
+    assert "cam_02" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_ctrl_c_keeps_what_was_captured(scene, tmp_path, monkeypatch, capsys):
+    class Impatient(command.Watch):
+        def rates(self, rates):
+            if min(r.ticks for r in rates.values()) > 100:
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(command, "Watch", Impatient)
+    before = signal.getsignal(signal.SIGINT)
+    assert record("--emulate", scene, "--out", tmp_path / "x", "--seconds", 5) == 0
+    assert signal.getsignal(signal.SIGINT) is before
+    capture, source = open_scene(tmp_path / "x"), open_scene(scene)
+    assert 80 < capture.n_ticks < 100_000
+    assert "ended early" in capsys.readouterr().out
+    ticks = np.arange(capture.n_ticks) % 80  # an emulated camera begins anew after its last tick
+    for camera in source.cameras:
+        np.testing.assert_array_equal(capture.stream(camera).packed, source.stream(camera).packed[ticks])
+
+
+def test_only_the_third_ctrl_c_breaks_off_the_writing():
+    with pytest.raises(KeyboardInterrupt), command._interruptible() as stop:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the third one went unheard")
+
+
+# ------------------------------------------------------------ light and darkness
+
+
+def rig_of(scene, folder: Path) -> Path:
+    """A profile of the scene's cameras, as somebody would write it who owns them."""
+    cameras = open_scene(scene).cameras
+    folder.mkdir()
+    (folder / "calibration.toml").write_text(calibration_toml(cameras.values()))
+    lines = ['schema = "spike4dgs-rig/1"', 'name = "ours"', "width = 40", "height = 24", 'layout = "tagged-rows"']
+    lines += [
+        "radiance_gain = 0.6",
+        'held_out = ["cam_03"]',
+        'calibration = "calibration.toml"',
+        "[transfer]",
+        "bytes = 4096",
+    ]
+    lines += ["[defaults]", "vendor_id = 0x0403", "product_id = 0x601f", "endpoint_in = 0x82", "endpoint_out = 0x01"]
+    lines += ['start = ["01"]', 'stop = ["02"]', "mirrored = true"]
+    for i, name in enumerate(cameras):
+        lines += ["[[camera]]", f'id = "{name}"', f'serial = "S{i}"', f'role = "{"secondary" if i else "primary"}"']
+    (folder / "rig.toml").write_text("\n".join(lines))
+    return folder / "rig.toml"
+
+
+def test_flat_and_dark_recordings_go_into_a_clip_and_feed_calibrate(scene, tmp_path, capsys):
+    rig, source = rig_of(scene, tmp_path / "rig"), open_scene(scene)
+    for mode in ("flat", "dark"):
+        assert record(rig, "--emulate", scene, "--mode", mode, "--out", tmp_path / mode, "--preview") == 0
+        streams = open_stream_folder(tmp_path / mode)
+        for name in source.cameras:
+            np.testing.assert_array_equal(streams[name].packed, getattr(source.recordings(name), mode).packed)
+        assert (tmp_path / mode / "sheet.png").stat().st_size > 10_000
+    light = ("--flat", tmp_path / "flat", "--dark", tmp_path / "dark", "--flat-radiance", "0.7")
+    assert record(rig, "--emulate", scene, "--out", tmp_path / "clip", *light) == 0
+    same_streams(open_scene(tmp_path / "clip"), source)
+    assert not open_scene(tmp_path / "clip").targets  # what a rig of one's own sees has no truth
+    for name, folder in (("theirs", scene), ("ours", tmp_path / "clip")):
+        assert main(["calibrate", str(folder), "--out", str(tmp_path / name)]) == 0
+    for camera in source.cameras:
+        with np.load(tmp_path / f"ours/{camera}.npz") as ours, np.load(tmp_path / f"theirs/{camera}.npz") as theirs:
+            np.testing.assert_array_equal(ours["gain"], theirs["gain"])
+            np.testing.assert_array_equal(ours["dark"], theirs["dark"])
+
+
+def test_light_that_does_not_fit_is_refused(scene, tmp_path):
+    profile = sources.emulated_source(scene, None, "clip").profile
+    assert record("--emulate", scene, "--mode", "dark", "--out", tmp_path / "dark", "--seconds", "0.001") == 0
+    small = replace(profile, width=32)
+    with pytest.raises(UserError, match="recordings of one length by the cameras of emulated-pattern"):
+        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.7, small)
+    with pytest.raises(UserError, match="a positive radiance"):
+        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.0, profile)
+    with pytest.raises(UserError, match="calibrate-rig"):
+        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.7, command._without_poses(profile))
+
+
+# ------------------------------------------------------------ arguments
+
+
+def test_wrong_arguments_say_what_to_do(scene, small_scene, tmp_path, capsys):
+    out = ("--out", tmp_path / "x")
+    for arguments, message in (
+        ((), "--emulate SCENE"),
+        ((tmp_path / "none.toml",), "none.toml"),
+        (("--emulate", scene, "--seconds", "0.00001"), "at least 5e-05, one tick"),
+        (("--emulate", scene, "--flat", tmp_path), "no --dark, --flat-radiance"),
+        (("--emulate", small_scene, "--mode", "flat"), "none of cam_0"),
+        (("--emulate", scene, "--out", scene), "a new or empty folder"),
+    ):
+        assert record(*arguments, *(() if "--out" in arguments else out)) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_everything_that_the_machine_lacks_is_said_at_once(scene, tmp_path, monkeypatch, capsys):
+    lacks = [problem("disk", "room", "none", "free some"), problem("memory", "more", "less", "buy some")]
+    monkeypatch.setattr(command, "check_machine", lambda *a, **k: lacks)
+    assert record("--emulate", scene, "--out", tmp_path / "x") == 2
+    assert "free some; memory: expected more, found less; buy some" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""Which Mitsuba variant is used, and that the scalar one gives the same pictures."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators.rendering import mitsuba_variant
+from spike4dgs.generators.rendering.mitsuba_variant import FAST, OVERRIDE, SAFE, load_mitsuba
+
+_PICK = "from spike4dgs.generators.rendering.mitsuba_variant import pick_variant; print(pick_variant())"
+_RENDER = """
+import sys
+import numpy as np
+from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.worlds import WORLDS
+world = WORLDS["car"].build(0, 0, 0.02)
+renderer = MultiViewRenderer(world, cameras(world, 32, 20, (4,)), seed=0, spp=32, background_spp=128)
+np.savez(
+    sys.argv[1], key=renderer.keys(0.01), again=renderer.keys(0.01), background=renderer.background,
+    changed=renderer.changed(0.01), traced=renderer.traced(0.01), mask=renderer.object_masks(0.01),
+    depth=renderer.depths(0.01), crn=renderer.crn_frames(0.01),
+)
+"""
+
+
+def python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run `code` in a child process with a clean choice of variant and the given environment on top."""
+    env = {k: v for k, v in os.environ.items() if k not in (OVERRIDE, "DRJIT_LIBLLVM_PATH")} | environment
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=env, timeout=120, check=False
+    )
+
+
+def test_a_libllvm_that_does_not_load_means_the_scalar_variant_and_one_line(tmp_path: Path):
+    bogus = tmp_path / "libLLVM.so"
+    bogus.write_bytes(b"not a library")
+    environment = {"DRJIT_LIBLLVM_PATH": str(bogus), "XDG_CACHE_HOME": str(tmp_path)}
+    first = python(_PICK, **environment)
+    assert first.returncode == 0 and first.stdout.strip() == SAFE
+    lines = first.stderr.strip().splitlines()
+    assert len(lines) == 1 and FAST in lines[0] and "libllvm19" in lines[0]
+    assert "not work here (ImportError: " in lines[0]  # the reason
+    (answer,) = (tmp_path / "spike4dgs").glob("mitsuba-*.json")
+    answer.write_text('{"why_not": "remembered"}')  # the second process reads the answer and does not probe
+    second = python(_PICK, **environment)
+    assert second.stdout.strip() == SAFE and "(remembered)" in second.stderr
+    answer.write_text("{ damaged")
+    assert python(_PICK, **environment).stdout.strip() == SAFE
+
+
+def test_asking_for_llvm_without_libllvm_is_one_clear_error(tmp_path: Path):
+    bogus = tmp_path / "libLLVM.so"
+    bogus.write_bytes(b"not a library")
+    environment = {"DRJIT_LIBLLVM_PATH": str(bogus), "XDG_CACHE_HOME": str(tmp_path), OVERRIDE: FAST}
+    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    out = tmp_path / "data"
+    found = python(code, "make-dataset", "car", "--profile", "tiny", "--out", str(out), **environment)
+    assert found.returncode == 2 and "apt-get install libllvm19" in found.stderr.splitlines()[-1]
+    assert not out.exists() or not any(out.glob("*"))
+
+
+def test_the_override_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(OVERRIDE, SAFE)
+    mitsuba_variant.pick_variant.cache_clear()
+    assert mitsuba_variant.pick_variant() == SAFE
+    monkeypatch.setenv(OVERRIDE, "gpu")
+    mitsuba_variant.pick_variant.cache_clear()
+    with pytest.raises(UserError, match=f"{OVERRIDE}.*gpu"):
+        mitsuba_variant.pick_variant()
+    mitsuba_variant.pick_variant.cache_clear()
+
+
+def test_scalar_and_vectorised_pictures_agree_within_noise(tmp_path: Path):
+    if load_mitsuba().variant() != FAST:
+        pytest.skip(f"{FAST} does not work here (no usable libLLVM)")
+    pictures = {}
+    for variant in (SAFE, FAST):
+        child = python(_RENDER, str(tmp_path / f"{variant}.npz"), **{OVERRIDE: variant})
+        assert child.returncode == 0, child.stderr
+        assert not (child.stdout + child.stderr).strip()  # quiet: no warnings about samplers
+        with np.load(tmp_path / f"{variant}.npz") as data:
+            pictures[variant] = dict(data)
+    slow, fast = pictures[SAFE], pictures[FAST]
+    for p in pictures.values():
+        assert np.array_equal(p["key"], p["again"])
+        assert np.array_equal(p["key"][~p["changed"]], p["background"][~p["changed"]])
+        assert np.array_equal(p["key"][p["mask"]], p["crn"][p["mask"]])
+    for name in ("mask", "traced"):
+        assert (slow[name] != fast[name]).mean() < 0.002
+    np.testing.assert_allclose(slow["depth"], fast["depth"], rtol=1e-3)
+    difference = slow["key"] - fast["key"]
+    assert np.abs(difference).mean() < 0.02
+    assert abs(difference.mean()) < 0.002

@@ -1,0 +1,135 @@
+"""Calibration from flat-field and dark recordings: what comes out is what the camera was made with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import array_cameras, write_small_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
+from spike4dgs.benchmark.scene.cameras import look_at
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
+from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor
+
+WIDTH, HEIGHT = 200, 125
+
+
+def recordings(folder, sensor):
+    up = np.array([0.0, 0.0, 1.0])
+    camera = look_at("cam_00", np.array([0, -3.0, 1]), np.zeros(3), up, focal=200, width=WIDTH, height=HEIGHT)
+    calibration.write_calibration(folder, camera, sensor, [1, 2])
+    flat, dark = (open_stream(folder / name / "cam_00.dat", WIDTH, HEIGHT, 2e4) for name in ("flat", "dark"))
+    return Recordings(flat, dark, calibration.FLAT_RADIANCE)
+
+
+def rms(found, truth):
+    return float(np.sqrt(np.mean((found / truth - 1) ** 2)))
+
+
+def test_maps_are_recovered_from_what_a_scene_ships(tmp_path):
+    pixels = HEIGHT, WIDTH, 0, "cam_00"
+    sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+    made = recordings(tmp_path, sensor)
+    flat, dark = made.flat, made.dark
+    assert (flat.n_ticks, dark.n_ticks) == (calibration.FLAT_TICKS, calibration.DARK_TICKS)
+    found = estimate(made)
+    assert rms(found.gain, sensor.gain) < 0.003  # asked for: 0.01
+    assert rms(found.dark, sensor.dark) < 0.05  # asked for: 0.20
+    assert found.radiance_gain == pytest.approx(0.6, rel=1e-3)
+    counted = flat.counts(0, flat.n_ticks) / flat.n_ticks - dark.counts(0, dark.n_ticks) / dark.n_ticks
+    assert rms(found.gain, sensor.gain) < 0.5 * rms(counted / counted.mean(), sensor.gain)  # better than counting
+
+
+def test_an_ideal_camera_comes_out_flat_and_dark(tmp_path):
+    found = estimate(recordings(tmp_path, Sensor()))
+    assert np.abs(found.gain - 1).max() < 0.01
+    assert found.dark.max() < 1 / calibration.DARK_TICKS
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 21), st.integers(1, 60), st.booleans(), st.integers(0, 2**31))
+def test_rates_are_those_of_the_unpacked_spikes(height, width, n, bottom_up, seed):
+    rng = np.random.default_rng(seed)
+    spikes = rng.random((n, height, width)) < rng.random((height, width))
+    stream = SpikeStream(pack(spikes, bottom_up), width, height, 2e4, bottom_up)
+    expected = np.zeros((height, width))
+    for y, x in np.ndindex(height, width):
+        t = np.flatnonzero(spikes[:, y, x])
+        expected[y, x] = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else (1 if len(t) else 0.5) / n
+    np.testing.assert_allclose(rates(stream), expected)
+
+
+def test_recordings_that_do_not_fit_are_refused():
+    dark = SpikeStream(pack(np.zeros((40, 8, 16))), 16, 8, 2e4)
+    other = SpikeStream(pack(np.zeros((40, 8, 24))), 24, 8, 2e4)
+    with pytest.raises(UserError, match="one size"):
+        estimate(Recordings(other, dark, 0.7))
+    with pytest.raises(UserError, match="no more spikes than in the dark"):
+        estimate(Recordings(dark, dark, 0.7))
+
+
+def scene_with_recordings(root, facts):
+    for camera in array_cameras():
+        pixels = camera.height, camera.width, 0, camera.id
+        sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+        calibration.write_calibration(root / "calibration", camera, sensor, [1, 2])
+        if camera.id != "cam_03":  # nobody knows the truth of this one
+            write_maps(root / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
+    return write_small_scene(root, extras={"calibration": facts})
+
+
+FACTS = {
+    "flat_radiance": calibration.FLAT_RADIANCE,
+    "flat_ticks": calibration.FLAT_TICKS,
+    "dark_ticks": calibration.DARK_TICKS,
+}
+
+
+def test_the_command_writes_maps_and_pictures_and_scores_them(tmp_path, capsys):
+    scene = scene_with_recordings(tmp_path / "scene", FACTS)
+    assert calibration.calibrate(scene, out=tmp_path / "out") == 0
+    lines = {line.split()[1]: line.split() for line in capsys.readouterr().out.splitlines() if "cam_" in line}
+    assert set(lines) == {"cam_00", "cam_01", "cam_02", "cam_03"}
+    for camera, cells in lines.items():
+        gain_error, dark_error = cells[9], cells[11]
+        with np.load(tmp_path / f"out/{camera}.npz") as maps:
+            gain, dark = maps["gain"], maps["dark"]
+        assert (tmp_path / f"out/{camera}.png").stat().st_size > 10_000
+        if camera == "cam_03":
+            assert (gain_error, dark_error) == ("-", "-")
+            continue
+        with np.load(scene / f"truth/{camera}.npz") as truth:
+            assert float(gain_error) == pytest.approx(100 * rms(gain, truth["gain"]), abs=0.001)
+            assert float(dark_error) == pytest.approx(100 * rms(dark, truth["dark"]), abs=0.001)
+        assert 0 < float(gain_error) < 1 and 0 < float(dark_error) < 20
+
+
+def test_light_is_recovered_from_the_rates_of_uneven_pixels(tmp_path):
+    pixels = HEIGHT, WIDTH, 0, "cam_00"
+    sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
+    radiance = np.random.default_rng(0).uniform(0.05, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    rate = 0.6 * sensor.gain * radiance + sensor.dark
+    assert np.abs(rate / 0.6 - radiance).max() > 0.1
+    assert np.abs(estimate(recordings(tmp_path, sensor)).radiance(rate) - radiance).max() < 0.02
+
+
+def test_methods_get_a_calibration_of_every_training_camera_or_none(tmp_path, small_scene):
+    assert open_scene(small_scene).training.calibrations is None
+    scene = open_scene(scene_with_recordings(tmp_path / "scene", FACTS)).training
+    assert len(scene.calibrations) == len(scene.cameras)
+    for camera, found in zip(scene.cameras, scene.calibrations, strict=True):
+        assert rms(found.gain, gain_map(camera.height, camera.width, 0, camera.id)) < 0.01
+
+
+def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
+    with pytest.raises(UserError, match="calibration recordings, found none of cam_00"):
+        calibration.calibrate(small_scene, out=tmp_path / "out")
+    scene = scene_with_recordings(tmp_path / "other", FACTS | {"dark_ticks": 77})
+    with pytest.raises(UserError, match="77 ticks"):
+        calibration.calibrate(scene, out=tmp_path / "out")

@@ -1,0 +1,311 @@
+"""The simulator against its float64 twin, closed forms and the statistics of real spike cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.generators.sensor.kernels import THRESHOLD
+from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.reference import fire, simulate_reference, tick_means
+
+TICKS = 100_000
+
+
+class Lazy:
+    """Keys computed on demand: nobody may need them all at once."""
+
+    def __init__(self, n, image):
+        self.n, self.image = n, image
+
+    def __len__(self):
+        return self.n
+
+    def __getitem__(self, k):
+        return self.image(k)
+
+
+def stream(keys, ticks, n, sensor, charge, threads=1):
+    packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads=threads)))
+    return SpikeStream(packed, charge.shape[1], charge.shape[0], 20000.0)
+
+
+def maps(height, width, on):
+    return Sensor(0.6, gain_map(height, width, 1, "cam_00"), dark_map(height, width, 1, "cam_00")) if on else Sensor()
+
+
+def checkpoints(s):
+    """Cumulative counts [H, W] at 1000, 51000 and 100000 ticks."""
+    return {1000: s.counts(0, 1000), 51_000: s.counts(0, 51_000)} | {
+        TICKS: s.counts(0, 51_000).astype(int) + s.counts(51_000, TICKS)
+    }
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_constant_light_has_no_drift(on):
+    light = np.linspace(0, 2.2, 9 * 15, dtype=np.float32).reshape(9, 15)  # up to saturation
+    sensor, charge = maps(9, 15, on), random_charge(9, 15, [3])
+    gain, dark = (1.0, 0.0) if not on else (sensor.gain.astype(float), sensor.dark.astype(float))
+    rate = np.clip(0.6 * gain * light.astype(float) + dark, 0, 1)
+    s = stream(Lazy(101, lambda k: light), np.arange(101) * 1000, TICKS, sensor, charge)
+    for n, counts in checkpoints(s).items():
+        exact = charge / THRESHOLD + n * rate
+        # integers only add their own rounding, 2^-31 a tick: 5e-5 after 10^5 ticks
+        assert (counts <= np.floor(exact + 1e-9)).all()
+        assert (counts >= np.floor(exact - n * 2.0**-31 - 1e-9)).all()
+
+
+@pytest.mark.parametrize("spacing", [8, 100])
+def test_linear_light_has_no_drift(spacing):
+    rng = np.random.default_rng(0)
+    first, last = rng.random((2, 9, 15)) * 1.5
+    sensor, charge = maps(9, 15, True), random_charge(9, 15, [3])
+    n_keys = TICKS // spacing + 1
+
+    def light(k):
+        return (first + (last - first) * (k / (n_keys - 1))).astype(np.float32)
+
+    s = stream(Lazy(n_keys, light), np.arange(n_keys) * spacing, TICKS, sensor, charge)
+    for n, counts in checkpoints(s).items():
+        mean = first + (last - first) * (n / 2 / TICKS)
+        exact = charge / THRESHOLD + n * (0.6 * sensor.gain * mean + sensor.dark)
+        assert np.abs(counts - np.floor(exact)).max() <= 1
+        assert (counts == np.floor(exact)).mean() > 0.95
+
+
+def near_threshold(keys, ticks, n, sensor, charge, tolerance=1e-4):
+    """[n, H, W]: where the exact charge lies so near the threshold that rounding may decide."""
+    levels = (level for _, level in fire(tick_means(keys, ticks, n), sensor, charge))
+    return np.stack([np.abs((level + 0.5) % 1 - 0.5) < tolerance for level in levels])
+
+
+def strays(spikes, expected):
+    """[n, H, W]: where a pixel's number of spikes so far leaves the twin's; coming back is no fault of its own."""
+    ahead = np.cumsum(spikes.astype(int) - expected, axis=0)
+    return (ahead != 0) & (np.concatenate([0 * ahead[:1], ahead[:-1]]) == 0)
+
+
+@settings(max_examples=30, deadline=None)
+@example(height=6, width=7, gaps=[1, 10, 24], cut=0, contrast=1.0, on=False, seed=654)  # a spike one tick early
+@given(
+    height=st.integers(1, 17),
+    width=st.integers(1, 23),
+    gaps=st.lists(st.integers(1, 24), min_size=1, max_size=8),
+    cut=st.integers(0, 5),
+    contrast=st.sampled_from([0.0, 0.01, 1.0, 30.0]),
+    on=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_equals_the_twin(height, width, gaps, cut, contrast, on, seed):
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum([0, *gaps])
+    n = max(1, int(ticks[-1]) - cut)
+    keys = (0.5 + contrast * rng.random((len(ticks), height, width))).astype(np.float32)
+    still = rng.random((height, width)) < 0.5
+    keys[:, still] = keys[0, still]
+    sensor, charge = maps(height, width, on), random_charge(height, width, [seed])
+    got = stream(keys, ticks, n, sensor, charge)
+    expected = simulate_reference(keys, ticks, n, sensor, charge)
+    differ = got.window(0, n) != expected
+    assert differ.mean() <= 0.01
+    assert not (strays(got.window(0, n), expected) & ~near_threshold(keys, ticks, n, sensor, charge)).any()
+    assert np.abs(got.counts(0, n).astype(int) - expected.sum(0)).max() <= 1
+    if not differ.any():
+        assert np.array_equal(got.packed, pack(expected))
+
+
+def scene(seed=0, height=31, width=45, n_keys=60):
+    keys = np.random.default_rng(seed).random((n_keys, height, width), dtype=np.float32)
+    keys[:, :, :20] = keys[0, :, :20]
+    return keys, np.arange(n_keys) * 5, (n_keys - 1) * 5
+
+
+@pytest.mark.parametrize("photons", [None, 5e4])
+def test_bytes_depend_on_the_seed_and_not_on_threads_or_batches(monkeypatch, photons):
+    keys, ticks, n = scene()
+    sensor, charge = replace(maps(31, 45, True), photons=photons), random_charge(31, 45, [0, 7])
+    once = stream(keys, ticks, n, sensor, charge, threads=1).packed
+    assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=2).packed)
+    monkeypatch.setattr("spike4dgs.generators.sensor.model._BATCH_BYTES", 4 * 31 * 45 * 7)
+    assert len(list(simulate(keys, ticks, n, sensor, charge))) > 5
+    assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=3).packed)
+    other = random_charge(31, 45, [1, 7])
+    assert not np.array_equal(once, stream(keys, ticks, n, sensor, other).packed)
+    assert np.array_equal(charge, random_charge(31, 45, [0, 7]))  # the caller's array is not changed
+
+
+def test_padding_bits_are_zero():
+    keys, ticks, n = scene(height=7, width=9)  # 63 pixels
+    packed = stream(keys * 0 + 5, ticks, n, Sensor(), random_charge(7, 9, [0])).packed
+    assert packed.shape == (n, 8)
+    assert (packed[:, -1] == 0x7F).all()
+
+
+def test_two_adjacent_intervals_in_constant_light():
+    """Real recordings show two adjacent intervals at 95 % of pixels, because the rest of the charge is kept."""
+    light = np.random.default_rng(0).uniform(0.15, 1.4, (40, 60)).astype(np.float32)
+    s = stream(np.stack([light, light]), [0, 500], 500, maps(40, 60, True), random_charge(40, 60, [0]))
+    spikes = s.window(0, 500).reshape(500, -1)
+    isis = [np.unique(np.diff(np.flatnonzero(pixel))) for pixel in spikes.T]
+    assert all(i.max() - i.min() <= 1 for i in isis if len(i))
+    assert np.mean([len(i) == 2 for i in isis]) >= 0.95
+
+
+def test_count_variance_is_that_of_an_ideal_integrator():
+    """Counts in a window of constant light vary by f(1-f) only, f the fractional part of the expected count."""
+    light = np.random.default_rng(0).uniform(0.1, 1.0, (40, 60)).astype(np.float32)
+    s = stream(np.stack([light, light]), [0, 4000], 4000, Sensor(), random_charge(40, 60, [0]))
+    counts = np.stack([s.counts(a, a + 20) for a in range(0, 4000, 20)]).astype(float)
+    f = (0.6 * 20 * light) % 1
+    assert np.abs(counts.var(axis=0) - f * (1 - f)).mean() < 0.02
+
+
+def test_interpolation_meets_keys_and_never_overshoots():
+    rng = np.random.default_rng(0)
+    keys = rng.random((6, 4, 5))
+    ticks = [0, 400, 800, 1200, 1600, 2000]
+    means = np.stack(list(tick_means(keys, ticks, 2000)))
+    for k in range(5):
+        part = means[ticks[k] : ticks[k + 1]]
+        assert (part >= np.minimum(keys[k], keys[k + 1]) - 1e-12).all()
+        assert (part <= np.maximum(keys[k], keys[k + 1]) + 1e-12).all()
+        assert np.abs(part[0] - keys[k]).max() < 0.01  # a tick is 1/400 of the interval
+        assert np.abs(part[-1] - keys[k + 1]).max() < 0.01
+
+
+def test_interpolation_is_exact_for_linear_and_inner_quadratic_light():
+    t = np.arange(0, 101, 10.0)
+    for curve, integral, inner in (
+        (lambda x: 2 + 0.01 * x, lambda x: 2 * x + 0.005 * x**2, slice(0, 100)),
+        (lambda x: (x + 50) ** 2 / 1e4, lambda x: (x + 50) ** 3 / 3e4, slice(10, 90)),  # monotone: no clamp acts
+    ):
+        means = np.array([m[0, 0] for m in tick_means(curve(t)[:, None, None], t.astype(int), 100)])
+        exact = np.diff(integral(np.arange(101.0)))
+        assert np.allclose(means[inner], exact[inner], rtol=0, atol=1e-12)
+
+
+def test_saturated_pixels_fire_every_tick_and_recover_at_once():
+    keys = np.array([50, 50, 50, 0, 0, 0], np.float32)[:, None, None] * np.ones((1, 8, 8), np.float32)
+    s = stream(keys, np.arange(6) * 10, 50, Sensor(), random_charge(8, 8, [0]))
+    assert (s.window(0, 20) == 1).all()
+    assert (s.window(30, 50) == 0).all()
+
+
+def test_maps_have_the_spread_of_the_real_camera(tmp_path):
+    gain, dark = gain_map(250, 400, 0, "cam_00"), dark_map(250, 400, 0, "cam_00")
+    smooth = np.add.reduceat(np.add.reduceat(gain, np.arange(0, 250, 10), 0), np.arange(0, 400, 10), 1) / 100
+    local = gain / np.repeat(np.repeat(smooth, 10, 0), 10, 1)
+    assert gain.mean() == pytest.approx(1, abs=1e-5)
+    assert gain.std() == pytest.approx(0.058, abs=0.002)
+    assert local.std() == pytest.approx(0.032, rel=0.15)
+    assert np.median(dark) == pytest.approx(0.0045, rel=0.02)
+    assert np.percentile(dark, [1, 99]) == pytest.approx([0.0015, 0.0128], rel=0.1)
+    assert 40 < (dark > 5 * np.median(dark)).sum() < 160
+    assert np.array_equal(gain, gain_map(250, 400, 0, "cam_00"))
+    assert not np.array_equal(gain, gain_map(250, 400, 0, "cam_01"))
+    assert not np.array_equal(gain, gain_map(250, 400, 1, "cam_00"))
+    for name in ("a.npz", "b.npz"):
+        write_maps(tmp_path / name, {"gain": gain, "dark": None})
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert list(np.load(tmp_path / "a.npz")) == ["gain"]
+
+
+def test_bad_input_is_named():
+    keys, ticks, n = scene()
+    charge = random_charge(31, 45, [0])
+    for bad_ticks, bad_n in ((ticks[:-1], n), (ticks + 1, n), (ticks, n + 1), (ticks * 0, n)):
+        with pytest.raises(UserError, match=r"key frames: expected .*; correct"):
+            list(simulate(keys, bad_ticks, bad_n, Sensor(), charge))
+    with pytest.raises(UserError, match="gain map"):
+        list(simulate(keys, ticks, n, Sensor(gain=np.ones((2, 2), np.float32)), charge))
+
+
+# ---------------------------------------------------------------- shot noise and tick means
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 40), st.sampled_from([100.0, 5e3, 5e4]), st.booleans(), st.integers(0, 2**31))
+def test_shot_noise_is_the_twins(height, width, photons, on, seed):
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum([0, *rng.integers(1, 9, 12)])
+    keys = rng.uniform(0, 2.2, (13, height, width)).astype(np.float32)  # up to saturation
+    sensor = replace(maps(height, width, on), photons=photons, noise_seed=(seed,))
+    charge = random_charge(height, width, [seed])
+    n = int(ticks[-1]) - 1
+    s = stream(keys, ticks, n, sensor, charge, threads=1)
+    exact = simulate_reference(keys, ticks.tolist(), n, sensor, charge)
+    assert np.array_equal(s.packed, stream(keys, ticks, n, sensor, charge, threads=3).packed)
+    spikes = s.window(0, n)
+    assert np.abs(spikes.sum(0).astype(int) - exact.sum(0)).max() <= 1
+    # a pixel leaves the twin only where rounding may decide; from there on its random numbers are other ones
+    differ = spikes != exact
+    first = differ & (np.cumsum(differ, axis=0) == 1)
+    assert not (first & ~near_threshold(keys, ticks, n, sensor, charge)).any()
+    assert differ.mean() < 0.02
+
+
+def test_intervals_vary_as_photons_do():
+    """Against a plain simulation that draws a Poisson number of photons in every tick."""
+    n, photons, rate = 20_000, 400, 0.11
+    shape, rng = (20, 30), np.random.default_rng(0)
+    light = np.full(shape, rate / 0.6, np.float32)
+    charge = random_charge(*shape, [5])
+    sensor = Sensor(photons=photons, noise_seed=(5,))
+    ours = stream([light, light], [0, n], n, sensor, charge).window(0, n)
+    level, plain = charge / THRESHOLD * photons, np.empty((n, *shape), bool)
+    for tick in range(n):
+        level = level + rng.poisson(rate * photons, shape)
+        plain[tick] = level >= photons
+        level -= photons * plain[tick]
+
+    def spread(spikes: np.ndarray, lag: int) -> tuple[float, float]:
+        """Mean and variance of the time over `lag` intervals, over all pixels."""
+        times = [np.flatnonzero(spikes[:, y, x]) for y in range(shape[0]) for x in range(shape[1])]
+        spans = np.concatenate([t[lag:] - t[:-lag] for t in times])
+        return float(spans.mean()), float(spans.var())
+
+    for lag in (1, 4, 16):
+        (mean, variance), (plain_mean, plain_variance) = spread(ours, lag), spread(plain, lag)
+        assert mean == pytest.approx(plain_mean, rel=1e-3) == pytest.approx(lag / rate, rel=2e-3)
+        assert variance == pytest.approx(plain_variance, rel=0.05)
+        tick = 1 / 6  # of reading out at whole ticks: the variance of the difference of two uniform numbers
+        assert variance - tick == pytest.approx(lag / photons / rate**2, rel=0.10)
+
+
+def test_a_full_well_stays_full_with_noise():
+    light = np.full((4, 16), 5.0, np.float32)
+    moving = np.stack([light, light + 1, light])  # the other kernel
+    for keys, ticks in (([light, light], [0, 3000]), (moving, [0, 1500, 3000])):
+        for photons in (None, 100, 5e4):
+            sensor = Sensor(photons=photons, noise_seed=(1,))
+            s = stream(keys, ticks, 3000, sensor, random_charge(4, 16, [0]))
+            assert (s.counts(1, 3000) == 2999).all()
+
+
+def test_noise_differs_between_seeds_and_not_between_runs():
+    light = np.full((8, 16), 0.5, np.float32)
+    clip = ([light, light], [0, 500], 500)
+    charge = random_charge(8, 16, [0])
+    first, again, other = (stream(*clip, Sensor(photons=1000, noise_seed=(seed,)), charge).packed for seed in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_tick_means_are_taken_as_they_are():
+    rng = np.random.default_rng(0)
+    means = rng.uniform(0, 1.5, (70, 5, 13)).astype(np.float32)
+    charge = random_charge(5, 13, [0])
+    for sensor in (maps(5, 13, True), replace(maps(5, 13, True), photons=5e4)):
+        packed = np.concatenate(list(simulate(means, range(70), 70, sensor, charge, means=True)))
+        spikes = SpikeStream(packed, 13, 5, 20000.0).window(0, 70)
+        assert np.array_equal(spikes, simulate_reference(means, range(70), 70, sensor, charge, means=True))
+    with pytest.raises(UserError, match="mean of every tick"):
+        next(simulate(means[:35], range(0, 70, 2), 70, Sensor(), charge, means=True))
+    with pytest.raises(UserError, match="photons per spike"):
+        next(simulate(means, range(70), 69, Sensor(photons=10), charge))

@@ -1,0 +1,125 @@
+"""The simulated camera against published and measured statistics of a real one: each within 15 %."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from small_scenes import shared_file
+
+from spike4dgs.benchmark.scene.calibration import rates
+from spike4dgs.benchmark.spikes.stream import open_stream
+from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.statistics import WINDOWS, excess_variance, local_spread, stream_statistics
+
+HEIGHT, WIDTH, TICKS = 250, 400, 500
+# a motionless recording of a 250x400 camera, 500 frames
+ONE_INTERVAL, TWO_INTERVALS, EXCESS = 0.016, 0.952, (0.0032, 0.0069, 0.0148, 0.0218)
+GAIN_LOCAL, GAIN_SPREAD, DARK_PERCENTILES, HOT = 0.032, 0.058, (0.0015, 0.0045, 0.0128), 88
+WITHIN = 0.15
+
+
+def real_sensor(photons: float | None = PHOTONS_PER_SPIKE) -> Sensor:
+    pixels = HEIGHT, WIDTH, 0, "cam_00"
+    return Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=photons, noise_seed=(0,))
+
+
+def record(light: np.ndarray, sensor: Sensor, ticks: int = TICKS) -> np.ndarray:
+    """Unpacked spikes [T, H, W] of a scene that stands still."""
+    height, width = light.shape
+    packed = np.concatenate(
+        list(simulate([light, light], [0, ticks], ticks, sensor, random_charge(height, width, [0])))
+    )
+    bits = np.unpackbits(packed, axis=1, bitorder="little")[:, : height * width]
+    return bits.reshape(ticks, height, width)[:, ::-1].astype(bool)
+
+
+@pytest.fixture(scope="module")
+def roadside() -> np.ndarray:
+    """Smooth light with log-normal rates around 0.1 spikes per tick (98 % of the pixels between 0.04 and 0.26).
+
+    The rates of the published recording are not known. How many pixels have one interval depends on little else: the
+    median follows from that share; the other figures are then predictions.
+    """
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(HEIGHT, WIDTH)), 12)
+    return (0.1 / 0.6 * np.exp(0.4 * (noise - noise.mean()) / noise.std())).astype(np.float32)
+
+
+def test_intervals_and_count_variance_are_the_real_cameras(roadside):
+    found = stream_statistics(record(roadside, real_sensor()))
+    assert found.one_interval == pytest.approx(ONE_INTERVAL, rel=WITHIN)
+    assert found.two_intervals == pytest.approx(TWO_INTERVALS, rel=WITHIN)
+    assert found.other_intervals == pytest.approx(1 - ONE_INTERVAL - TWO_INTERVALS, rel=WITHIN)
+    assert found.excess_variance == pytest.approx(EXCESS, rel=WITHIN)
+
+
+def test_wrong_cameras_are_told_apart(roadside):
+    """What other simulators do: a hard reset has one interval, Poisson on the gray level far too much variance."""
+    rate = 0.6 * roadside.astype(np.float64)
+    level, hard = np.random.default_rng(0).random(rate.shape), np.empty((TICKS, *rate.shape), bool)
+    for tick in range(TICKS):
+        level += rate
+        hard[tick] = level >= 1
+        level[hard[tick]] = 0
+    assert stream_statistics(hard).two_intervals < 0.1
+    noisy = record(roadside, real_sensor(photons=150))
+    assert excess_variance(noisy.reshape(TICKS, -1), 60) > 1.5 * EXCESS[-1]
+
+
+def test_maps_have_the_published_spreads():
+    sensor = real_sensor()
+    assert sensor.gain.mean() == pytest.approx(1, abs=1e-6)
+    assert sensor.gain.std() == pytest.approx(GAIN_SPREAD, rel=WITHIN)
+    assert local_spread(sensor.gain) == pytest.approx(GAIN_LOCAL, rel=WITHIN)
+    assert np.percentile(sensor.dark, (1, 50, 99)) == pytest.approx(DARK_PERCENTILES, rel=WITHIN)
+    assert (sensor.dark > 5 * np.median(sensor.dark)).sum() == pytest.approx(HOT, rel=WITHIN)
+
+
+def test_a_definition_of_excess_variance_against_its_closed_form():
+    """Counts of an ideal pixel are one of two neighbours; the rest is the estimate's own f (1 - f) / (n - 1)."""
+    rate, window, n = 0.237, 20, 25
+    level = np.random.default_rng(0).random(4000)
+    spikes = np.floor(level + rate * np.arange(1, n * window + 1)[:, None]) - np.floor(
+        level + rate * np.arange(n * window)[:, None]
+    )
+    f = (rate * window) % 1
+    assert excess_variance(spikes.astype(bool), window) == pytest.approx(f * (1 - f) / (n - 1), rel=0.05)
+
+
+def test_still_pixels_of_a_real_recording_and_of_a_simulation_at_their_rates():
+    stream = open_stream(shared_file("data/real_spikes/car_100kmh_250x400_200f.dat"), WIDTH, HEIGHT, 4e4)
+    real = stream.window(0, stream.n_ticks).astype(bool)
+    quarters = np.stack([gaussian_filter(part.mean(0), 2) for part in np.split(real, 4)])
+    still = np.ptp(quarters, axis=0) < 0.004  # the car comes nowhere near
+    still &= (real.mean(0) > 0.05) & (real.mean(0) < 0.95)
+    assert still.sum() > 5000
+    light = (rates(stream) / 0.6).astype(np.float32)
+    a = stream_statistics(real, still)
+    ours = {n: stream_statistics(record(light, Sensor(photons=n), len(real)), still) for n in (2.5e4, 5e4, 1e5)}
+    b = ours[PHOTONS_PER_SPIKE]
+    assert b.one_interval == pytest.approx(a.one_interval, rel=WITHIN)
+    assert b.two_intervals == pytest.approx(a.two_intervals, rel=WITHIN)
+    assert b.other_intervals == pytest.approx(a.other_intervals, rel=WITHIN)
+    assert b.excess_variance[: len(WINDOWS) - 1] == pytest.approx(a.excess_variance[: len(WINDOWS) - 1], rel=WITHIN)
+    # twice or half as many photons to a spike would not do
+    assert ours[1e5].other_intervals < 0.8 * a.other_intervals < 1.25 * a.other_intervals < ours[2.5e4].other_intervals
+
+
+def test_measured_maps_and_ours_have_the_same_spread():
+    with np.load(shared_file("data/real_spikes/calib_nonuniformity_250x400.npz")) as maps:
+        light, dark, gain = maps["D_light"], maps["Nd"], maps["Nl"]
+    sensor = real_sensor()
+    assert robust_spread(sensor.gain) == pytest.approx(robust_spread(gain), rel=WITHIN)
+    assert sensor.gain.std() == pytest.approx(gain.std() / gain.mean(), rel=WITHIN)
+    assert local_spread(sensor.gain) == pytest.approx(local_spread(gain), rel=WITHIN)
+    # `dark` is in lux, and the interval less one is inversely proportional to the light, which was 335 lux at `light`
+    rate = 1 / (1 + light * (335 + dark) / dark)
+    assert np.percentile(sensor.dark, (1, 50, 99)) == pytest.approx(np.percentile(rate, (1, 50, 99)), rel=WITHIN)
+    assert (sensor.dark > 5 * np.median(sensor.dark)).sum() == pytest.approx(
+        (dark > 5 * np.median(dark)).sum(), rel=WITHIN
+    )
+
+
+def robust_spread(image: np.ndarray) -> float:
+    return float(1.4826 * np.median(np.abs(image / np.median(image) - 1)))

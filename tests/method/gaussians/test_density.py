@@ -1,0 +1,209 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.optimizer import MOMENTS, Decay, apply_edit, export_state, make_adam, set_rates
+from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate, share
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.splat import Views, render
+
+SETTINGS = TrainSettings()
+HIGH = 2 * SETTINGS.grow_gradient
+
+
+def cloud(n: int, seed: int = 0) -> Gaussians:
+    """Gaussians of all shapes around the origin, none of them faint or large."""
+    rng = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=rng) - 0.5,
+        log_scales=-6 + torch.rand(n, 3, generator=rng),
+        quats=torch.randn(n, 4, generator=rng),
+        logits=torch.logit(0.1 + 0.8 * torch.rand(n, generator=rng)),
+        colors=torch.rand(n, 1, generator=rng),
+    )
+
+
+def camera(x: float) -> Camera:
+    up = np.array([0.0, 0.0, 1.0])
+    return look_at("c", np.array([x, -3.0, 0.4]), np.zeros(3), up, focal=90.0, width=64, height=48)
+
+
+def pressure(values: list[float]) -> Pressure:
+    return Pressure(torch.tensor(values), torch.ones(len(values)))
+
+
+def mask(n: int, *rows: int) -> Tensor:
+    return torch.zeros(n, dtype=torch.bool).index_fill(0, torch.tensor(rows), True)
+
+
+def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, torch.optim.Adam]:
+    """Gaussians, something else beside them, and an optimiser whose moments differ in every row."""
+    leaves, other = gaussians.trainable(), torch.nn.Parameter(torch.ones(3))
+    adam = make_adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
+    set_rates(adam, {g["name"]: Decay(1e-3, 1e-3) for g in adam.param_groups}, 0.0)
+    rng = torch.Generator().manual_seed(5)
+    for _ in range(3):
+        for p in [*leaves.tensors().values(), other]:
+            p.grad = torch.randn(p.shape, generator=rng)
+        adam.step()
+    return leaves, other, adam
+
+
+EDITS = {
+    "prune": lambda g: prune(g, torch.arange(12) % 3 != 0),
+    "densify": lambda g: densify(g, mask(12, 1, 4, 5), mask(12, 0, 5, 11), torch.Generator().manual_seed(3)),
+    "relocate": lambda g: relocate(g, mask(12, 2, 9), torch.Generator().manual_seed(1)),
+    "refine": lambda g: refine(g, pressure([HIGH, 0] * 6), SETTINGS, 1.0, 100, torch.Generator())[0],
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_every_rows_moments_are_those_of_the_row_that_it_continues(name: str) -> None:
+    leaves, other, adam = trained(cloud(12))
+    old, before = {k: v.clone() for k, v in export_state(adam).items()}, other.detach().clone()
+    edit: Edit = EDITS[name](leaves)
+    after = apply_edit(adam, edit)
+    new = export_state(adam)
+    assert new.keys() == old.keys()
+    kept = edit.source >= 0
+    assert kept.any()
+    for key, value in old.items():
+        group, _, what = key.split(".")
+        if group == "grid" or what not in MOMENTS:  # another group, and the count of steps
+            assert torch.equal(new[key], value)
+            continue
+        assert new[key].shape == after.tensors()[group].shape
+        assert torch.equal(new[key][kept], value[edit.source[kept]]) and not new[key][~kept].any()
+    for group in adam.param_groups:
+        (parameter,) = group["params"]
+        assert parameter is (other if group["name"] == "grid" else after.tensors()[group["name"]])
+        assert parameter.is_leaf and parameter.requires_grad
+        parameter.grad = torch.ones_like(parameter)
+    assert len(adam.state) == len(adam.param_groups)  # no memory of the old leaves
+    adam.step()
+    assert all(torch.isfinite(v).all() for v in after.tensors().values())
+    assert not torch.equal(other, before)
+
+
+def test_a_gaussian_marked_for_both_is_split_only() -> None:
+    g = cloud(3)
+    edit = densify(g, mask(3, 1), mask(3, 1), torch.Generator())
+    assert edit.source.tolist() == [0, 2, -1, -1]
+
+
+def test_halves_spread_along_the_axes_of_the_gaussian_that_is_split() -> None:
+    one = cloud(1, seed=4)
+    one.log_scales[0] = torch.tensor([0.1, 0.4, 1.0]).log()
+    everything = torch.ones(4000, dtype=torch.bool)
+    halves = densify(one.rows(torch.zeros(4000).long()), ~everything, everything, torch.Generator().manual_seed(0))
+    w, x, y, z = (one.quats[0] / one.quats[0].norm()).tolist()
+    R = torch.tensor(Rotation.from_quat([x, y, z, w]).as_matrix(), dtype=torch.float32)
+    spread = torch.cov((halves.gaussians.means - one.means).T)
+    torch.testing.assert_close(spread, R @ torch.diag(torch.tensor([0.01, 0.16, 1.0])) @ R.T, rtol=0.1, atol=0.02)
+    assert (halves.gaussians.means.mean(0) - one.means[0]).norm() < 0.05
+
+
+def test_relocated_gaussians_equal_their_hosts_and_leave_the_others_alone() -> None:
+    g, dead = cloud(30), mask(30, 2, 9, 17, 28)
+    edit = relocate(g, dead, torch.Generator().manual_seed(1))
+    new = edit.gaussians
+    quiet = edit.source >= 0
+    assert edit.source[quiet].tolist() == torch.nonzero(quiet)[:, 0].tolist() and not quiet[dead].any()
+    for i in torch.nonzero(dead)[:, 0].tolist():
+        (host,) = [j for j in range(30) if not dead[j] and torch.equal(g.means[j], new.means[i])]
+        assert not quiet[host] and new.logits[i] < g.logits[host]
+        assert all(torch.equal(v[i], v[host]) for v in new.tensors().values())
+    assert all(torch.equal(v[quiet], g.tensors()[k][quiet]) for k, v in new.tensors().items())
+
+
+def test_relocation_prefers_opaque_hosts() -> None:
+    g = cloud(400)
+    g.logits[:200], g.logits[200:] = 8.0, torch.logit(torch.tensor(0.01))
+    dead = torch.arange(400) % 2 == 0
+    edit = relocate(g, dead, torch.Generator().manual_seed(0))
+    hosts = (edit.source < 0) & ~dead
+    assert hosts[:200].sum() > 80 and hosts[200:].sum() < 8
+
+
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.99])
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
+def test_shared_opacity_and_scale_follow_the_published_sums(opacity: float, copies: int) -> None:
+    new, shrink = (float(v) for v in share(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])))
+    assert 1 - (1 - new) ** copies == pytest.approx(opacity, rel=1e-9)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, copies + 1)
+        for k in range(i)
+    )
+    assert shrink == pytest.approx(opacity / total, rel=1e-6)
+
+
+def test_relocation_changes_the_picture_far_less_than_plain_copies_would() -> None:
+    g = cloud(40, seed=2)
+    g = Gaussians(g.means, g.log_scales + 3, g.quats, g.logits, g.colors)
+    dead = torch.arange(40) % 4 == 0
+    g.logits[dead] = -12.0  # invisible
+    relocated = relocate(g, dead, torch.Generator().manual_seed(0)).gaussians
+    hosts = torch.cdist(relocated.means[dead], g.means[~dead]).argmin(1)
+    copied = g.rows(torch.arange(40))
+    for name, value in copied.tensors().items():
+        value[dead] = g.tensors()[name][~dead][hosts]
+
+    def picture(gaussians: Gaussians) -> Tensor:
+        return render(gaussians.splats(), Views.from_cameras([camera(0.1)]), backend="reference").image
+
+    before = picture(g)
+    change, uncorrected = (before - picture(relocated)).abs(), (before - picture(copied)).abs()
+    assert before.max() > 0.5 and change.max() < 0.06
+    assert change.mean() < 0.02 * before.mean() and change.mean() < 0.2 * uncorrected.mean()
+
+
+def test_refinement_grows_where_the_gradient_is_high_and_removes_the_faint() -> None:
+    g = cloud(6)
+    g.logits[3] = -9.0
+    g.log_scales[1, 2] = math.log(2 * SETTINGS.split_scale * 3.0)  # large for a scene of this size
+    (edit,) = refine(g, pressure([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
+    assert edit.source.tolist() == [0, 2, 4, 5, -1, -1, -1]
+    assert torch.equal(edit.gaussians.means[4], g.means[0])
+
+
+@pytest.mark.parametrize("limit", [6, 7, 8, 11, 12, 50])
+def test_refinement_keeps_to_the_limit_and_prefers_high_gradients(limit: int) -> None:
+    g = cloud(6)
+    (edit,) = refine(g, pressure([(i + 1) * HIGH for i in range(6)]), SETTINGS, 1.0, limit, torch.Generator())
+    more = min(limit, 12) - 6
+    assert len(edit.gaussians) == 6 + more
+    assert torch.equal(edit.gaussians.means[6:].sort(0).values, g.means[6 - more :].sort(0).values)
+
+
+def test_refinement_at_the_limit_moves_the_dead() -> None:
+    g = cloud(8)
+    g.logits[2] = -9.0
+    (edit,) = refine(g, pressure([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
+    assert len(edit.gaussians) == 8 and edit.source[2] == -1
+    assert edit.gaussians.logits.sigmoid().min() > SETTINGS.min_opacity
+
+
+def test_pressure_is_that_of_each_view_alone_in_half_images() -> None:
+    g = cloud(6)
+    g = Gaussians(g.means, g.log_scales + 3, g.quats, g.logits, g.colors).trainable()
+    g.means.data[5] = torch.tensor([0.0, -9.0, 0.0])  # behind both cameras
+    cameras, gathered = [camera(-0.2), camera(0.2)], Pressure.zero(6, torch.device("cpu"))
+    for _ in range(2):
+        out = render(g.splats(), Views.from_cameras(cameras), backend="cpu")
+        out.image.square().mean().backward()
+        gathered.add(out)
+    expected = torch.zeros(6)
+    for one in cameras:
+        alone = render(g.splats(), Views.from_cameras([one]), backend="reference")
+        alone.image.square().mean().backward()
+        assert alone.means2d.grad is not None
+        expected += (alone.means2d.grad[0] * torch.tensor([32.0, 24.0])).norm(dim=-1).float() / 2
+    assert gathered.seen.tolist() == [4.0] * 5 + [0.0]
+    torch.testing.assert_close(gathered.mean(), expected, rtol=2e-3, atol=1e-7)

@@ -1,0 +1,152 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from small_scenes import array_cameras
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.gaussians.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.gaussians.parameters import Gaussians, densify, from_points, prune, relocate, share
+from spike4dgs.method.splat import Views, render
+
+RATES = {name: Decay(0.01, 0.001) for name in ("means", "log_scales", "quats", "logits", "colors")}
+
+
+def some(n: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    g = from_points(rng.normal(size=(n, 3)).astype(np.float32), rng.random(n).astype(np.float32), opacity=0.3)
+    g.logits.add_(torch.from_numpy(rng.normal(size=n).astype(np.float32)))
+    g.quats.add_(torch.from_numpy(rng.normal(size=(n, 4)).astype(np.float32)))
+    return g
+
+
+def trained(g: Gaussians, steps: int = 3) -> tuple[Gaussians, torch.optim.Adam]:
+    g = g.trainable()
+    adam = make_adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
+    for step in range(steps):
+        set_rates(adam, RATES, step / steps)
+        adam.zero_grad()
+        sum((v * v).sum() for v in g.tensors().values()).backward()
+        adam.step()
+    return g, adam
+
+
+def moments(adam: torch.optim.Adam, name: str) -> torch.Tensor:
+    return export_state(adam)[f"{name}.0.exp_avg"]
+
+
+def test_points_become_gaussians_as_wide_as_their_three_nearest_neighbours_are_far():
+    x = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), axis=-1).reshape(-1, 3).astype(np.float32)
+    g = from_points(x * 0.2, np.full(64, 0.7, np.float32), opacity=0.25)
+    splats = g.splats()
+    assert torch.allclose(splats.scales, torch.tensor(0.2), rtol=1e-5)  # every grid point has three at distance 0.2
+    assert torch.allclose(splats.opacities, torch.tensor(0.25)) and torch.allclose(splats.colors, torch.tensor(0.7))
+
+
+def test_coincident_points_get_a_positive_size():
+    points = np.zeros((8, 3), np.float32)
+    points[0] = 1.0
+    g = from_points(points, np.zeros(8, np.float32), opacity=0.5)
+    assert torch.isfinite(g.log_scales).all()
+
+
+@pytest.mark.parametrize("points", [np.zeros((3, 3)), np.full((10, 3), np.nan)])
+def test_too_few_or_infinite_points_are_refused(points):
+    with pytest.raises(UserError, match="at least 4 finite points"):
+        from_points(points.astype(np.float32), np.zeros(len(points), np.float32), opacity=0.5)
+
+
+def test_decay_is_log_linear():
+    assert Decay(1e-2, 1e-4).at(0.5) == pytest.approx(1e-3)
+
+
+def test_densify_keeps_old_rows_and_moments_and_starts_new_ones_afresh():
+    g, adam = trained(some(10))
+    clone, split = torch.zeros(10, dtype=torch.bool), torch.zeros(10, dtype=torch.bool)
+    clone[[2, 5]], split[[0, 9]] = True, True
+    before = {k: (v.detach().clone(), moments(adam, k).clone()) for k, v in g.tensors().items()}
+    edit = densify(g, clone, split, torch.Generator().manual_seed(0))
+    new = apply_edit(adam, edit)
+    assert len(new) == 10 - 2 + 2 + 4
+    kept = [1, 2, 3, 4, 5, 6, 7, 8]
+    for name, value in new.tensors().items():
+        assert torch.equal(value[:8], before[name][0][kept])
+        assert torch.equal(moments(adam, name)[:8], before[name][1][kept])
+        assert not moments(adam, name)[8:].any()
+        assert torch.equal(value[8:10], before[name][0][[2, 5]])
+    halves = new.log_scales[10:].exp() * 1.6
+    assert torch.allclose(halves, before["log_scales"][0][[0, 9, 0, 9]].exp())
+    assert torch.equal(new.logits[10:], before["logits"][0][[0, 9, 0, 9]])
+
+
+def test_split_halves_are_distributed_like_the_gaussian_they_replace():
+    g = some(4).rows(torch.zeros(20000, dtype=torch.long))
+    g.log_scales[:] = torch.tensor([0.1, 0.5, 1.0]).log()
+    everything = torch.ones(len(g), dtype=torch.bool)
+    new = densify(g, ~everything, everything, torch.Generator().manual_seed(1)).gaussians
+    covariance = torch.cov((new.means - g.means[0]).T)
+    assert torch.allclose(torch.linalg.eigvalsh(covariance), torch.tensor([0.01, 0.25, 1.0]), rtol=0.05)
+
+
+def test_pruned_optimiser_goes_on_as_if_the_pruned_had_never_been():
+    keep = torch.tensor([True, False, True, True, False, True])
+    g, adam = trained(some(6))
+    alone, adam_alone = trained(some(6).rows(keep))
+    g = apply_edit(adam, prune(g, keep))
+    for leaves, optimiser in ((g, adam), (alone, adam_alone)):
+        optimiser.zero_grad()
+        sum((v * v).sum() for v in leaves.tensors().values()).backward()
+        optimiser.step()
+    for name, value in g.tensors().items():
+        assert torch.equal(value, alone.tensors()[name])
+
+
+def test_optimiser_state_survives_export_and_import():
+    g, adam = trained(some(5))
+    copy, fresh = trained(some(5), steps=0)
+    copy = g.trainable()
+    fresh = make_adam({k: [v] for k, v in copy.tensors().items()}, (0.9, 0.99))
+    import_state(fresh, {k: v.clone() for k, v in export_state(adam).items()})
+    for leaves, optimiser in ((g, adam), (copy, fresh)):
+        set_rates(optimiser, RATES, 0.5)
+        optimiser.zero_grad()
+        (leaves.means**3).sum().backward()
+        optimiser.step()
+    assert torch.equal(g.means, copy.means)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.01, 0.99), st.integers(1, 20))
+def test_shared_gaussians_keep_opacity_and_line_integral(opacity, copies):
+    new, factor = (float(x) for x in share(torch.tensor([opacity]).double(), torch.tensor([copies])))
+    assert 1 - (1 - new) ** copies == pytest.approx(opacity, rel=1e-6)
+    stacked = quad(lambda x: 1 - (1 - new * math.exp(-0.5 * (x / factor) ** 2)) ** copies, -40, 40, points=[0])[0]
+    assert stacked == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
+
+
+def test_relocation_keeps_the_number_and_nearly_the_picture():
+    g = some(40, seed=3)
+    g.means.mul_(0.3)
+    g.log_scales.sub_(1.0)
+    dead = torch.arange(40) % 4 == 0
+    g.logits[dead] = -12.0
+    edit = relocate(g, dead, torch.Generator().manual_seed(0))
+    views = Views.from_cameras(array_cameras(2))
+    before, after = (render(x.splats(), views, backend="reference").image for x in (g, edit.gaussians))
+    assert len(edit.gaussians) == 40 and (edit.gaussians.logits.sigmoid() > 0.005).all()
+    assert (edit.source[dead] == -1).all()
+    untouched = edit.source >= 0
+    assert torch.equal(edit.gaussians.means[untouched], g.means[untouched])
+    error = (before - after).square().mean().sqrt() / before.std()
+    assert error < 0.05, error
+
+
+def test_relocation_without_dead_or_without_living_changes_nothing():
+    g = some(6)
+    for dead in (torch.zeros(6, dtype=torch.bool), torch.ones(6, dtype=torch.bool)):
+        edit = relocate(g, dead, torch.Generator())
+        assert torch.equal(edit.gaussians.logits, g.logits) and torch.equal(edit.source, torch.arange(6))

@@ -1,0 +1,199 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion.hexplane import (
+    HexPlane,
+    HexPlaneMotion,
+    HexPlaneShape,
+    plane_tv,
+    sample_level,
+    time_smoothness,
+    time_sparsity,
+)
+from spike4dgs.method.motion.hexplane_cpu import sample_levels
+from spike4dgs.method.motion.mlp import perceptron, perceptron_reference
+from spike4dgs.method.motion.table import MOTIONS, Extent, hexplane_shape
+from spike4dgs.method.settings import TrainSettings
+
+SHAPE = HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def gaussians(n: int = 50) -> Gaussians:
+    g = rng(1)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=g) * 2 - 1,
+        log_scales=torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        logits=torch.randn(n, generator=g),
+        colors=torch.rand(n, 1, generator=g),
+    )
+
+
+def motion() -> HexPlaneMotion:
+    return HexPlaneMotion(SHAPE, -torch.ones(3), torch.ones(3), 2.0, rng())
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
+def test_initial_deformation_is_exactly_zero(t):
+    g = gaussians()
+    for name, value in motion().deform(g, t).tensors().items():
+        assert torch.equal(value, g.tensors()[name]), name
+
+
+def test_every_parameter_can_be_deformed_and_learns():
+    m, g = motion(), gaussians()
+    for head in m.last.values():
+        torch.nn.init.ones_(head.weight)
+    moved = m.deform(g, 0.4)
+    for name, value in moved.tensors().items():
+        assert not torch.equal(value, g.tensors()[name]), name
+    sum(v.sum() for v in moved.tensors().values()).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in m.parameters())
+
+
+def test_means_move_in_units_of_the_scene():
+    m, g = motion(), gaussians()
+    torch.nn.init.ones_(m.last["means"].bias)
+    assert torch.allclose(m.deform(g, 0.5).means - g.means, torch.tensor(2.0))
+
+
+def test_time_uses_the_whole_axis():
+    planes = HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
+    with torch.no_grad():
+        for p in planes.time:
+            p[:] = torch.arange(1.0, 8.0)[None, :, None, None]
+    at = torch.full((1, 3), 0.5)
+    spatial = planes(at, 0.0)  # the first row is all 1
+    for row in range(7):  # every row is read at its own time, the first at 0 and the last at 1
+        assert torch.allclose(planes(at, row / 6), spatial * (row + 1) ** 3, rtol=1e-5)
+
+
+def test_points_outside_the_box_take_its_border():
+    planes = HexPlane(SHAPE, -torch.ones(3), torch.ones(3), rng())
+    inside, outside = torch.tensor([[1.0, -1.0, 0.2]]), torch.tensor([[7.0, -3.0, 0.2]])
+    assert torch.allclose(planes(inside, 0.5), planes(outside, 0.5))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 9), st.integers(1, 17), st.sampled_from([0, 1, 40]))
+def test_kernel_equals_the_plain_twin_in_value_and_gradient(seed, size, features, n):
+    g = rng(seed)
+    unit = torch.rand(n, 3, generator=g) * 1.4 - 0.2
+    space = torch.randn(3, size, size, features, generator=g)
+    lines = torch.randn(3, size, features, generator=g)
+    weight = torch.randn(n, features, generator=g)
+    results = []
+    for fast in (True, False):
+        leaves = [x.clone().requires_grad_(True) for x in (unit, space, lines)]
+        if fast:
+            out = sample_levels(leaves[0], [leaves[2]], [leaves[1]])
+        else:
+            out = sample_level(*(x.double() for x in leaves))
+        (out * weight).sum().backward()
+        results.append([out.detach().float(), *(x.grad for x in leaves)])
+    for fast, slow in zip(*results, strict=True):
+        scale = float(slow.abs().max()) + 1e-6 if slow.numel() else 1.0
+        assert float((fast - slow).abs().max() if slow.numel() else 0) <= 2e-5 * scale
+
+
+def test_kernel_equals_the_plain_twin_on_cell_borders_and_far_outside_the_box():
+    g, steps = rng(3), torch.tensor([-1e4, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1e4])
+    unit = torch.cartesian_prod(steps, steps, steps)  # a plane of 5 x 5 has its values at multiples of 1/4
+    space, lines = torch.randn(3, 5, 5, 4, generator=g), torch.randn(3, 5, 4, generator=g)
+    weight = torch.randn(len(unit), 4, generator=g)
+    results = []
+    for fast in (True, False):
+        leaves = [x.clone().requires_grad_(True) for x in (unit, space, lines)]
+        out = sample_levels(leaves[0], [leaves[2]], [leaves[1]]) if fast else sample_level(*leaves)
+        (out * weight).sum().backward()
+        results.append([out.detach(), *(x.grad for x in leaves)])
+    for fast, slow in zip(*results, strict=True):
+        torch.testing.assert_close(fast, slow, rtol=1e-4, atol=1e-5 * float(slow.abs().max()))
+    outside = ((unit <= 0) | (unit >= 1)) & (results[0][1] != 0)
+    assert not outside.any()  # the border has no slope
+
+
+def test_levels_stand_side_by_side_and_do_not_mix():
+    g = rng(4)
+    unit = torch.rand(30, 3, generator=g)
+    space = [torch.randn(3, r, r, 4, generator=g) for r in (3, 6, 11)]
+    lines = [torch.randn(3, r, 4, generator=g) for r in (3, 6, 11)]
+    each = [sample_levels(unit, [a], [s]) for s, a in zip(space, lines, strict=True)]
+    assert torch.equal(sample_levels(unit, lines, space), torch.cat(each, 1))
+
+
+def test_start_middle_and_end_of_the_clip_train_different_rows():
+    planes = HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
+    touched = []
+    for t in (0.0, 0.5, 1.0):
+        planes.zero_grad()
+        planes(torch.rand(40, 3, generator=rng()), t).sum().backward()
+        touched.append([set(torch.nonzero(p.grad.abs().sum((0, 2, 3)))[:, 0].tolist()) for p in planes.time])
+    assert touched == [[{0}] * 2, [{3}] * 2, [{6}] * 2]
+
+
+def test_kernel_survives_points_that_are_no_numbers():
+    unit = torch.tensor([[float("nan"), 0.5, 0.5], [float("inf"), -float("inf"), 0.1], [1e30, -1e30, 0.0]])
+    sample_levels(unit, [torch.ones(3, 4, 2)], [torch.ones(3, 4, 4, 2)])
+
+
+@pytest.mark.parametrize("rows", [0, 1, 511, 1500])
+def test_blocked_perceptron_equals_three_layers(rows):
+    g = rng(2)
+    shapes = ((16, 8), (16,), (40, 16), (40,), (5, 40), (5,))
+    x, layers = torch.randn(rows, 8, generator=g), [torch.randn(s, generator=g) for s in shapes]
+    weight = torch.randn(rows, 5, generator=g)
+    results = []
+    for f in (perceptron, perceptron_reference):
+        leaves = [v.clone().requires_grad_(True) for v in (x, *layers)]
+        out = f(leaves[0], leaves[1:])
+        (out * weight).sum().backward()
+        results.append([out.detach(), *(v.grad for v in leaves)])
+    for fast, slow in zip(*results, strict=True):
+        assert torch.allclose(fast, slow, rtol=1e-4, atol=1e-4 * float(slow.abs().max() if slow.numel() else 1))
+
+
+def test_plane_tv_of_a_ramp_and_of_a_checkerboard():
+    i, j = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
+    ramp = (2 * i + 3 * j)[None, :, :, None].repeat(3, 1, 1, 4)
+    assert plane_tv([ramp]).item() == pytest.approx(3 * (4 + 9))  # a second difference would give 0
+    board = ((i + j) % 2)[None, :, :, None].repeat(3, 1, 1, 4)
+    assert plane_tv([board]).item() == pytest.approx(3 * 2)
+    assert plane_tv([ramp, ramp]).item() == plane_tv([ramp]).item()  # the weight does not grow with levels
+
+
+def test_time_smoothness_ignores_steady_change_and_measures_acceleration():
+    t = torch.arange(9.0)[None, :, None, None]
+    steady, accelerated = (5 * t).expand(3, 9, 6, 2), (t**2).expand(3, 9, 6, 2)
+    assert time_smoothness([steady]).item() == pytest.approx(0, abs=1e-9)
+    assert time_smoothness([accelerated]).item() == pytest.approx(3 * 4)
+
+
+def test_time_sparsity_is_the_distance_from_one():
+    assert time_sparsity([torch.ones(3, 4, 5, 2)]).item() == 0
+    assert time_sparsity([torch.full((3, 4, 5, 2), 0.25)]).item() == pytest.approx(3 * 0.75)
+
+
+def extent(n_ticks: int, width: int) -> Extent:
+    return Extent(-torch.ones(3), torch.ones(3), 1.0, n_ticks, width)
+
+
+def test_resolution_follows_clip_length_and_picture_size():
+    s = TrainSettings()
+    short, long = hexplane_shape(extent(400, 200), s), hexplane_shape(extent(2000, 400), s)
+    assert long.times == pytest.approx(5 * short.times, rel=0.1)
+    assert long.spatial[-1] == pytest.approx(2 * short.spatial[-1], rel=0.1)
+    assert len(short.spatial) == s.levels and short.spatial[0] == short.spatial[1] // 2
+
+
+def test_static_motion_returns_the_same_gaussians():
+    g = gaussians()
+    static = MOTIONS["static"](extent(100, 64), TrainSettings(), rng())
+    assert torch.equal(static.splats(g, 0.7).means, g.means) and not static.groups() and not static.moves

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from spike4dgs.baselines.initialization.dust3r_network import Dust3r, Dust3rShape
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.scene.bursts import FIRST_TRAINING_VARIANT
+from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
+from spike4dgs.method.msdi.checkpoints import load_pretrained, source_of, transfer
+from spike4dgs.method.msdi.weights import SHIPPED, Card, load_network, read_card, save_weights, weights_path
+
+EMBED = replace(TINY, embed_channels=3)  # as the published patch embedding
+DUST3R = Dust3rShape(2, 16, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
+
+
+def layer(width: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published transformer layer."""
+    return {
+        "norm1.weight": (width,),
+        "norm1.bias": (width,),
+        "attn.qkv.weight": (3 * width, width),
+        "attn.qkv.bias": (3 * width,),
+        "attn.proj.weight": (width, width),
+        "attn.proj.bias": (width,),
+        "norm2.weight": (width,),
+        "norm2.bias": (width,),
+        "mlp.fc1.weight": (4 * width, width),
+        "mlp.fc1.bias": (4 * width,),
+        "mlp.fc2.weight": (width, 4 * width),
+        "mlp.fc2.bias": (width,),
+    }
+
+
+def conv(name: str, *shape: int, bias: bool = True) -> dict[str, tuple[int, ...]]:
+    parts: dict[str, tuple[int, ...]] = {f"{name}.weight": shape}
+    return parts | ({f"{name}.bias": (shape[0],)} if bias else {})
+
+
+def head(prefix: str, c: MsdiConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published DPT head."""
+    w, f, t = c.head_widths, c.head_features, (c.encoder_width, *[c.fusion_width] * 3)
+    names: dict[str, tuple[int, ...]] = {}
+    for k in range(4):
+        names |= conv(f"act_postprocess.{k}.0", w[k], t[k], 1, 1)
+        names |= conv(f"scratch.layer{k + 1}_rn", f, w[k], 3, 3, bias=False)
+        for unit in (1, 2):
+            for number in (1, 2):
+                names |= conv(f"scratch.refinenet{k + 1}.resConfUnit{unit}.conv{number}", f, f, 3, 3)
+        names |= conv(f"scratch.refinenet{k + 1}.out_conv", f, f, 1, 1)
+    names |= conv("act_postprocess.0.1", w[0], w[0], 4, 4)
+    names |= conv("act_postprocess.1.1", w[1], w[1], 2, 2)
+    names |= conv("act_postprocess.3.1", w[3], w[3], 3, 3)
+    names |= conv("head.0", f // 2, f, 3, 3) | conv("head.2", f // 2, f // 2, 3, 3) | conv("head.4", 4, f // 2, 1, 1)
+    return {f"{prefix}.dpt.{name}": shape for name, shape in names.items()}
+
+
+def fast3r_shapes(c: MsdiConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the published file of Fast3R at the sizes of a configuration."""
+    names = conv("encoder.patch_embed.proj", c.encoder_width, 3, c.patch, c.patch)
+    for k in range(c.encoder_layers):
+        names |= {f"encoder.enc_blocks.{k}.{n}": s for n, s in layer(c.encoder_width).items()}
+    names |= conv("encoder.enc_norm", c.encoder_width)
+    names |= conv("decoder.decoder_embed", c.fusion_width, c.encoder_width)
+    for k in range(c.fusion_layers):
+        names |= {f"decoder.dec_blocks.{k}.{n}": s for n, s in layer(c.fusion_width).items()}
+    names |= conv("decoder.dec_norm", c.fusion_width)
+    return names | head("downstream_head", c) | head("downstream_head_local", c)
+
+
+def random_state(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return {name: torch.randn(*shape, generator=g) for name, shape in shapes.items()}
+
+
+def fresh(config: MsdiConfig, seed: int = 0) -> Msdi:
+    torch.manual_seed(seed)
+    return Msdi(config).eval()
+
+
+def test_the_papers_configuration_takes_all_of_fast3rs_published_shapes() -> None:
+    shapes = fast3r_shapes(PAPER)
+    with torch.device("meta"):
+        network = Msdi(PAPER)
+        state = {name: torch.empty(shape) for name, shape in shapes.items()}
+    assert 640e6 < sum(t.numel() for t in state.values()) < 655e6
+    result = transfer(network, state, Path("model.safetensors"))
+    assert result.source == "fast3r"
+    assert set(result.left) == {name for name in shapes if name.startswith("downstream_head_local.")}
+    assert len(result.taken) == len(shapes) - len(result.left)
+    prefixes = {name.split(".")[0] for name in result.fresh if not name.startswith("encoder.")}
+    assert prefixes == {"extractor", "generator"}
+    inside = {name for name in result.fresh if name.startswith("encoder.")}
+    assert inside == {"encoder.mix.weight", "encoder.mix.bias", "encoder.ray_embed.weight"}
+
+
+def test_the_papers_configuration_takes_dust3rs_encoder() -> None:
+    with torch.device("meta"):
+        network, state = Msdi(PAPER), Dust3r().state_dict()
+    result = transfer(network, {**state, "mask_token": torch.zeros(1, 1, 768)}, Path("model.safetensors"))
+    encoder = [n for n in state if n.split(".")[0] in ("patch_embed", "enc_blocks", "enc_norm")]
+    assert result.source == "dust3r" and len(result.taken) == len(encoder) == 24 * 12 + 4
+    assert len(result.left) == len(state) - len(encoder) + 1
+    assert {n.split(".")[0] for n in result.fresh} == {"encoder", "extractor", "fusion", "generator", "head"}
+
+
+def test_values_land_where_they_belong(tmp_path: Path) -> None:
+    state = random_state(fast3r_shapes(EMBED), 1)
+    save_file(state, tmp_path / "model.safetensors")
+    network, before = fresh(EMBED), fresh(EMBED).state_dict()
+    result = load_pretrained(network, tmp_path / "model.safetensors")
+    after = network.state_dict()
+    for ours, theirs in {
+        "encoder.patch_embed.weight": "encoder.patch_embed.proj.weight",
+        "encoder.blocks.1.attn.qkv.bias": "encoder.enc_blocks.1.attn.qkv.bias",
+        "encoder.norm.weight": "encoder.enc_norm.weight",
+        "fusion.embed.weight": "decoder.decoder_embed.weight",
+        "fusion.blocks.3.mlp.fc2.weight": "decoder.dec_blocks.3.mlp.fc2.weight",
+        "fusion.norm.bias": "decoder.dec_norm.bias",
+        "head.scratch.layer_rn.2.weight": "downstream_head.dpt.scratch.layer3_rn.weight",
+        "head.act_postprocess.3.1.weight": "downstream_head.dpt.act_postprocess.3.1.weight",
+        "head.scratch.refinenet2.resConfUnit1.conv2.bias": (
+            "downstream_head.dpt.scratch.refinenet2.resConfUnit1.conv2.bias"
+        ),
+        "head.head.4.weight": "downstream_head.dpt.head.4.weight",
+    }.items():
+        assert torch.equal(after[ours], state[theirs]), ours
+    assert all(torch.equal(after[name], before[name]) for name in result.fresh)
+    assert not any(torch.equal(after[name], before[name]) for name in result.taken)
+    out = network((torch.rand(1, 2, 9, 16, 32) < 0.3).float())
+    assert out.points.isfinite().all()
+
+
+def test_dust3rs_encoder_gives_the_same_tokens_here(tmp_path: Path) -> None:
+    torch.manual_seed(4)
+    published = Dust3r(DUST3R).eval()
+    save_file({k: v.clone() for k, v in published.state_dict().items()}, tmp_path / "model.safetensors")
+    network = fresh(EMBED)
+    load_pretrained(network, tmp_path / "model.safetensors")
+    pictures = torch.randn(2, 3, 32, 48)
+    features = torch.cat([pictures, torch.randn(2, EMBED.features - 3, 32, 48)], dim=1)
+    with torch.no_grad():
+        network.encoder.mix.weight.copy_(torch.eye(3, EMBED.features)[:, :, None, None])
+        torch.nn.init.zeros_(network.encoder.mix.bias)  # type: ignore[arg-type]
+        tokens = network.encoder(features, torch.ones(2, 3, 32, 48))
+        assert torch.allclose(tokens, published.encode(pictures), atol=1e-5)
+
+
+def test_other_files_are_refused_and_nothing_is_unpickled(tmp_path: Path) -> None:
+    path, network = tmp_path / "model.safetensors", fresh(EMBED)
+    before = {k: v.clone() for k, v in network.state_dict().items()}
+    torch.save({"model": {}}, path)
+    with pytest.raises(UserError, match="expected weights in safetensors format"):
+        load_pretrained(network, path)
+    with pytest.raises(UserError, match="expected weights in safetensors format"):
+        load_pretrained(network, tmp_path / "absent.safetensors")
+    save_file({"weight": torch.zeros(1)}, path)
+    with pytest.raises(UserError, match="the tensors of Fast3R or DUSt3R, found others, such as weight"):
+        load_pretrained(network, path)
+    state = random_state(fast3r_shapes(EMBED), 0)
+    del state["encoder.enc_norm.bias"]
+    save_file(state, path)
+    with pytest.raises(UserError, match="found 1 other tensors, the first encoder.norm.bias missing"):
+        load_pretrained(network, path)
+    save_file(random_state(fast3r_shapes(replace(EMBED, fusion_layers=5)), 0), path)
+    with pytest.raises(UserError, match=r"found 12 other tensors, the first fusion.blocks.4.attn.proj.bias \(16,\)"):
+        load_pretrained(network, path)
+    save_file(random_state(fast3r_shapes(EMBED), 0), path)
+    with pytest.raises(UserError, match="encoder.patch_embed.weight"):
+        load_pretrained(fresh(TINY), path)  # embeds four channels
+    assert all(torch.equal(v, before[k]) for k, v in network.state_dict().items())
+    assert source_of({}) is None
+
+
+CARD = Card("tiny", 12, 3, ("toy-1@abc",), {"psnr_db": 30.5})
+
+
+def test_weights_come_back_with_their_card(tmp_path: Path) -> None:
+    network, path = fresh(TINY, 5), tmp_path / "w.safetensors"
+    digest = save_weights(path, network, CARD)
+    assert digest == save_weights(tmp_path / "again.safetensors", network, CARD)
+    assert read_card(path) == CARD
+    loaded = load_network(path, "cpu")
+    assert not loaded.training and not any(p.requires_grad for p in loaded.parameters())
+    x = (torch.rand(1, 3, 9, 16, 32) < 0.4).float()
+    with torch.no_grad():
+        a, b = network(x), loaded(x)
+    assert (a.points - b.points).abs().max() < 0.01 * a.points.abs().max()
+    assert path.stat().st_size < 2.5 * sum(p.numel() for p in network.parameters()) + 20_000
+
+
+def test_damaged_and_foreign_weights_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(b"\x80\x02pickle")
+    with pytest.raises(UserError, match="weights of MSDI, found damaged data"):
+        read_card(path)
+    save_file({"weight": torch.zeros(1)}, path)
+    with pytest.raises(UserError, match="metadata spike4dgs-msdi/1, found none"):
+        read_card(path)
+    save_file({"weight": torch.zeros(1)}, path, metadata={"spike4dgs-msdi/1": json.dumps({"config": "tiny"})})
+    with pytest.raises(UserError, match="damaged data"):
+        read_card(path)
+    save_weights(path, fresh(TINY), replace(CARD, config="huge"))
+    with pytest.raises(UserError, match="a configuration of paper, small, tiny, found 'huge'"):
+        read_card(path)
+    other = tmp_path / "other.safetensors"
+    save_weights(other, fresh(replace(TINY, fusion_width=8)), CARD)
+    with pytest.raises(UserError, match="parameters of configuration tiny"):
+        load_network(other, "cpu")
+    broken = fresh(TINY)
+    torch.nn.init.constant_(broken.encoder.norm.weight, torch.nan)
+    with pytest.raises(UserError, match="found NaN or more than 65504 in encoder.norm.weight"):
+        save_weights(path, broken, CARD)
+
+
+def test_the_environment_names_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SPIKE4DGS_MSDI", str(tmp_path / "absent.safetensors"))
+    with pytest.raises(WeightsError, match="no such file"):
+        weights_path()
+    (tmp_path / "absent.safetensors").touch()
+    assert weights_path() == tmp_path / "absent.safetensors"
+
+
+def test_the_shipped_weights_are_those_of_their_card() -> None:
+    card = read_card(SHIPPED)
+    text = (SHIPPED.parent / "README.md").read_text()
+    assert sha256_file(SHIPPED) in text and f"Weights of step {card.steps}" in text
+    assert load_network(SHIPPED, "cpu").config.name == card.config == "small"
+    variants = [int(name.partition("@")[0].rpartition("-")[2]) for name in card.trained_on]
+    assert min(variants) >= FIRST_TRAINING_VARIANT, "neither the benchmark's nor the hidden ones"
+    assert card.measured["psnr_db"] > card.measured["tfp_psnr_db"] + 3
+    assert SHIPPED.stat().st_size < 20e6

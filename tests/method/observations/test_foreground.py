@@ -1,0 +1,115 @@
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.observations.foreground import (
+    foreground_masks,
+    foreground_points,
+    moving_window,
+    stray_points,
+    temporal_deviation,
+)
+from spike4dgs.method.splat import Views
+
+WORLD = ToyWorld(width=64, height=40, travel=0.3)
+TIMES = np.linspace(0, 1, 7)
+
+
+@cache
+def clip() -> tuple[torch.Tensor, torch.Tensor]:
+    """Noisy pictures [T, C, H, W] of the toy world, and where the board is at any of the times [C, H, W]."""
+    looks = [[WORLD.look(c, t) for c in WORLD.cameras] for t in TIMES]
+    pictures = np.array([[image for image, _, _ in row] for row in looks])
+    pictures += np.random.default_rng(0).normal(0, 0.015, pictures.shape)
+    swept = np.array([[board for _, _, board in row] for row in looks]).any(0)
+    return torch.tensor(pictures, dtype=torch.float32), torch.from_numpy(swept)
+
+
+def flat(noise: float, seed: int = 0) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    return torch.tensor(0.5 + noise * rng.normal(size=(9, 2, 30, 50)), dtype=torch.float32)
+
+
+def test_deviation_is_that_of_pictures_averaged_over_3x3_pixels() -> None:
+    pictures = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
+    padded = np.pad(pictures.double().numpy(), ((0, 0), (0, 0), (1, 1), (1, 1)))
+    smooth = sum(padded[..., y : y + 8, x : x + 9] for y in range(3) for x in range(3)) / 9
+    np.testing.assert_allclose(temporal_deviation(pictures), smooth.std(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005, 0.02, 0.04])
+def test_noise_alone_does_not_move(noise: float) -> None:
+    assert not foreground_masks(flat(noise)).any()
+
+
+def test_mask_holds_where_the_board_has_been_and_little_else() -> None:
+    pictures, swept = clip()
+    masks = foreground_masks(pictures)
+    assert (masks & swept).sum() > 0.95 * swept.sum()
+    around = torch.nn.functional.max_pool2d(swept[:, None].float(), 5, 1, 2)[:, 0] > 0
+    assert not (masks & ~around).any()  # blur and growth, one pixel each
+
+
+def test_inside_of_a_uniform_thing_is_filled() -> None:
+    pictures = flat(0.005)
+    for t in range(len(pictures)):
+        pictures[t, :, 3 + t : 19 + t, 10 + t : 36 + t] = 0.9  # 8x18 pixels never change
+    assert foreground_masks(pictures)[:, 12:19, 19:36].all()
+
+
+def test_a_thing_that_leaves_the_picture_is_not_cut_at_its_edge() -> None:
+    pictures = flat(0.0)
+    for t in range(len(pictures)):
+        pictures[t, :, 10:20, : 2 + 2 * t] = 0.9
+    assert foreground_masks(pictures)[:, 10:20, 2:17].all()
+
+
+def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
+    pictures, _ = clip()
+    masks = foreground_masks(pictures)
+    camera = WORLD.held_out
+    _, depth, board = WORLD.look(camera, 0.5)
+    v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
+    points = torch.from_numpy(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
+    moving = foreground_points(points, Views.from_cameras(WORLD.cameras), masks).numpy()
+    truth = board.reshape(-1)
+    assert moving[truth].mean() > 0.97
+    assert moving[~truth].mean() < 0.15  # what the board's rim passes over
+    assert np.array_equal(stray_points(points, Views.from_cameras(WORLD.cameras), masks).numpy(), ~moving)
+
+
+def test_points_behind_all_cameras_or_out_of_their_sight_neither_move_nor_stray() -> None:
+    masks = torch.ones(len(WORLD.cameras), WORLD.height, WORLD.width, dtype=torch.bool)
+    points = torch.tensor([[0.0, -9.0, 1.0], [50.0, 0.0, 1.0]])
+    assert not foreground_points(points, Views.from_cameras(WORLD.cameras), masks).any()
+    assert not stray_points(points, Views.from_cameras(WORLD.cameras), masks).any()  # they have left
+
+
+def test_window_shows_the_same_pixels_through_the_same_lines_of_sight() -> None:
+    pictures, swept = clip()
+    views = Views.from_cameras(WORLD.cameras)
+    window = moving_window(views, swept, 3)
+    width, height = window.views.width, window.views.height
+    assert width < WORLD.width and height < WORLD.height
+    assert window.cut(swept).sum() == swept.sum()
+    for c, (camera, (x, y)) in enumerate(zip(WORLD.cameras, window.corner, strict=True)):
+        K, w2c = window.views.K[c].numpy(), window.views.w2c[c].numpy()
+        cut = Camera("cut", width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], w2c[:3, :3], w2c[:3, 3])
+        there, _ = camera.project(np.array([[0.1, 0.0, 0.5]]))
+        here, _ = cut.project(np.array([[0.1, 0.0, 0.5]]))
+        np.testing.assert_allclose(here, there - [x, y], atol=1e-9)
+        assert torch.equal(window.cut(pictures)[2, c], pictures[2, c, y : y + height, x : x + width])
+
+
+def test_window_without_motion_is_the_whole_picture_and_a_margin_ends_at_its_edge() -> None:
+    views = Views.from_cameras(WORLD.cameras[:2])
+    masks = torch.zeros(2, WORLD.height, WORLD.width, dtype=torch.bool)
+    assert moving_window(views, masks, 4).views is views
+    masks[0, :3, 60:] = True  # the other view sees nothing move
+    window = moving_window(views, masks, 2)
+    assert (window.views.width, window.views.height) == (8, 7)
+    assert window.corner == ((56, 0), (0, 0))

@@ -1,0 +1,71 @@
+"""Gaussians before a backdrop against the same Gaussians rendered all at once: equal bits, equal gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splat_scenes import HARD, random_splats, views
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat.background import Backdrop
+
+
+def rows(splats: Splats, index: Tensor) -> Splats:
+    return Splats(*(t[index].float() for t in (*splats.geometry, splats.colors)))
+
+
+def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int]) -> None:
+    """Compare pictures and gradients of splats[moving] before the others."""
+    few = Views(v.w2c[chosen], v.K[chosen], v.width, v.height)
+    order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
+    everything = [t.requires_grad_() for t in (*rows(splats, order).geometry, rows(splats, order).colors)]
+    own = [t.requires_grad_() for t in (*rows(splats, moving).geometry, rows(splats, moving).colors)]
+    expected = render(Splats(*everything), few, backend="cpu")
+    found = Backdrop(rows(splats, ~moving), v).render(Splats(*own), chosen)
+    assert torch.equal(found.image, expected.image) and torch.equal(found.alpha, expected.alpha)
+    n = int((~moving).sum())
+    assert torch.equal(found.radii, expected.radii[:, n:])
+    g = torch.Generator().manual_seed(1)
+    weight, opaque = torch.randn(found.image.shape, generator=g), torch.randn(found.alpha.shape, generator=g)
+    for out in (expected, found):
+        ((out.image * weight).sum() + (out.alpha * opaque).sum()).backward()
+    for a, b in zip(everything, own, strict=True):
+        assert torch.equal(a.grad[n:], b.grad)
+    assert torch.equal(expected.means2d.grad[:, n:], found.means2d.grad)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 300), st.sampled_from([0.0, 0.02, 0.3, 1.0]), st.sampled_from([1, 2, 3]), st.integers(0, 2**31))
+def test_pictures_and_gradients_are_those_of_all_at_once(n: int, share: float, channels: int, seed: int) -> None:
+    moving = torch.rand(n, generator=torch.Generator().manual_seed(seed)) < share
+    both_ways(random_splats(n, channels, seed=seed), views(3), moving, [2, 0])
+
+
+@pytest.mark.parametrize("scene", HARD)
+def test_hard_scenes(scene) -> None:  # type: ignore[no-untyped-def]
+    splats, v = scene()
+    moving = torch.arange(len(splats)) % 3 == 0
+    both_ways(splats, v, moving, [0])
+
+
+def test_it_can_be_drawn_with_again() -> None:
+    splats, v = random_splats(100, seed=5), views(2)
+    still = torch.arange(100) < 60
+    backdrop = Backdrop(rows(splats, still), v)
+    first = [backdrop.render(rows(random_splats(30, seed=s), torch.arange(30)), [0, 1]).image for s in (1, 2, 1)]
+    assert torch.equal(first[0], first[2]) and not torch.equal(first[0], first[1])
+    assert len(backdrop) == 60
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    splats, v = rows(random_splats(20, seed=3), torch.arange(20)), views(1)
+    backdrop = Backdrop(splats, v)
+    for name in ("means", "colors"):
+        bad = {n: getattr(splats, n).clone() for n in ("means", "quats", "scales", "opacities", "colors")}
+        bad[name][3, 0] = float("nan")
+        with pytest.raises(UserError, match="finite"):
+            backdrop.render(Splats(**bad), [0])

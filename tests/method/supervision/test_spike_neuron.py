@@ -1,0 +1,116 @@
+"""The spiking layer against plain loops, its surrogate gradient where it is smooth, and the bias of its resets."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.method.supervision.spike_neuron import FLOOR, encode, firing_rate, spike_loss
+
+RESETS = ("subtract", "hard")
+
+
+class Fire(torch.autograd.Function):
+    """A spike where the threshold 1 is reached, with the surrogate gradient 1 where it fired."""
+
+    @staticmethod
+    def forward(ctx, charge):
+        fired = (charge >= 1).to(charge.dtype)
+        ctx.save_for_backward(fired)
+        return fired
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad * ctx.saved_tensors[0]
+
+
+def unrolled(current: torch.Tensor, start: torch.Tensor, steps: int, reset: str) -> torch.Tensor:
+    """The neuron step by step, differentiated through time by torch."""
+    charge, total = start.clone(), torch.zeros_like(current)
+    for _ in range(steps):
+        charge = charge + current
+        spike = Fire.apply(charge)
+        total = total + spike
+        charge = charge - spike if reset == "subtract" else charge * (1 - spike.detach())
+    return total / steps
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from(RESETS), st.integers(1, 70), st.sampled_from([0.02, 0.3, 1.0, 1.5]))
+def test_closed_form_equals_the_loop_in_rate_and_gradient(seed: int, reset: str, steps: int, top: float) -> None:
+    g = torch.Generator().manual_seed(seed)
+    # Multiples of 2^-12: every sum is exact, and thresholds are met exactly now and then.
+    grid = torch.randint(0, int(top * 4096) + 1, (60,), generator=g).double() / 4096
+    start = torch.randint(0, 4096, (60,), generator=g).double() / 4096
+    results = []
+    for f in (firing_rate, unrolled):
+        current = grid.clone().requires_grad_()
+        rate = f(current, start, steps, reset)
+        rate.sum().backward()
+        results.append((rate.detach(), current.grad))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(results[0][1], results[1][1], rtol=0, atol=1e-12)
+
+
+def test_nothing_fires_in_the_dark_and_passes_no_gradient() -> None:
+    current = torch.zeros(5, requires_grad=True)
+    for reset in RESETS:
+        rate = firing_rate(current, torch.linspace(0, 0.99, 5), 256, reset)
+        (gradient,) = torch.autograd.grad(rate.sum(), current)
+        assert not rate.any() and not gradient.any()
+
+
+def test_above_one_spike_a_step_the_rate_is_one_and_the_gradient_still_leads_down() -> None:
+    current = torch.tensor([1.0, 1.3, 40.0], requires_grad=True)
+    for reset in RESETS:
+        rate = firing_rate(current, torch.zeros(3), 64, reset)
+        (gradient,) = torch.autograd.grad(rate.sum(), current)
+        assert torch.equal(rate, torch.ones(3)) and torch.equal(gradient, torch.ones(3))
+
+
+def test_mean_over_starts_is_the_current_and_the_surrogate_its_finite_difference() -> None:
+    """Over uniform starts the subtractive rate is I exactly: smooth, with slope 1. The surrogate leaves out the steps
+    after the last spike, on average half an interval: 1 - 1 / (2 I M), and never less than 1 - 1 / (I M)."""
+    steps, n = 128, 4096
+    starts = (torch.arange(n).double() + 0.5) / n
+
+    def mean(i: float) -> float:
+        return float(firing_rate(torch.full((n,), i, dtype=torch.float64), starts, steps).mean())
+
+    for i in (0.05, 0.13, 0.37, 0.6, 0.92):
+        assert mean(i) == pytest.approx(i, abs=1 / n)
+        difference = (mean(i + 0.02) - mean(i - 0.02)) / 0.04
+        assert difference == pytest.approx(1, abs=2 / (n * 0.04))
+        current = torch.full((n,), i, dtype=torch.float64, requires_grad=True)
+        firing_rate(current, starts, steps).mean().backward()
+        surrogate = float(current.grad.sum())
+        assert 1 - 1 / (i * steps) <= surrogate <= 1
+        assert surrogate == pytest.approx(1 - 0.5 / (i * steps) + 0.5 / steps, abs=2e-3)
+
+
+def test_a_hard_reset_is_biased_and_a_subtraction_is_not() -> None:
+    current = torch.linspace(0.02, 0.5, 20001, dtype=torch.float64)
+    zero = torch.zeros_like(current)
+    hard, soft = (firing_rate(current, zero, 4096, reset) for reset in RESETS[::-1])
+    error = ((hard - current).abs() / current).numpy()
+    print(f"hard reset: mean error {100 * error.mean():.1f} %, largest {100 * error.max():.1f} %")
+    assert 0.10 < error.mean() < 0.14
+    intervals = np.ceil(1 / current.numpy() - 1e-12)  # rates 1/n only
+    np.testing.assert_allclose(hard.numpy(), 1 / intervals, rtol=5e-3, atol=1 / 4096)
+    assert float((soft - current).abs().max()) <= 1 / 4096
+    just_below_one = firing_rate(torch.tensor([0.999]), torch.zeros(1), 4096, "hard")
+    assert float(just_below_one) == 0.5  # half of the spikes are lost
+
+
+def test_the_loss_is_the_published_one_and_finite_at_zero() -> None:
+    rate = torch.tensor([0.0, 0.2, 0.6], requires_grad=True)
+    recorded = torch.tensor([0.1, 0.2, 0.0])
+    loss = spike_loss(rate, recorded)
+    expected = np.mean(
+        [((r + FLOOR) ** (1 / 2.2) - (t + FLOOR) ** (1 / 2.2)) ** 2 for r, t in [(0, 0.1), (0.6, 0)]] * 1
+    )
+    assert float(loss.detach()) == pytest.approx(expected * 2 / 3, rel=1e-5)
+    loss.backward()
+    assert rate.grad.isfinite().all() and rate.grad[0] < 0 < rate.grad[2]
+    assert float(encode(torch.tensor(1.0))) == pytest.approx(1, abs=2e-3)

@@ -1,0 +1,122 @@
+"""Fits of streams that hold nothing, everything, the same thing, or too little: no NaN and no Inf anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from toy_fits import silent, surfaces
+from toy_world import ToyWorld
+
+from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.fit import film, measure
+from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.supervision.table import SUPERVISIONS
+from spike4dgs.method.trainer import Trainer, seeded
+
+SETTINGS = TrainSettings(
+    coarse_steps=3, fine_steps=9, views_per_step=3, mlp_width=8, features=4, refine_every=3, flat_field=True
+)
+HEIGHT, WIDTH, TICKS = 40, 64, 120
+
+
+@cache
+def usual() -> TrainingScene:
+    return ToyWorld(width=WIDTH, height=HEIGHT, n_ticks=TICKS).training
+
+
+def stream(spikes: np.ndarray) -> SpikeStream:
+    return SpikeStream(pack(spikes), WIDTH, HEIGHT, 20000.0)
+
+
+def with_streams(spikes: np.ndarray, views: int | None = None) -> TrainingScene:
+    """The usual scene with `spikes` [T, H, W] for its first `views` cameras, or for all."""
+    scene, one = usual(), stream(spikes)
+    count = len(scene.streams) if views is None else views
+    return replace(scene, streams=(one,) * count + scene.streams[count:], n_ticks=len(spikes))
+
+
+def calibrated(scene: TrainingScene, gain: np.ndarray, dark: np.ndarray) -> TrainingScene:
+    """The scene with these maps in its first camera, and perfect ones in the others."""
+    other = Calibration(np.ones((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32), 0.6)
+    copy = replace(scene)
+    first = Calibration(gain.astype(np.float32), dark.astype(np.float32), 0.6)
+    copy.__dict__["calibrations"] = (first, *(other,) * (len(scene.streams) - 1))
+    return copy
+
+
+def holes(value: float) -> np.ndarray:
+    """A map of ones that is `value` here and there."""
+    return np.where(np.random.default_rng(1).random((HEIGHT, WIDTH)) < 0.2, value, 1.0)
+
+
+def case(name: str) -> TrainingScene:
+    empty = np.zeros((TICKS, HEIGHT, WIDTH), bool)
+    if name == "all dark":
+        return with_streams(empty)
+    if name == "saturated":
+        return with_streams(~empty)
+    if name == "identical frames":
+        return with_streams(np.broadcast_to(np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.5, empty.shape))
+    if name == "a camera that saw nothing":
+        return with_streams(empty, 1)
+    if name == "a camera that was blinded":
+        return with_streams(~empty, 1)
+    if name == "dark half":
+        seen = usual().streams[0].window(0, TICKS).astype(bool)
+        seen[:, :, : WIDTH // 2] = False
+        return with_streams(seen)
+    if name == "one tick":
+        return with_streams(np.random.default_rng(0).random((1, HEIGHT, WIDTH)) < 0.5)
+    if name == "100,000 ticks":
+        tile = np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3
+        return with_streams(np.tile(tile, (1000, 1, 1)), None)
+    if name == "NaN gain":
+        return calibrated(usual(), holes(np.nan), np.zeros((HEIGHT, WIDTH)))
+    if name == "NaN dark rate":
+        return calibrated(usual(), np.ones((HEIGHT, WIDTH)), holes(np.nan) - 1)
+    assert name == "dead pixels"
+    return calibrated(usual(), holes(0.0), np.zeros((HEIGHT, WIDTH)))
+
+
+CASES = [
+    "all dark", "saturated", "identical frames", "a camera that saw nothing", "a camera that was blinded", "dark half",
+    "one tick", "100,000 ticks", "NaN gain", "NaN dark rate", "dead pixels",
+]  # fmt: skip
+FITS = [
+    ("adaptive", "paths", "pixel", {"freeze_still": True}),
+    ("tfp", "hexplane", "spss", {}),
+    ("tfi", "spacetime", "pixel+spike", {}),
+    ("tfp", "static", "spike", {"spike_ticks": 1}),
+    ("tfstp", "spacetime-lite", "spike-render", {}),
+]
+
+
+@pytest.mark.parametrize("images, motion, supervision, extra", FITS, ids=["+".join(f[:3]) for f in FITS])
+@pytest.mark.parametrize("name", CASES)
+def test_losses_gradients_and_parameters_are_numbers(name, images, motion, supervision, extra) -> None:
+    if name == "100,000 ticks" and images == "tfstp":
+        pytest.skip("TFSTP looks at every tick before the picture's: minutes")
+    scene, s = case(name), replace(SETTINGS, time_spacing_ticks=20, max_times=4, **extra)
+    start = surfaces(usual(), 0)
+    footage = film(scene, start.cameras, IMAGES[images], s, "cpu")
+    model = MOTIONS[motion](measure(start, scene), s, seeded(0, -1))
+    gaussians = model.attach(from_points(start.points[::8], start.values[::8], opacity=0.5), footage)
+    fit = Trainer(footage, gaussians, model, SUPERVISIONS[supervision](s, scene), s, scale=1.0, seed=0)
+    while fit.step < fit.total:
+        assert fit.train_step().isfinite()
+        leaves = [*fit.gaussians.tensors().values(), *model.parameters(), *fit.supervision.parameters()]
+        assert all(x.isfinite().all() for x in leaves)
+        assert all(x.grad.isfinite().all() for x in leaves if x.grad is not None)
+    with torch.no_grad():
+        fit.run(silent)
+        for t in (0.0, 1.0):
+            assert fit._render(model.splats(fit.gaussians, t), footage.views).image.isfinite().all()

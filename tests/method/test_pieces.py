@@ -1,0 +1,192 @@
+"""Long clips: pieces of 20 ms, each fitted from where its neighbour ends."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussian_clouds import cloud
+from saved_models import DURATION_US, gaussian_model, provenance
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.fit import Parts, RecipeMethod, Start, at_most, film, measure
+from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.motion import spacetime
+from spike4dgs.method.motion.table import MOTIONS, Extent
+from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.schedule import choose_time, stages
+from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.supervision.table import SUPERVISIONS
+from spike4dgs.method.trainer import Trainer, seeded
+
+WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
+
+
+def pictures(stream, ticks, gain, camera=None):  # type: ignore[no-untyped-def]
+    """Mean of the spikes 12 ticks around."""
+    spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
+    return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
+
+
+def surfaces(scene: TrainingScene, seed: int) -> Start:
+    """Noisy points on the true surfaces at the middle of the clip."""
+    return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
+
+
+def paths(n_ticks: int) -> spacetime.Paths:
+    made = MOTIONS["paths"](Extent(torch.zeros(3), torch.ones(3), 1.0, n_ticks, 64), TrainSettings(), seeded(0, 0))
+    assert isinstance(made, spacetime.Paths)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("n_ticks", "pieces"), [(1, 1), (200, 1), (400, 1), (799, 1), (1200, 3), (2000, 5), (100_000, 13)]
+)
+def test_pieces_are_about_20_ms_long_and_odd(n_ticks: int, pieces: int) -> None:
+    assert paths(n_ticks).pieces == pieces
+    assert MOTIONS["hexplane"](paths(n_ticks).extent, TrainSettings(), seeded(0, 0)).pieces == 1
+
+
+def test_stages_go_outwards_and_each_begins_where_its_neighbour_ends() -> None:
+    s = TrainSettings(coarse_steps=100, fine_steps=200, piece_steps=150, ramp=0.5)
+    rest, *moving = stages(s, moves=True, pieces=5)
+    assert not rest.deforms and [m.piece for m in moving] == [2, 1, 3, 0, 4]
+    assert [m.neighbour for m in moving] == [None, 2, 2, 1, 3] and [m.steps for m in moving] == [200, *[150] * 4]
+    seen = {step: choose_time(s, rest, step, 1000) for step in range(100)}
+    assert min(seen.values()) >= 479 and max(seen.values()) <= 520, "a fifth of the middle piece"
+    for stage in moving:
+        steps = range(stage.first, stage.first + stage.steps)
+        times = np.array([choose_time(s, stage, step, 1000) for step in steps])
+        low, high = 200 * stage.piece, 200 * (stage.piece + 1)
+        assert times.min() >= low and times.max() <= high and len(set(times[len(times) // 2 :])) > 60
+        if stage.neighbour is not None:
+            border = high if stage.neighbour > stage.piece else low
+            assert np.abs(times[:5] - border).max() <= 48 and np.abs(times - border).max() > 180
+    at = {round(m.within(a), 9) for m in moving for a in m.span}
+    assert at == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
+    """Place, orientation, opacity and velocity at the border are the same on both sides."""
+    g, motion, h = cloud(seed=4, dtype=torch.float64), paths(1200), 1e-6
+    before, after = (1.0, 0.0) if forward else (0.0, 1.0)
+    follower = motion.continued(g, forward)
+    old, new = motion.splats(g, before), motion.splats(follower, after)
+    torch.testing.assert_close(new.means, old.means, rtol=0, atol=1e-12)
+    torch.testing.assert_close(rotation_matrices(new.quats), rotation_matrices(old.quats), rtol=0, atol=1e-12)
+    fade = torch.exp(torch.tensor(-((0.5 / TrainSettings().static_life) ** 2)))  # of a new life, at a piece's end
+    torch.testing.assert_close(new.opacities, old.opacities.clamp(1e-6) * fade.double(), rtol=1e-6, atol=1e-12)
+
+    def speed(x, t):  # type: ignore[no-untyped-def]
+        return (motion.splats(x, t + h).means - motion.splats(x, t - h).means) / (2 * h)
+
+    torch.testing.assert_close(speed(follower, after), speed(g, before), rtol=0, atol=1e-6)
+    # ... and straight on: the following piece has no acceleration yet
+    torch.testing.assert_close(speed(follower, 0.5), speed(follower, after), rtol=0, atol=1e-6)
+
+
+def trainer(**settings: float) -> Trainer:
+    scene, start = WORLD.training, surfaces(WORLD.training, 0)
+    s = replace(
+        TrainSettings(coarse_steps=6, fine_steps=8, piece_steps=8, refine_every=2, views_per_step=3), **settings
+    )
+    s = replace(s, time_spacing_ticks=20, freeze_still=True)
+    extent = measure(start, scene)
+    motion = MOTIONS["paths"](extent, s, seeded(0, -1))
+    footage = film(scene, start.cameras, pictures, s, "cpu")
+    first = motion.attach(from_points(start.points[::3], start.values[::3], opacity=0.5), footage)
+    return Trainer(footage, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
+
+
+def quiet(done: int, total: int, note: str = "") -> None:
+    pass
+
+
+@pytest.mark.parametrize("step", [6, 13, 14, 15, 22, 29])
+def test_a_fit_of_pieces_resumes_to_the_same_bits(step: int, tmp_path: Path) -> None:
+    """At the last step of a piece, and at the first and second of the next."""
+    whole, first, second = trainer(), trainer(), trainer()
+    whole.run(quiet)
+    first.total = step
+    first.run(quiet, tmp_path / "c", "this")
+    second.run(quiet, tmp_path / "c", "this")
+    assert len(whole.pieces()) == 3
+    for a, b in zip(whole.pieces(), second.pieces(), strict=True):
+        assert all(torch.equal(v, b.tensors()[k]) for k, v in a.tensors().items())
+
+
+def test_a_piece_that_has_ended_stays_as_it_is() -> None:
+    fit = trainer()
+    while fit.step < 15:
+        fit.train_step()
+    ended = {k: v.clone() for k, v in fit.ended[1].tensors().items()}
+    fit.run(quiet)
+    middle = fit.pieces()[1].tensors()
+    assert all(torch.equal(v, middle[k]) for k, v in ended.items())
+
+
+def test_a_cap_holds_whatever_the_pictures_size() -> None:
+    fit = trainer(fine_steps=30, coarse_steps=20, max_gaussians=1500, grow_gradient=0.0)
+    start = len(fit.gaussians)
+    fit.run(quiet)
+    assert start < 1500 and len(fit.still) + 750 <= 2250
+    assert all(len(g) <= max(750, start - len(fit.still)) for g in fit.pieces())
+
+
+def test_a_start_with_more_points_than_the_cap_is_thinned() -> None:
+    start = surfaces(WORLD.training, 0)
+    points, values = at_most(500, start, 7)
+    pairs = {(*p, v) for p, v in zip(start.points.tolist(), start.values.tolist(), strict=True)}
+    assert len(points) == len(values) == 500 < len(start.points)
+    assert (
+        len(kept := {(*p, v) for p, v in zip(points.tolist(), values.tolist(), strict=True)}) == 500 and kept <= pairs
+    )
+    assert not np.array_equal(points, at_most(500, start, 8)[0]) and at_most(10**6, start, 7)[0] is start.points
+
+
+def test_a_time_is_drawn_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
+    """Also at the borders, at the ends, and by a model that was saved and loaded."""
+    models = [gaussian_model("paths", still=40) for _ in range(3)]
+    grays = (0.2, 0.5, 0.8)
+    (first,) = models[0].pieces
+    pieces = tuple(replace(first, colors=torch.full_like(first.colors, gray)) for gray in grays)
+    model = replace(models[0], pieces=pieces)
+    model.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    assert isinstance(loaded, FittedModel)
+    for share, piece, local in (
+        (-1, 0, 0),
+        (0, 0, 0),
+        (0.2, 0, 0.6),
+        (0.5, 1, 0.5),
+        (0.9, 2, 0.7),
+        (1, 2, 1),
+        (2, 2, 1),
+    ):
+        for m in (model, loaded):
+            splats = m.splats(share * DURATION_US)
+            expected = m.motion.splats(pieces[piece], local)
+            torch.testing.assert_close(splats.colors[40:], expected.colors)
+            torch.testing.assert_close(splats.means[40:], expected.means, rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts({"short": pictures}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
+    steps = {"coarse_steps": 100, "fine_steps": 250, "piece_steps": 200, "time_spacing_ticks": 20}
+
+    def fitted(**settings: float) -> FittedModel:
+        recipe = Recipe("test", "short", "true", "paths", "pixel", {**steps, "freeze_still": True, **settings})
+        return RecipeMethod(recipe, parts).fit(WORLD.training, Budget(), "cpu", 0, quiet)  # type: ignore[return-value]
+
+    pieces = fitted()
+    monkeypatch.setattr(spacetime, "PIECE_TICKS", 10_000)
+    whole = fitted(fine_steps=650)
+    assert (len(pieces.pieces), len(whole.pieces)) == (3, 1)
+    assert WORLD.psnr(pieces, moving=True) > WORLD.psnr(whole, moving=True) + 2

@@ -1,0 +1,150 @@
+"""Models on disk: the same pictures, one clear error for anything else, and what a run writes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from dummy_methods import CountMethod, run
+from saved_models import DURATION_US, MODELS, WORLD, model, provenance
+from small_scenes import write_small_scene
+
+from spike4dgs.baselines.held_out_pose import RefinableModel, Refinement
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.results.provenance import Savable
+from spike4dgs.method.model_files.model_file import ModelFile, read_model, write_model
+from spike4dgs.method.saved_model import load_model
+
+MOVING = [name for name in MODELS if name != "static"]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path) -> None:
+    path, camera = tmp_path / "deep" / "m.safetensors", WORLD.held_out
+    original = model(name)
+    original.save(path, provenance())
+    loaded = load_model(path)
+    assert type(loaded.model) is type(original)
+    for t_us in (-10.0, 0.0, 1234.5, 0.5 * DURATION_US, DURATION_US):
+        picture = original.render(camera, t_us)
+        assert picture.std() > 0.01, "a test of nothing"
+        np.testing.assert_array_equal(loaded.model.render(camera, t_us), picture)
+    assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_the_models_of_these_tests_move(name: str) -> None:
+    a, b = (model(name).render(WORLD.held_out, t) for t in (0.2 * DURATION_US, 0.8 * DURATION_US))
+    assert np.abs(a - b).max() > 0.01
+
+
+def test_where_it_comes_from_is_kept(tmp_path: Path) -> None:
+    model("static").save(tmp_path / "m", provenance(fit_seconds=12.25, budget="paper"))
+    found = load_model(tmp_path / "m")
+    expected = provenance(fit_seconds=12.25, budget="paper")
+    assert found.title == "toy+4dgs on toy" and found.provenance.duration_us == DURATION_US
+    same = {k: v for k, v in vars(expected).items() if k != "cameras"}
+    assert {k: v for k, v in vars(found.provenance).items() if k != "cameras"} == same
+    for a, b in zip(found.provenance.cameras, WORLD.cameras, strict=True):
+        assert (a.id, a.width, a.height, a.K.tolist()) == (b.id, b.width, b.height, b.K.tolist())
+        np.testing.assert_allclose(a.w2c, b.w2c, atol=1e-12)
+
+
+def test_a_model_that_refines_views_saves_what_it_holds(tmp_path: Path) -> None:
+    wrapped = RefinableModel(model("hexplane"), Refinement())
+    assert isinstance(wrapped, Savable)
+    wrapped.save(tmp_path / "m", provenance())
+    picture = load_model(tmp_path / "m").model.render(WORLD.held_out, 500.0)
+    np.testing.assert_array_equal(picture, wrapped.render(WORLD.held_out, 500.0))
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "m.safetensors"
+    model("hexplane").save(path, provenance())
+    return path
+
+
+def refused(path: Path, message: str, device: str = "cpu") -> None:
+    with pytest.raises(UserError, match=message) as found:
+        load_model(path, device)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_a_file_that_was_cut_off_is_refused(saved: Path, share: float) -> None:
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(share * len(data))])
+    refused(saved, r"m\.safetensors: expected a fitted model, found damaged data .*run-benchmark")
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_flipped_bit_is_found(saved: Path, share: float) -> None:
+    data = bytearray(saved.read_bytes())
+    data[int(share * len(data))] ^= 1
+    saved.write_bytes(data)
+    refused(saved, r"m\.safetensors: expected the SHA-256 that it was written with, found damaged data")
+
+
+def test_what_is_no_model_is_refused(saved: Path, tmp_path: Path) -> None:
+    refused(tmp_path / "none", "none: expected a fitted model, found no such file; run-benchmark writes OUT/models")
+    refused(tmp_path, r"expected a model's file, found a folder \(models in it: m.safetensors\); name one file")
+    refused(saved, "device: expected cpu, or a CUDA device", "nonsense")
+    safetensors.torch.save_file({"x": torch.zeros(2)}, saved, metadata={"schema": "somebody/2"})
+    refused(saved, "expected schema spike4dgs-model/1, found 'somebody/2'")
+
+
+def without(key: str) -> Any:
+    return lambda about: about.pop(key)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: {"kind": "ghosts"}, "expected a model of kind gaussians, .* found 'ghosts'"),
+        (lambda f: {"config": {}}, "cannot read .KeyError"),
+        (lambda f: {"config": {"motion": {**f.config["motion"], "name": "warp"}}}, "cannot read .KeyError: 'warp'"),
+        (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"x": 1}}}}, "found 'x'; correct the name"),
+        (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}}, "cannot read .Runtime"),
+        (
+            lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
+            "cannot read .KeyError",
+        ),
+        (lambda f: {"provenance": provenance(cameras=())}, "expected method, scene, cameras and clock of a fit"),
+        (lambda f: {"provenance": provenance(rate_hz=0.0)}, "bad .'rate_hz'."),
+        (lambda f: {"provenance": provenance(method={})}, "KeyError.'name'."),
+    ],
+)
+def test_a_model_of_another_version_is_one_clear_error(saved: Path, change: Any, message: str) -> None:
+    file = read_model(saved)
+    values = {name: getattr(file, name) for name in ("kind", "config", "tensors", "provenance")}
+    write_model(saved, ModelFile(**{**values, **change(file)}))
+    refused(saved, message)
+
+
+class Kept(CountMethod):
+    """Its models can be saved."""
+
+    def fit(self, *args: Any, **kwargs: Any) -> Any:
+        """A toy model that renders what the method's own renders."""
+        fitted, toy = super().fit(*args, **kwargs), model("hexplane")
+        fitted.save = toy.save
+        return fitted
+
+
+def test_a_run_keeps_the_models_that_can_be_saved(tmp_path: Path) -> None:
+    scene = write_small_scene(tmp_path / "scene")
+    run(tmp_path / "out", [scene], Kept("kept"), CountMethod("fleeting"))
+    assert [p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out/models").rglob("*.*")] == [
+        "models/kept/pattern-0.safetensors"
+    ]
+    found = load_model(tmp_path / "out/models/kept/pattern-0.safetensors").provenance
+    about = json.loads((tmp_path / "out/predictions/kept/pattern-0/prediction.json").read_text())
+    assert found.method == about["method"] and found.scene_revision == about["scene_revision"]
+    assert (found.scene, found.split, found.budget) == ("pattern-0", about["split"], about["budget"])
+    assert [c.id for c in found.cameras] == ["cam_00", "cam_01", "cam_02"]
+    assert (found.n_ticks, found.rate_hz, found.radiance_gain) == (80, 20000.0, 0.6)
+    assert found.harness == about["harness"]

@@ -1,0 +1,21 @@
+"""Emulated arrays that show a small scene: what the tests of cameras and of recordings share."""
+
+from __future__ import annotations
+
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
+from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
+from spike4dgs.generators.recorder.emulation.camera import Fault
+from spike4dgs.generators.recorder.profile.profile import RigProfile
+
+BLOCK = 1024
+N = 200  # ticks of the clips with faults
+
+
+def profile_of(scene: Scene, **changes: object) -> RigProfile:
+    # The time limit is for a machine that has other things to do.
+    return scene_profile(scene, **({"transfer_bytes": BLOCK, "transfers": 4, "timeout_ms": 20000} | changes))
+
+
+def emulate(scene: Scene, profile: RigProfile, *faults: Fault, **options: object) -> EmulatedBackend:
+    return EmulatedBackend(EmulatedArray(profile, scene_streams(scene), faults=faults, **options))  # type: ignore[arg-type]

@@ -1,0 +1,40 @@
+"""Files of training bursts without a renderer: the toy world, seen by nine cameras, as `make-msdi-data` writes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from toy_world import GAIN, ToyWorld
+
+from spike4dgs.benchmark.scene.bursts import Burst, BurstFacts, burst_path, stack_bursts, write_bursts
+
+
+def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
+    """`count` pictures around `t` in [0, 1]; everything within reach of the board counts as moving."""
+    times = t + np.linspace(-0.05, 0.05, count)
+    looks = [[world.look(camera, when) for camera in world.cameras] for when in times]
+    keys = np.array([[image for image, _, _ in row] for row in looks], np.float32)
+    shape = keys.shape[1:]
+    rng = np.random.default_rng(world.seed)
+    return Burst(
+        keys=keys,
+        depth=np.array([depth for _, depth, _ in looks[count // 2]], np.float32),
+        moving=np.any([[board for _, _, board in row] for row in looks], axis=0),
+        w2c=np.stack([c.w2c for c in world.cameras]),
+        K=np.stack([c.K for c in world.cameras]),
+        gain=rng.uniform(0.95, 1.05, shape).astype(np.float32),
+        dark=rng.uniform(0.001, 0.008, shape).astype(np.float32),
+    )
+
+
+def write_toy_shard(folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2) -> Path:
+    """The shard `toy-VARIANT` of one rig; returns its path."""
+    world = ToyWorld(width=width, height=height, seed=variant)
+    bursts = [toy_burst(world, t) for t in np.linspace(0.3, 0.7, instants)]
+    looks = [world.look(camera, 1e3) for camera in world.cameras]  # the board is far out of sight
+    stills = [tuple(np.array([look[k] for look in looks], np.float32) for k in range(2))]
+    facts = BurstFacts("toy", variant, 0, width, height, len(world.cameras), 1, instants, 1, GAIN, 5e4)
+    path = burst_path(folder, "toy", variant)
+    write_bursts(path, facts, stack_bursts([bursts], stills))
+    return path

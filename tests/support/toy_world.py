@@ -1,0 +1,134 @@
+"""A world for tests that needs no renderer: a textured floor, a wall, and a board that moves in front of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.method import Model
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+
+RATE_HZ, GAIN = 20000.0, 0.6
+
+
+def run_neurons(rate: NDArray[np.floating], charge: NDArray[np.floating], ticks: int) -> NDArray[np.float64]:
+    """Spikes of integrate-and-fire neurons with subtractive reset, one tick after the other."""
+    charge, spikes = charge.astype(np.float64), np.zeros(rate.shape)
+    for _ in range(ticks):
+        charge += rate
+        fired = charge >= 1
+        charge -= fired
+        spikes += fired
+    return spikes
+
+
+@dataclass(frozen=True)
+class ToyWorld:
+    """Cameras in a square array 4 m before a wall; the board in between moves `travel` m to the right in the clip."""
+
+    width: int = 64
+    height: int = 40
+    side: int = 3  # cameras per side of the array
+    n_ticks: int = 240
+    travel: float = 0.25
+    seed: int = 0
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        places = np.linspace(-0.4, 0.4, self.side)
+        return tuple(
+            look_at(
+                f"cam_{i:02d}",
+                np.array([x, -3.0, 1.0 + z]),
+                np.array([0.0, 0.3, 0.7]),
+                np.array([0.0, 0.0, 1.0]),
+                focal=1.2 * self.width,
+                width=self.width,
+                height=self.height,
+            )
+            for i, (z, x) in enumerate((z, x) for z in places for x in places)
+        )
+
+    def texture(self, surface: int, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Band-limited gray pattern of a surface at its coordinates (a, b) in metres."""
+        rng = np.random.default_rng([self.seed, surface])
+        finest = 0.9 * 1.2 * self.width / 3.5  # rad/m that are 0.9 rad/px at 3.5 m
+        total = np.zeros_like(a)
+        for _ in range(12):
+            k = rng.uniform(0.15, 1) * finest * np.array([np.cos(p := rng.uniform(0, 6.28)), np.sin(p)])
+            total += np.sin(k[0] * a + k[1] * b + rng.uniform(0, 6.28))
+        return 0.45 + 0.35 * np.tanh(total / 2.5)
+
+    def look(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Radiance, depth z and board mask, each [H, W], at t in [0, 1]."""
+        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+        d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+        o = camera.center
+        with np.errstate(divide="ignore", invalid="ignore"):
+            to_floor, to_wall, to_board = -o[2] / d[..., 2], (1.0 - o[1]) / d[..., 1], -o[1] / d[..., 1]
+        floor, wall, board = (o + s[..., None] * d for s in (to_floor, to_wall, to_board))
+        x = board[..., 0] - self.travel * (t - 0.5)
+        on_board = (np.abs(x) < 0.45) & (np.abs(board[..., 2] - 0.6) < 0.35)
+        on_floor = (to_floor > 0) & (to_floor < to_wall)
+        image = np.where(
+            on_floor, self.texture(0, floor[..., 0], floor[..., 1]), self.texture(1, wall[..., 0], wall[..., 2])
+        )
+        image = np.where(on_board, self.texture(2, x, board[..., 2]), image)
+        depth = np.where(on_board, to_board, np.where(on_floor, to_floor, to_wall))
+        return image, depth, on_board
+
+    def stream(self, camera: Camera, index: int) -> SpikeStream:
+        """Noise-free integrate-and-fire of the radiance, which is traced every 8 ticks and interpolated."""
+        keys = np.arange(0, self.n_ticks + 8, 8)
+        frames = np.stack([self.look(camera, k / self.n_ticks)[0] for k in keys])
+        charge = np.random.default_rng([self.seed, 100 + index]).random(frames.shape[1:])
+        packed = []
+        for tick in range(self.n_ticks):
+            i, w = divmod(tick + 0.5, 8)
+            charge += GAIN * ((1 - w / 8) * frames[int(i)] + w / 8 * frames[int(i) + 1])
+            fired = charge >= 1
+            charge -= fired
+            packed.append(pack(fired[None]))
+        return SpikeStream(np.concatenate(packed), self.width, self.height, RATE_HZ)
+
+    def surfaces(
+        self, cameras: Sequence[Camera], noise_m: float, seed: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Noisy points [n, 3] on what `cameras` see at the middle of the clip, a point for 2x2 pixels; values [n]."""
+        rng, points, values = np.random.default_rng(seed), [], []
+        for camera in cameras:
+            image, depth, _ = self.look(camera, 0.5)
+            v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
+            points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
+            values.append(image[v, u])
+        cloud = np.concatenate(points)
+        cloud += noise_m * rng.normal(size=cloud.shape)
+        return cloud.astype(np.float32), np.concatenate(values).astype(np.float32)
+
+    def psnr(self, model: Model, moving: bool) -> float:
+        """Mean over the clip, dB, of the centre camera: everywhere, or on the board only."""
+        error = []
+        for t in np.linspace(0.1, 0.9, 5):
+            truth, _, board = self.look(self.held_out, t)
+            squared = (model.render(self.held_out, t * self.training.duration_us) - truth) ** 2
+            error.append(squared[board].mean() if moving else squared.mean())
+        return float(-10 * np.log10(error).mean())
+
+    @cached_property
+    def held_out(self) -> Camera:
+        """The centre camera."""
+        return self.cameras[len(self.cameras) // 2]
+
+    @cached_property
+    def training(self) -> TrainingScene:
+        """All cameras but the centre one."""
+        chosen = [(i, c) for i, c in enumerate(self.cameras) if c is not self.held_out]
+        streams = tuple(self.stream(c, i) for i, c in chosen)
+        cameras = tuple(c for _, c in chosen)
+        return TrainingScene("toy", f"toy-{self!r}", cameras, streams, RATE_HZ, self.n_ticks, GAIN)
