@@ -1,4 +1,4 @@
-"""`export-nerfstudio`: a scene as the pictures, poses and times that nerfstudio's D-NeRF data parser loads.
+"""`export-nerfstudio`: a scene as the images, poses and times that nerfstudio's D-NeRF data parser loads.
 
     OUT/train/CAMERA_TICK.png, OUT/val/..., OUT/test/...
     OUT/transforms_train.json, OUT/transforms_val.json, OUT/transforms_test.json
@@ -27,10 +27,10 @@ from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 
 _TOLERANCE_PX = 0.005  # of what one focal length and a principal point in the middle may move a pixel
-_VAL_EVERY = 5  # one picture between training times for so many training pictures
+_VAL_EVERY = 5  # one image between training times for so many training images
 _LOSSES = """lost on the way:
-  - 8-bit sRGB pictures, clipped at white, for streams and linear radiance
-  - one picture per window of spikes (blurred by motion within it) for every tick
+  - 8-bit sRGB images, clipped at white, for streams and linear radiance
+  - one image per window of spikes (blurred by motion within it) for every tick
   - one focal length and the middle as principal point for calibrated intrinsics (others are refused)
   - time as a share of the clip, rounded by readers to float32, for ticks
   - masks, geometry, calibration recordings, points and the other splits stay behind
@@ -38,8 +38,8 @@ their parser assumes a scene within 1.5 units of the origin: give it a --scale-f
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
-    """A picture of the export: linear radiance [H, W] or [H, W, 3]."""
+class _Image:
+    """An image of the export: linear radiance [H, W] or [H, W, 3]."""
 
     target: Target
     image: Float32
@@ -57,26 +57,26 @@ def export_nerfstudio(
 ) -> int:
     """Write a scene as data for nerfstudio's D-NeRF parser (and others that read this layout).
 
-    Training pictures are made from the spikes of the training cameras; validation pictures too, at times between;
-    test pictures are the ground truth of the held-out cameras. Lossy: 8-bit sRGB pictures clipped at white, one per
+    Training images are made from the spikes of the training cameras; validation images too, at times between;
+    test images are the ground truth of the held-out cameras. Lossy: 8-bit sRGB images clipped at white, one per
     window of spikes instead of the stream; one focal length, and the principal point in the middle (other cameras are
     refused); masks, geometry, calibration and points stay behind. Score here what counts: a predictions folder.
 
     Args:
         scene: Scene folder.
         out: New folder to write.
-        images: What makes a picture of spikes, such as tfp or tfi.
-        every: Ticks from one training picture of a camera to the next; 2 or more.
+        images: What makes an image of spikes, such as tfp or tfi.
+        every: Ticks from one training image of a camera to the next; 2 or more.
         split: Training and held-out cameras; the scene's default split if left out.
-        colour: Test pictures in colour, where the ground truth has it. Spike cameras, and so the training pictures,
-            see gray: then test pictures in gray are what can be compared.
+        colour: Test images in colour, where the ground truth has it. Spike cameras, and so the training images,
+            see gray: then test images in gray are what can be compared.
         allow_gaps: Export a recording with gaps all the same.
     """
     opened = open_scene(scene, allow_gaps, split)
     if images not in IMAGES:
         raise problem("--images", f"one of {', '.join(IMAGES)}", repr(images), "correct the name")
     if every < 2:
-        raise problem("--every", "2 ticks or more", str(every), "leave room for the validation pictures between")
+        raise problem("--every", "2 ticks or more", str(every), "leave room for the validation images between")
     used = [opened.cameras[c] for c in (*opened.train, *opened.test)]
     angle = _angle_x(used, scene)
     check_new(out)
@@ -88,10 +88,10 @@ def export_nerfstudio(
         "val": _from_spikes(opened, images, between),
     }
     frames = {name: [_write(out, name, opened, p) for p in pictures] for name, pictures in parts.items()}
-    for name, of_part in frames.items():  # after all pictures: what is cut off has no description
+    for name, of_part in frames.items():  # after all images: what is cut off has no description
         path = out / f"transforms_{name}.json"
-        print(f"{path}: {len(of_part)} pictures" if of_part else f"no {path.name}: the scene has no such pictures")
-        if of_part:  # the parser opens the first picture
+        print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
+        if of_part:  # the parser opens the first image
             write_json(path, {"camera_angle_x": angle, "frames": of_part})
     print(_LOSSES)
     return 0
@@ -112,24 +112,24 @@ def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
         if off[worst] > _TOLERANCE_PX or (c.width, c.height) != (first.width, first.height):
             expected = "cameras of one size and one focal length, their principal points in the middle"
             found = f"{worst} of {c.id} off by {off[worst]:.3g} px at {c.width}x{c.height}"
-            fix = "this format has no other cameras: rectify the pictures, or use transforms_*.json of the scene"
+            fix = "this format has no other cameras: rectify the images, or use transforms_*.json of the scene"
             raise problem(where, expected, found, fix)
     return 2 * math.atan(0.5 * first.width / first.fx)
 
 
-def _from_spikes(scene: Scene, maker: str, ticks: Iterable[int]) -> Iterable[_Picture]:
+def _from_spikes(scene: Scene, maker: str, ticks: Iterable[int]) -> Iterable[_Image]:
     for camera in scene.train:
         stream = scene.stream(camera)
         for tick in ticks:
-            yield _Picture(Target(camera, tick), IMAGES[maker](stream, [tick], scene.radiance_gain)[0])
+            yield _Image(Target(camera, tick), IMAGES[maker](stream, [tick], scene.radiance_gain)[0])
 
 
-def _from_truth(scene: Scene, colour: bool) -> Iterable[_Picture]:
+def _from_truth(scene: Scene, colour: bool) -> Iterable[_Image]:
     for target in scene.targets:
-        yield _Picture(target, scene.ground_truth_rgb(target) if colour else scene.ground_truth(target))
+        yield _Image(target, scene.ground_truth_rgb(target) if colour else scene.ground_truth(target))
 
 
-def _write(out: Path, part: str, scene: Scene, picture: _Picture) -> dict[str, Any]:
+def _write(out: Path, part: str, scene: Scene, picture: _Image) -> dict[str, Any]:
     """Write one PNG; returns its frame."""
     target, pixels = picture.target, encode_srgb(picture.image)
     name = f"{target.camera}_{target.tick:06d}"

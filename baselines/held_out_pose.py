@@ -1,7 +1,7 @@
 """Recipes whose initialisation estimates poses: the held-out view's pose is refined before a second scoring.
 
 A model that stands on estimated poses is a little off the calibrated frame in which held-out cameras are given, and a
-sharp picture rendered half a pixel aside scores badly. Both scores are therefore published: (i) at the calibrated pose,
+sharp image rendered half a pixel aside scores badly. Both scores are therefore published: (i) at the calibrated pose,
 and (ii) after the pose alone was fitted to pixels of the test view, with the Gaussians frozen (BARF, InstantSplat).
 Those pixels are of static things only and of a time that is not scored (`benchmark.refinement` chooses them).
 """
@@ -31,7 +31,7 @@ from spike4dgs.method.tracking.model import TrackedModel
 from spike4dgs.method.trainer import one_torch_thread
 
 Float32 = NDArray[np.float32]
-Draw = Callable[[Views], Tensor]  # one view -> its picture [1, H, W], differentiable in `views.w2c`
+Draw = Callable[[Views], Tensor]  # one view -> its image [1, H, W], differentiable in `views.w2c`
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class PosedRecipe(RecipeMethod):
 
 @dataclass(frozen=True, eq=False)
 class RefinableModel:
-    """A fitted model that can also say from where it sees a picture."""
+    """A fitted model that can also say from where it sees an image."""
 
     model: FittedModel | TrackedModel
     refinement: Refinement
@@ -88,7 +88,7 @@ class RefinableModel:
         self.model.save(path, provenance)
 
     def refine(self, camera: Camera, picture: Float32, still: NDArray[np.bool_], t_us: float) -> Camera:
-        """The camera near `camera` from which the model looks most like `picture`; see `refine_pose`."""
+        """The camera near `camera` from which the model looks most like `image`; see `refine_pose`."""
         model = self.model
         with torch.no_grad():
             splats = model.splats(t_us)
@@ -96,7 +96,7 @@ class RefinableModel:
         depth_m = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
 
         def draw(views: Views) -> Tensor:
-            return model.picture(render(splats, views).image, views)
+            return model.image(render(splats, views).image, views)
 
         return refine_pose(draw, camera, picture, still, depth_m, self.refinement, model.device)
 
@@ -104,23 +104,23 @@ class RefinableModel:
 def refine_pose(
     draw: Draw,
     camera: Camera,
-    picture: Float32,
+    image: Float32,
     still: NDArray[np.bool_],
     depth_m: float,
     settings: Refinement,
     device: str = "cpu",
 ) -> Camera:
-    """The pose near `camera`'s that makes mean |drawn - picture| over the pixels of `still` [H, W] smallest.
+    """The pose near `camera`'s that makes mean |drawn - image| over the pixels of `still` [H, W] smallest.
 
     The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
     included, so that refinement never ends worse than it began. Raises UserError where no pixel is still.
     """
     shape = (camera.height, camera.width)
-    if picture.shape != shape or still.shape != shape or not still.any():
-        found = f"{picture.shape}, {still.shape}, {int(still.sum())} still pixels"
-        raise problem("pose refinement", f"a picture and a mask of shape {shape} with still pixels", found, "check it")
+    if image.shape != shape or still.shape != shape or not still.any():
+        found = f"{image.shape}, {still.shape}, {int(still.sum())} still pixels"
+        raise problem("pose refinement", f"an image and a mask of shape {shape} with still pixels", found, "check it")
     start = Views.from_cameras([camera], device=device)
-    target = torch.as_tensor(picture, device=device)[None]
+    target = torch.as_tensor(image, device=device)[None]
     weight = torch.as_tensor(still, dtype=target.dtype, device=device)[None] / float(still.sum())
     xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([1.0, 1.0, 1.0, depth_m, depth_m, depth_m], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""`inspect`: what is in a stream or a scene? Rates, bad pixels, interval statistics, and pictures to look at."""
+"""`inspect`: what is in a stream or a scene? Rates, bad pixels, interval statistics, and images to look at."""
 
 from __future__ import annotations
 
@@ -86,10 +86,10 @@ def _two_intervals(stream: SpikeStream) -> float:
     return float(np.mean(longest[enough] - shortest[enough] <= 1)) if enough.any() else float("nan")
 
 
-def write_picture(path: Path, report: StreamReport, stream: SpikeStream) -> None:
+def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     """Write one PNG: TFP and TFI of the middle of the clip, the map of bad pixels, and the histogram of rates.
 
-    Where a recording has gaps, they are drawn over the course of the rate, and the pictures are of the middle of the
+    Where a recording has gaps, they are drawn over the course of the rate, and the images are of the middle of the
     longest stretch without one.
     """
     import matplotlib
@@ -219,7 +219,7 @@ def inspect(
     out: Path = Path("runs/inspect"),
     allow_gaps: bool = False,
 ) -> int:
-    """Show a scene's streams, or one raw stream: rates, dead and hot pixels, interval statistics, TFP and TFI pictures.
+    """Show a scene's streams, or one raw stream: rates, dead and hot pixels, interval statistics, TFP and TFI images.
 
     Args:
         path: A scene folder, a folder of imported streams, or a headerless .dat file.
@@ -227,17 +227,17 @@ def inspect(
         height: Rows of a .dat file.
         fps: Ticks per second of a .dat file.
         top_down: The first row of a .dat file is the top one (cameras of this kind store the bottom row first).
-        out: Folder for the pictures, one PNG per stream.
+        out: Folder for the images, one PNG per stream.
         allow_gaps: Accept recordings with gaps.
     """
     reports = []
     streams = _open(path, width, height, fps, top_down, allow_gaps)
     for name, stream in streams.items():
         report = examine(name, stream)
-        write_picture(out / f"{path.resolve().name if path.is_dir() else path.stem}" / f"{name}.png", report, stream)
+        write_image(out / f"{path.resolve().name if path.is_dir() else path.stem}" / f"{name}.png", report, stream)
         reports.append(report)
     _print_reports(reports)
     for gap in (gap for stream in streams.values() for gap in stream.gaps):
         print(f"{gap.camera}: no data in ticks [{gap.first_tick}, {gap.stop_tick}): {gap.ticks} ticks, {gap.reason}")
-    print(f"pictures: {out / (path.resolve().name if path.is_dir() else path.stem)}")
+    print(f"images: {out / (path.resolve().name if path.is_dir() else path.stem)}")
     return 0

@@ -1,4 +1,4 @@
-"""The floor `nearest-view`: the picture that the nearest training camera takes at that time."""
+"""The floor `nearest-view`: the image that the nearest training camera takes at that time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from spike4dgs.method.fit import ImageMaker
 
 @dataclass(frozen=True, eq=False)
 class NearestViewModel:
-    """Nothing is fitted: pictures are made from the training streams when they are asked for."""
+    """Nothing is fitted: images are made from the training streams when they are asked for."""
 
     scene: TrainingScene
     images: ImageMaker
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """The picture [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
+        """The image [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
         distances = [float(np.linalg.norm(c.center - camera.center)) for c in self.scene.cameras]
         # Rounded to a micrometre: equals on paper must not be told apart by the last bit.
         nearest = int(np.argmin(np.round(distances, 6)))

@@ -114,9 +114,9 @@ def poses(
         initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
             view, and what views match).
         images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
-            calibrations: what `colmap-flat` sees), or pictures of the clip's middle, such as tfp.
+            calibrations: what `colmap-flat` sees), or images of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
-        refine: Also fit 4DGS to TFP pictures from these poses, poses included, and measure what they became.
+        refine: Also fit 4DGS to TFP images from these poses, poses included, and measure what they became.
         seed: Seed of everything random.
         split: Split whose training cameras are taken; each scene's default one if left out.
         out: Write the rows to this JSON file.
@@ -130,7 +130,7 @@ def poses(
     rows = []
     for path in scenes:
         scene = open_scene(path, allow_gaps, split).training
-        pictures = _pictures(scene, images)
+        pictures = _images(scene, images)
         for name in initialization:
             budget = Budget() if refine else None
             rows += measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics, refine=budget)
@@ -141,8 +141,8 @@ def poses(
     return 0
 
 
-def _pictures(scene: TrainingScene, images: str) -> Float32:
-    """One picture of each training view [C, H, W], linear radiance."""
+def _images(scene: TrainingScene, images: str) -> Float32:
+    """One image of each training view [C, H, W], linear radiance."""
     if images == CLIP:
         return clip_means(scene)
     if images == FLAT:
@@ -172,7 +172,7 @@ def measure_poses(
 
 
 def refined(scene: TrainingScene, cameras: Sequence[Camera], budget: Budget, seed: int) -> tuple[Camera, ...]:
-    """`cameras`, in any order, after 4DGS was fitted to TFP pictures from where they stand, poses included."""
+    """`cameras`, in any order, after 4DGS was fitted to TFP images from where they stand, poses included."""
     placed = {camera.id: camera for camera in cameras}
     start = rig(replace(scene, cameras=tuple(placed[camera.id] for camera in scene.cameras)), seed)
     parts = replace(PARTS, initialization={"given": lambda scene, seed: start})

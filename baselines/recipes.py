@@ -2,7 +2,7 @@
 
 The rows of the paper's main tables are {tfi, tfp, spk2img} + {d3dgs, stg, 4dgs}, dy-spikegs and dy-spikenerf. Those of
 its ablations, and of ours, are named IMAGES + INITIALIZATION + MOTION + SUPERVISION, without `rig` and `pixel`, and
-with one `msdi` for pictures and points.
+with one `msdi` for images and points.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PARTS = Parts(
 )
 _MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
 
-# Spk2ImgNet's pictures take a quarter of a quick fit's 90 s on two cores, at every other time of the other rows; for it
+# Spk2ImgNet's images take a quarter of a quick fit's 90 s on two cores, at every other time of the other rows; for it
 # STG has a sixth and 4DGS, the slowest, a quarter fewer steps.
 _SPK2IMG: dict[str, dict[str, Any]] = {
     "d3dgs": {},
@@ -64,8 +64,8 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
 )
 
-# The reference method, and with less of it. MSDI's pictures take about a third of a quick fit's 90 s: there are a
-# tenth fewer steps. Half as many pictures would cost 2.7 dB on the turntable (1150 steps, `adaptive` pictures).
+# The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s: there are a
+# tenth fewer steps. Half as many images would cost 2.7 dB on the turntable (1150 steps, `adaptive` images).
 _MSDI: dict[str, Any] = {"flat_field": True, "time_spacing_ticks": 10, "coarse_steps": 250, "fine_steps": 1100}
 SPIKE4DGS = (
     Recipe("spike4dgs", "msdi", "msdi", "hexplane", "spss", _MSDI),
@@ -75,7 +75,7 @@ SPIKE4DGS = (
 )
 
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
-# corrected by the cameras' calibration; what does not move is fitted first and becomes a backdrop; what moves follows
+# corrected by the cameras' calibration; what does not move is fitted first and becomes a background; what moves follows
 # paths of its own. The rows before it have a part of that each: the calibration alone, then the windows too.
 BEYOND = (
     Recipe("tfp+rig-flat+stg", "tfp", "rig-flat", "spacetime", "pixel", {"flat_field": True}),

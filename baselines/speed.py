@@ -1,4 +1,4 @@
-"""`speed tfp` and `speed tfi`: pictures at every tick of a clip, beside plain numpy, with the error."""
+"""`speed tfp` and `speed tfi`: images at every tick of a clip, beside plain numpy, with the error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spike4dgs.benchmark.speed.decode import unpack_plainly
 from spike4dgs.benchmark.speed.timing import show_table, time_ms
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
-COLUMNS = ("pictures", "by", "min ms", "median ms", "times as fast", "largest error")
+COLUMNS = ("images", "by", "min ms", "median ms", "times as fast", "largest error")
 
 
 def fired_stream(ticks: int, width: int, height: int, seed: int = 0) -> SpikeStream:

@@ -1,11 +1,11 @@
-"""`speed images`: time and quality of every way from spikes to pictures, beside the paper's Table 6 and spikezoo.
+"""`speed images`: time and quality of every way from spikes to images, beside the paper's Table 6 and spikezoo.
 
-Quality is measured at the scenes' held-out cameras: each generator sees the held-out stream itself, and its pictures of
+Quality is measured at the scenes' held-out cameras: each generator sees the held-out stream itself, and its images of
 the scored ticks are compared with the ground truth, as the benchmark compares a method's. Nothing is trained here.
 Where a scene has that camera's calibration recordings, ours are scored a second time, corrected by them.
 
 spikezoo gets its window of 41 ticks as a ready-made float array, centred on the middle of the tick: taking the window
-out of the stream does not count for it, and its pictures are half a tick late. numpy gets an unpacked clip likewise.
+out of the stream does not count for it, and its images are half a tick late. numpy gets an unpacked clip likewise.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from spike4dgs.benchmark.speed.timing import module_of, show_table, time_ms
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 Float32 = NDArray[np.float32]
-Draw = Callable[[], Float32]  # makes one picture, [H, W] linear radiance
+Draw = Callable[[], Float32]  # makes one image, [H, W] linear radiance
 Prepare = Callable[[SpikeStream, int, float], Draw]  # stream, tick, gain: what comes before the clock starts
 Quality = Mapping[str, Mapping[str, float | None]]  # scene id -> metric id -> mean
 QUALITY = ("psnr", "ssim", "psnr_dynamic")
@@ -77,10 +77,10 @@ class Row:
 
     name: str  # the entry of IMAGES, or ours that it corresponds to
     by: str
-    ms: float | None = None  # a picture of 400x250, median
-    scene_ms: float | None = None  # a picture of the first scene's size, median
+    ms: float | None = None  # an image of 400x250, median
+    scene_ms: float | None = None  # an image of the first scene's size, median
     quality: Quality = field(default_factory=dict)
-    corrected: Quality = field(default_factory=dict)  # of pictures corrected by the camera's calibration
+    corrected: Quality = field(default_factory=dict)  # of images corrected by the camera's calibration
     note: str = ""
 
     @property
@@ -93,24 +93,24 @@ class Row:
         return _mean([values[metric] for values in self.quality.values()])
 
     def corrected_mean(self, metric: str) -> float | None:
-        """The same of corrected pictures."""
+        """The same of corrected images."""
         return _mean([values[metric] for values in self.corrected.values()])
 
 
 def images(argv: Sequence[str] = ()) -> int:
     """Time every spike-to-image generator, and score it at the held-out cameras of the given scenes.
 
-    Writes the table to OUT/images.csv, and for each scene OUT/strip_SCENE.png: truth, pictures, errors.
+    Writes the table to OUT/images.csv, and for each scene OUT/strip_SCENE.png: truth, images, errors.
     """
     p = argparse.ArgumentParser("spike4dgs speed images", description=images.__doc__)
     p.add_argument("scenes", nargs="*", type=Path, help="scene folders; without any, only time is measured")
-    p.add_argument("--repeats", type=int, default=5, help="the median of so many pictures counts")
+    p.add_argument("--repeats", type=int, default=5, help="the median of so many images counts")
     p.add_argument("--out", type=Path, default=Path("runs/images"), help="folder for the table and the strips")
     p.add_argument("--allow-gaps", action="store_true", help="accept recordings with gaps")
     a = p.parse_args(list(argv))
     scenes = [open_scene(path, a.allow_gaps) for path in a.scenes]
     rows = measure_generators(scenes, a.repeats)
-    title = f"Pictures from spikes, median ms of {a.repeats}, quality at the held-out cameras of {len(scenes)} scene(s)"
+    title = f"Images from spikes, median ms of {a.repeats}, quality at the held-out cameras of {len(scenes)} scene(s)"
     show_table(title, _columns(scenes), [_texts(r) for r in rows], a.out / "images.csv", [r.note for r in rows])
     if len(scenes) > 1:
         scored = [row for row in rows if row.quality]
@@ -120,7 +120,7 @@ def images(argv: Sequence[str] = ()) -> int:
     for scene in scenes:
         write_strip(a.out / f"strip_{scene.id}.png", scene, rows)
     if scenes:
-        print(f"pictures: {a.out}/strip_*.png")
+        print(f"images: {a.out}/strip_*.png")
     return 0
 
 
@@ -155,7 +155,7 @@ def _measure(row: Row, prepare: Prepare, scenes: Sequence[Scene], repeats: int, 
 
 
 def _corrected(maker: ImageMaker, scenes: Sequence[Scene]) -> Quality:
-    """Scores of pictures that know their camera, on scenes that have the held-out cameras' calibration recordings."""
+    """Scores of images that know their camera, on scenes that have the held-out cameras' calibration recordings."""
     known = [s for s in scenes if all(s.recordings(c) for c in s.test)]
     cameras = {(s.id, c): estimate(r) for s in known for c in s.test if (r := s.recordings(c))}
 
@@ -257,7 +257,7 @@ def _zoo(net: Any, stream: SpikeStream, tick: int, gain: float) -> Draw:
 def _columns(scenes: Sequence[Scene]) -> tuple[str, ...]:
     size = f"ms {scenes[0].meta['width']}x{scenes[0].meta['height']}" if scenes else "ms, scene"
     quality = ("PSNR", "SSIM", "PSNR, moving", "PSNR, corrected", "moving, corrected")
-    return ("pictures", f"ms {WIDTH}x{HEIGHT}", size, *quality, "in Table 6", "its PSNR", "its SSIM")
+    return ("images", f"ms {WIDTH}x{HEIGHT}", size, *quality, "in Table 6", "its PSNR", "its SSIM")
 
 
 def _texts(row: Row) -> tuple[str, ...]:
@@ -273,7 +273,7 @@ def _show(metric: str, value: float | None) -> str:
 
 
 def write_strip(path: Path, scene: Scene, rows: Sequence[Row]) -> None:
-    """Write a PNG of the middle target: truth and the picture of each of our generators, error maps below."""
+    """Write a PNG of the middle target: truth and the image of each of our generators, error maps below."""
     from matplotlib.figure import Figure
 
     target = middle_target(scene)
@@ -285,12 +285,12 @@ def write_strip(path: Path, scene: Scene, rows: Sequence[Row]) -> None:
     axes = figure.subplots(2, len(makers) + 1, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
-    _picture(axes[0, 0], f"truth, {scene.id}, tick {target.tick}", encode_srgb(truth), "gray", 255)
+    _image(axes[0, 0], f"truth, {scene.id}, tick {target.tick}", encode_srgb(truth), "gray", 255)
     for (top, below), (row, maker) in zip(axes[:, 1:].T, makers, strict=True):
         image = _ours(maker, *_view(scene, target))()
         psnr = _show("psnr", row.quality[scene.id]["psnr"])
-        _picture(top, f"{row.name}, {psnr} dB over the scene", encode_srgb(image), "gray", 255)
-        shown = _picture(below, "", np.abs(np.clip(image, 0, 1) - np.clip(truth, 0, 1)), "magma", _ERROR_MAX)
+        _image(top, f"{row.name}, {psnr} dB over the scene", encode_srgb(image), "gray", 255)
+        shown = _image(below, "", np.abs(np.clip(image, 0, 1) - np.clip(truth, 0, 1)), "magma", _ERROR_MAX)
     if makers:
         scale = axes[1, 0].inset_axes((0.1, 0.45, 0.8, 0.1))
         figure.colorbar(shown, cax=scale, orientation="horizontal").set_label("absolute error (1 = white)", fontsize=8)
@@ -299,6 +299,6 @@ def write_strip(path: Path, scene: Scene, rows: Sequence[Row]) -> None:
         figure.savefig(part, metadata={"Software": None})
 
 
-def _picture(axis: Any, title: str, image: NDArray[Any], cmap: str, most: float) -> Any:
+def _image(axis: Any, title: str, image: NDArray[Any], cmap: str, most: float) -> Any:
     axis.set_title(title, fontsize=8)
     return axis.imshow(image, cmap=cmap, vmin=0, vmax=most, interpolation="nearest")

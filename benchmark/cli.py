@@ -60,7 +60,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "train-spk2img": Command(
         "spike4dgs.baselines.spike_to_image.spk2img.train:train_spk2img",
-        "train the network of the spk2img pictures on training variants of the worlds",
+        "train the network of the spk2img images on training variants of the worlds",
         "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
     ),
     "make-msdi-data": Command(
@@ -70,7 +70,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "train-msdi": Command(
         "spike4dgs.method.msdi.training.train:train_msdi",
-        "train the network that finds points, poses and pictures from spikes",
+        "train the network that finds points, poses and images from spikes",
         "train-msdi --data data/msdi --out runs/msdi",
     ),
     "run-benchmark": Command(
@@ -90,7 +90,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "inspect": Command(
         "spike4dgs.baselines.inspect:inspect",
-        "show a scene or a raw spike stream: rates, bad pixels, pictures",
+        "show a scene or a raw spike stream: rates, bad pixels, images",
         "inspect recording.dat --width 400 --height 250 --fps 20000",
     ),
     "render": Command(
@@ -125,7 +125,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "export-nerfstudio": Command(
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
-        "write a scene as nerfstudio's D-NeRF data: pictures, poses, times",
+        "write a scene as nerfstudio's D-NeRF data: images, poses, times",
         "export-nerfstudio data/car-0-small --out car-nerfstudio",
     ),
     "tradeoff": Command(
@@ -148,7 +148,7 @@ SPEED: dict[str, Command] = {
     "ssim": Command("spike4dgs.method.speed:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
     "render": Command(
         "spike4dgs.method.viewing.speed_render:render",
-        "pictures of saved models, side by side",
+        "images of saved models, side by side",
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
     "simulate": Command(
@@ -163,11 +163,11 @@ SPEED: dict[str, Command] = {
         "spike4dgs.benchmark.speed.decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
     ),
     "metrics": Command("spike4dgs.benchmark.speed.metrics:metrics", "every metric for one image", "speed metrics"),
-    "tfi": Command("spike4dgs.baselines.speed:tfi", "pictures from spike intervals, whole stack", "speed tfi"),
-    "tfp": Command("spike4dgs.baselines.speed:tfp", "pictures from spike counts, whole stack", "speed tfp"),
+    "tfi": Command("spike4dgs.baselines.speed:tfi", "images from spike intervals, whole stack", "speed tfi"),
+    "tfp": Command("spike4dgs.baselines.speed:tfp", "images from spike counts, whole stack", "speed tfp"),
     "images": Command(
         "spike4dgs.baselines.speed_images:images",
-        "time and quality of each way from spikes to a picture, beside the paper's Table 6",
+        "time and quality of each way from spikes to an image, beside the paper's Table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),
 }

@@ -2,7 +2,7 @@
 
     python predictions_only.py SCENE PREDICTIONS
 
-This one reads a scene folder's files with numpy alone, and writes for each scored (camera, tick) the mean picture of
+This one reads a scene folder's files with numpy alone, and writes for each scored (camera, tick) the mean image of
 all training cameras around that tick. It imports nothing of the benchmark.
 """
 

@@ -31,7 +31,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     """The report: errors at random ticks ("ticks") and of ground truth ("ground_truth"), one by one and in total.
 
     Errors: PSNR (dB, range 1, clipped like the scores), mean and 99.9th percentile of the relative error in percent,
-    mean absolute error; over the whole picture and where something moves or is lit differently.
+    mean absolute error; over the whole image and where something moves or is lit differently.
     """
     rng = np.random.default_rng([job.seed, 7])
     ticks = sorted(int(t) for t in rng.choice(job.n_ticks, min(_TICKS, job.n_ticks), replace=False))
@@ -63,7 +63,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
 
 
 def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArray[np.bool_]) -> dict[str, float]:
-    """Errors of one picture [H, W] against the truth; `moving` [H, W] is where `*_moving` look."""
+    """Errors of one image [H, W] against the truth; `moving` [H, W] is where `*_moving` look."""
     found: dict[str, float] = {}
     for suffix, where in (("", np.ones(moving.shape, bool)), ("_moving", moving)):
         if not where.any():

@@ -20,7 +20,7 @@ class Profile:
     spp: int  # of key frames, inside the region that changes
     background_spp: int
     target_spp: int  # of ground truth, inside the region that changes
-    max_key_px: float  # that a point of the picture may move between two of its keys
+    max_key_px: float  # that a point of the image may move between two of its keys
     sparse_every: int  # ticks between the ground-truth frames of the cameras that are not held out
 
 

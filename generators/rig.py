@@ -17,7 +17,7 @@ def cameras(scene: WorldScene, width: int, height: int, views: Sequence[int] = t
     """Cameras `cam_00` .. `cam_08` of the array (or the `views` of it), in the order asked for.
 
     The focal length scales with `width`, so the field of view is the same at every resolution.
-    Raises UserError for a view outside 0..8 or an empty picture.
+    Raises UserError for a view outside 0..8 or an empty image.
     """
     if width < 1 or height < 1:
         raise problem(

@@ -144,8 +144,8 @@ class RenderTargets(_Task):
         t_s, everywhere = tick / RATE_HZ, tick in self.job.sparse_ticks
         renderer = self._every_view if everywhere else self._held_out
         views = range(len(cameras_of(self.job))) if everywhere else [held_out_view(self.job)]
-        pictures = (renderer.keys(t_s), renderer.object_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
-        return [Truth(view, tick, *one) for view, *one in zip(views, *pictures, strict=True)]
+        images = (renderer.keys(t_s), renderer.object_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
+        return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 
 def _target_renderer(job: Job, views: Sequence[Camera], still: Still | None) -> MultiViewRenderer:

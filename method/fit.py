@@ -1,4 +1,4 @@
-"""A recipe as a method: pictures from spikes, first points, the trainer, and a model that renders."""
+"""A recipe as a method: images from spikes, first points, the trainer, and a model that renders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.motion.table import PUBLISHED, Extent, Motion
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import TrainSettings, make_settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.base import Supervision
@@ -47,7 +47,7 @@ SupervisionMaker = Callable[[TrainSettings, TrainingScene], Supervision]
 
 
 class ImageMaker(Protocol):
-    """Pictures from spikes, corrected if the camera's calibration is given; `spike_to_image.images` says more."""
+    """Images from spikes, corrected if the camera's calibration is given; `spike_to_image.images` says more."""
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
@@ -57,26 +57,26 @@ class ImageMaker(Protocol):
 
 
 class FitSettings(Protocol):
-    """What every algorithm's settings have: when pictures are made, and how a budget changes the step counts."""
+    """What every algorithm's settings have: when images are made, and how a budget changes the step counts."""
 
     @property
     def time_spacing_ticks(self) -> int:
-        """Ticks between two training pictures."""
+        """Ticks between two training images."""
         ...
 
     @property
     def edge_ticks(self) -> int:
-        """Ticks at the clip's ends without a picture."""
+        """Ticks at the clip's ends without an image."""
         ...
 
     @property
     def max_times(self) -> int:
-        """The most training pictures a view."""
+        """The most training images a view."""
         ...
 
     @property
     def flat_field(self) -> bool:
-        """Whether pictures are corrected by the cameras' calibrations."""
+        """Whether images are corrected by the cameras' calibrations."""
         ...
 
     def scaled(self, scale: float) -> FitSettings:
@@ -90,7 +90,7 @@ class FitJob:
 
     scene: TrainingScene
     start: Start
-    footage: Footage
+    training_images: TrainingImages
     extent: Extent
     settings: Any  # the algorithm's own, scaled by the budget
     device: str
@@ -162,8 +162,8 @@ class RecipeMethod:
         _part(own or parts.supervision, recipe.supervision, recipe, "supervision")
         progress(0, 1, "initialisation")
         start = initialize(scene, seed)
-        progress(0, 1, "pictures")
-        footage = film(scene, start.cameras, images, settings, device)
+        progress(0, 1, "images")
+        footage = make_training_images(scene, start.cameras, images, settings, device)
         key = sha256_json([scene.revision, self.params, budget.label, seed])
         extent = measure(start, scene)
         job = FitJob(scene, start, footage, extent, settings, device, seed, progress, checkpoint, key)
@@ -196,9 +196,9 @@ def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, super
     points, values = at_most(settings.max_gaussians, start, job.seed)
     look = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
     first = from_points(points, values, **look, device=job.device)
-    first = motion.attach(first, job.footage)
+    first = motion.attach(first, job.training_images)
     supervision = supervise(settings, job.scene).to(job.device)
-    trainer = Trainer(job.footage, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
+    trainer = Trainer(job.training_images, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
     trainer.run(job.progress, job.checkpoint, job.key)
     cameras = trainer.poses.cameras(start.cameras)
     return FittedModel(trainer.pieces(), trainer.still, motion, job.scene.duration_us, job.device, spec, cameras)
@@ -229,17 +229,17 @@ def check_device(device: str) -> None:
 
 
 def choose_ticks(n_ticks: int, settings: FitSettings) -> tuple[int, ...]:
-    """Ticks of the training pictures: evenly spaced, an edge away from the clip's ends, where windows are cut."""
+    """Ticks of the training images: evenly spaced, an edge away from the clip's ends, where windows are cut."""
     edge = min(settings.edge_ticks, (n_ticks - 1) // 2)
     span = n_ticks - 2 * edge
     count = min(settings.max_times, max(1, round(span / settings.time_spacing_ticks) + 1))
     return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
 
 
-def film(
+def make_training_images(
     scene: TrainingScene, cameras: Sequence[Camera], images: ImageMaker, settings: FitSettings, device: str
-) -> Footage:
-    """Pictures of all training views at the chosen times; see `FitSettings.flat_field`."""
+) -> TrainingImages:
+    """Images of all training views at the chosen times; see `FitSettings.flat_field`."""
     ticks = choose_ticks(scene.n_ticks, settings)
     gain, cameras_known = scene.radiance_gain, scene.calibrations if settings.flat_field else None
     if cameras_known:
@@ -248,7 +248,7 @@ def film(
         made = [images(s, ticks, gain) for s in scene.streams]
     pictures = np.stack(made, axis=1)
     views = Views.from_cameras(cameras, device=device)
-    return Footage(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
+    return TrainingImages(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
 
 
 def measure(start: Start, scene: TrainingScene) -> Extent:

@@ -70,7 +70,7 @@ class FittedModel:
         views = Views.from_cameras([camera], device=self.device)
         with one_torch_thread():
             image = render(self.splats(t_us), views).image
-            return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+            return self.image(image, views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
         """What is drawn at `t_us`."""
@@ -79,15 +79,15 @@ class FittedModel:
         moving = self.motion.splats(self.pieces[piece], t * count - piece)
         if not len(self.still):
             return moving
-        return join(self._backdrop, moving)
+        return join(self._background, moving)
 
     @cached_property
-    def _backdrop(self) -> Splats:
+    def _background(self) -> Splats:
         return self.still.splats()
 
-    def picture(self, image: Tensor, views: Views) -> Tensor:
+    def image(self, image: Tensor, views: Views) -> Tensor:
         """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
-        return self.motion.picture(image, views)
+        return self.motion.image(image, views)
 
     def save(self, path: Path, provenance: Provenance) -> None:
         """Write the model to one file; see `saved_model.load_model`."""

@@ -1,4 +1,4 @@
-"""`load_model`: a model that a run saved, ready to render the pictures that it rendered then, bit for bit."""
+"""`load_model`: a model that a run saved, ready to render the images that it rendered then, bit for bit."""
 
 from __future__ import annotations
 

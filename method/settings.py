@@ -20,12 +20,12 @@ class TrainSettings:
     views_per_step: int = 4  # they share one time and one deformation; of 8 views only half as many steps fit the time
     ramp: float = 0.3  # share of the fine stage in which the times open up from the middle to the whole clip
 
-    # Times at which pictures are made from the spikes.
+    # Times at which images are made from the spikes.
     time_spacing_ticks: int = 10  # 0.5 ms at 20 kHz: half a ground-truth interval
-    edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their pictures belong to a later time
+    edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their images belong to a later time
     max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
     coarse_share: float = 0.2  # middle share of the clip (or its middle piece) that a moving scene's coarse stage sees
-    flat_field: bool = False  # correct the pictures by each camera's calibrated gain n(x, y) and dark rate, if known
+    flat_field: bool = False  # correct the images by each camera's calibrated gain n(x, y) and dark rate, if known
 
     # Poses of the training cameras.
     refine_poses: bool = False  # fit them too; for starts that estimated them
@@ -33,7 +33,7 @@ class TrainSettings:
     pose_rate_last: float = 2e-6
 
     # Model only what moves.
-    freeze_still: bool = False  # after the static stage, Gaussians where nothing changes become a backdrop
+    freeze_still: bool = False  # after the static stage, Gaussians where nothing changes become a background
 
     # Loss.
     ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs
@@ -57,8 +57,8 @@ class TrainSettings:
     split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
     min_opacity: float = 0.005  # fainter ones are removed
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
-    max_moving_per_pixel: float = 0.4  # the same of those before a backdrop, which is not counted
-    max_gaussians: int = 1_000_000  # whatever the pictures' size; half as many before a backdrop
+    max_moving_per_pixel: float = 0.4  # the same of those before a background, which is not counted
+    max_gaussians: int = 1_000_000  # whatever the images' size; half as many before a background
 
     # Deformation.
     cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
@@ -76,12 +76,10 @@ class TrainSettings:
 
     # Losses on spikes.
     spike_ticks: int = 40  # ticks of a recorded window, as many as TFP's has
-    neuron_ticks: int = (
-        256  # for which a neuron sees a rendered picture: SpikeNeRF's; closed form, so they cost nothing
-    )
+    neuron_ticks: int = 256  # for which a neuron sees a rendered image: SpikeNeRF's; closed form, so they cost nothing
     phi_rate: float = 1e-2
     noise_rate: float = 1e-3
-    noise_weight: float = 30.0  # of the noise embedding's mean square; with 0.1 it takes the pictures' edges: 7 dB lost
+    noise_weight: float = 30.0  # of the noise embedding's mean square; with 0.1 it takes the images' edges: 7 dB lost
 
     # Spacetime Gaussians. Published rates in brackets, for 30,000 steps.
     static_life: float = 4.0  # of the clip: a Gaussian that fades by 1 % towards the clip's ends [1]

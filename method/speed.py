@@ -2,7 +2,7 @@
 
 The other side of `splat` is the rasteriser `torch_ref` of the package metal-gauss, which draws three channels; ours is
 timed with one, as the spike cameras need, and with three. It cuts Gaussians off at three standard deviations where we
-go on to an alpha of 1/255, so pictures differ by up to 1/255 a Gaussian; the tests hold our error against float64.
+go on to an alpha of 1/255, so images differ by up to 1/255 a Gaussian; the tests hold our error against float64.
 """
 
 from __future__ import annotations

@@ -17,17 +17,17 @@ from torch import Tensor
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Progress
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.density import GradientStatistics, refine
 from spike4dgs.method.gaussians.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.observations.lookup import moving
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.pose_refinement import Poses
 from spike4dgs.method.schedule import Stage, choose_time, stages
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
-from spike4dgs.method.splat.background import Backdrop
+from spike4dgs.method.splat.background import Background
 from spike4dgs.method.supervision.base import Sample, Supervision
 
 
@@ -55,7 +55,7 @@ class Trainer:
 
     def __init__(
         self,
-        footage: Footage,
+        footage: TrainingImages,
         gaussians: Gaussians,
         motion: Motion,
         supervision: Supervision,
@@ -65,17 +65,17 @@ class Trainer:
         seed: int,
     ) -> None:
         if settings.refine_poses and settings.freeze_still:
-            fix = "choose one of them: a backdrop is projected once"
+            fix = "choose one of them: a background is projected once"
             raise problem("settings", "refine_poses or freeze_still", "both", fix)
-        self.footage, self.motion, self.supervision = footage, motion, supervision
+        self.training_images, self.motion, self.supervision = footage, motion, supervision
         self.settings, self.scale, self.seed = settings, scale, seed
         self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
         self.gaussians = gaussians.trainable()
         self.ended: dict[int, Gaussians] = {}  # the pieces of the clip that are fitted
-        self.still = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # frozen: the backdrop
-        self.backdrop: Backdrop | None = None
+        self.still = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # frozen: the background
+        self.background: Background | None = None
         self.poses = Poses(footage.views, scale)
         self._begin(self.plan[0])
 
@@ -101,10 +101,10 @@ class Trainer:
         }
         groups = {name: [leaf] for name, leaf in self.gaussians.tensors().items()}
         self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
-        self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
+        self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)
 
     def _continue(self, stage: Stage) -> None:
-        """Go over to a stage: what is still becomes a backdrop, or a piece of the clip ends and another begins."""
+        """Go over to a stage: what is still becomes a background, or a piece of the clip ends and another begins."""
         if stage.neighbour is None:
             if stage.deforms and self.settings.freeze_still:
                 self._freeze()
@@ -120,25 +120,25 @@ class Trainer:
         return tuple(fitted[piece] for piece in sorted(fitted))
 
     def _freeze(self) -> None:
-        """Make a backdrop of the Gaussians at whose places no view sees a change."""
-        moves = moving(self.gaussians.means.detach(), self.footage) > self.settings.moving_change
+        """Make a background of the Gaussians at whose places no view sees a change."""
+        moves = moving(self.gaussians.means.detach(), self.training_images) > self.settings.moving_change
         self._set_still(self.gaussians.rows(~moves))
         self.gaussians = self.gaussians.rows(moves).trainable()
 
     def _set_still(self, still: Gaussians) -> None:
-        self.still, self.backdrop = still, Backdrop(still.splats(), self.footage.views)
+        self.still, self.background = still, Background(still.splats(), self.training_images.views)
 
     def sample(self) -> Sample:
         """The current step's views and time."""
-        footage, count = self.footage, len(self.footage.views)
+        footage, count = self.training_images, len(self.training_images.views)
         index = choose_time(self.settings, self.stage, self.step, len(footage.ticks))
         views = torch.arange(count)
         if self.settings.views_per_step < count:
             order = torch.randperm(count, generator=seeded(self.seed, self.step))
             views = order[: self.settings.views_per_step].sort().values
         tick = footage.ticks[index]
-        pictures = footage.pictures[index][views]
-        return Sample(tick / footage.n_ticks, tick, tuple(views.tolist()), pictures, self.step)
+        images = footage.images[index][views]
+        return Sample(tick / footage.n_ticks, tick, tuple(views.tolist()), images, self.step)
 
     def train_step(self) -> Tensor:
         """One step; returns the loss."""
@@ -152,9 +152,9 @@ class Trainer:
 
         def draw(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
-            outputs.append(self.backdrop.render(splats, chosen) if self.backdrop else self._render(splats, views))
+            outputs.append(self.background.render(splats, chosen) if self.background else self._render(splats, views))
             image = outputs[-1].image
-            return self.motion.picture(image, views) if stage.deforms else image[..., 0]
+            return self.motion.image(image, views) if stage.deforms else image[..., 0]
 
         set_rates(self.adam, self.rates, stage.fraction(self.step))
         self.adam.zero_grad(set_to_none=True)
@@ -162,7 +162,7 @@ class Trainer:
         (loss + self.motion.regularizer() if stage.deforms else loss).backward()
         self.adam.step()
         for out in outputs:
-            self.pressure.add(out)
+            self.statistics.add(out)
         self.step += 1
         self._refine(stage)
         return loss.detach()
@@ -171,10 +171,10 @@ class Trainer:
         return render(splats, views)
 
     def _views(self, chosen: list[int]) -> Views:
-        return Views(self.footage.views.w2c[chosen], self.footage.views.K[chosen], *self._size())
+        return Views(self.training_images.views.w2c[chosen], self.training_images.views.K[chosen], *self._size())
 
     def _size(self) -> tuple[int, int]:
-        return self.footage.views.width, self.footage.views.height
+        return self.training_images.views.width, self.training_images.views.height
 
     def _refine(self, stage: Stage) -> None:
         s, done = self.settings, self.step - stage.first
@@ -182,19 +182,19 @@ class Trainer:
             return
         width, height = self._size()
         density, most = (
-            (s.max_moving_per_pixel, s.max_gaussians // 2) if self.backdrop else (s.max_per_pixel, s.max_gaussians)
+            (s.max_moving_per_pixel, s.max_gaussians // 2) if self.background else (s.max_per_pixel, s.max_gaussians)
         )
         limit = min(round(density * width * height), most)
         rng = seeded(self.seed, self.step)
-        for edit in refine(self.gaussians, self.pressure, s, self.scale, limit, rng):
+        for edit in refine(self.gaussians, self.statistics, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
         if stage.deforms and 2 <= done // s.refine_every < 2 + s.guided_rounds:
             before = len(self.gaussians)
-            more = self.motion.guide(self.gaussians, self.footage, rng)
+            more = self.motion.guide(self.gaussians, self.training_images, rng)
             index = torch.arange(len(more), device=more.means.device)
             if len(more) > before:
                 self.gaussians = apply_edit(self.adam, Edit(more, torch.where(index < before, index, -1)))
-        self.pressure = Pressure.zero(len(self.gaussians), self.gaussians.means.device)
+        self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)
 
     def run(
         self, progress: Progress, checkpoint: Path | None = None, fit: str = "", checkpoint_s: float = 15.0
@@ -226,7 +226,7 @@ class Trainer:
             "supervision": self.supervision.state_dict(),
             "poses": self.poses.state_dict(),
             "adam": export_state(self.adam),
-            "pressure": {"gradient": self.pressure.gradient, "seen": self.pressure.seen},
+            "pressure": {"gradient": self.statistics.gradient, "seen": self.statistics.seen},
         }
         return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
 
@@ -250,4 +250,4 @@ class Trainer:
         stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
         self._begin(stage)
         import_state(self.adam, saved.part("adam"))
-        self.pressure = Pressure(on["pressure"]["gradient"], on["pressure"]["seen"])
+        self.statistics = GradientStatistics(on["pressure"]["gradient"], on["pressure"]["seen"])

@@ -1,13 +1,13 @@
 """The initialisations `colmap`, `colmap-flat` and `colmap-uncalibrated`: poses by structure from motion (COLMAP).
 
-SIFT features of one picture per training view, the mean of the whole clip: what moves is a blur there, and the static
+SIFT features of one image per training view, the mean of the whole clip: what moves is a blur there, and the static
 rest, where the spikes' quantisation noise has averaged out, carries the poses of a rig that stands still. One global
 mapping (rotation averaging, global positioning, bundle adjustment) solves for all views at once: an array is small
 beside its distance to the scene, and the pair that incremental mapping begins with is then easily placed in a wrong but
 locally best way.
 
 `colmap` keeps the calibrated intrinsics; `colmap-uncalibrated` knows nothing and refines one focal length for all
-views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` sees pictures corrected by the cameras'
+views from a prior of 1.2 image widths. Their points are COLMAP's. `colmap-flat` sees images corrected by the cameras'
 calibrations, in which views have up to twice as many points in common, and sweeps planes from the poses found, as
 `rig-flat` does from given ones.
 
@@ -52,9 +52,9 @@ def colmap_uncalibrated(scene: TrainingScene, seed: int) -> Start:
 
 
 def colmap_flat(scene: TrainingScene, seed: int) -> Start:
-    """Poses from corrected pictures with the calibrated intrinsics, and points by plane sweep; raises as `colmap`."""
-    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
-    found = map_views(scene, pictures, seed, calibrated=True).of_all(scene, WHO)
+    """Poses from corrected images with the calibrated intrinsics, and points by plane sweep; raises as `colmap`."""
+    images = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    found = map_views(scene, images, seed, calibrated=True).of_all(scene, WHO)
     return rig_flat(replace(scene, cameras=found.cameras), seed)
 
 
@@ -71,19 +71,19 @@ def clip_means(scene: TrainingScene) -> Float32:
     return counts / np.float32(ticks * scene.radiance_gain)
 
 
-def map_views(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Mapping:
-    """Structure from motion on one picture of each training view [C, H, W], linear radiance.
+def map_views(scene: TrainingScene, images: Float32, seed: int, *, calibrated: bool) -> Mapping:
+    """Structure from motion on one image of each training view [C, H, W], linear radiance.
 
     The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
     nothing can be aligned and the mapping is empty.
     """
     import pycolmap
 
-    with find_features(scene.cameras, pictures, seed, calibrated=calibrated) as found:
+    with find_features(scene.cameras, images, seed, calibrated=calibrated) as found:
         models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", _options(seed, calibrated))
         if not models:
             return NOTHING
-        return in_scene(max(models.values(), key=lambda m: m.num_reg_images()), scene.cameras, found.names, pictures)
+        return in_scene(max(models.values(), key=lambda m: m.num_reg_images()), scene.cameras, found.names, images)
 
 
 def _options(seed: int, calibrated: bool) -> pycolmap.GlobalPipelineOptions:

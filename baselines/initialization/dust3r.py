@@ -1,13 +1,13 @@
 """The initialisations `dust3r` and `dust3r-uncalibrated`: poses and points by DUSt3R from weights that users bring.
 
-The network sees the first training view beside each of the others and gives, per pair, the points of both pictures in
+The network sees the first training view beside each of the others and gives, per pair, the points of both images in
 the first one's frame, at a scale of the pair's own. The pairs share the first view's points, so their scales follow
 from the ratios of its distances. Each other view is then placed by PnP with RANSAC between its pixels and its points,
 and all is moved to the scene's frame as COLMAP's result is. Pairs beyond this star, and the joint optimisation over all
 of them, are left out: with 8 views of an array every view overlaps the first.
 
 `dust3r` keeps the calibrated intrinsics in PnP; `dust3r-uncalibrated` takes one focal length from the first view's
-points (`focal_from_points`). Pictures are the means of the clip, as for COLMAP.
+points (`focal_from_points`). Images are the means of the clip, as for COLMAP.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Float64 = NDArray[np.float64]
 VARIABLE = "SPIKE4DGS_DUST3R"
 WEIGHTS = "model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence CC BY-NC-SA 4.0)"
 LONG_SIDE = 512  # px, the size that the weights were trained at
-RANSAC_PX = 5.0  # of the network's picture
+RANSAC_PX = 5.0  # of the network's image
 LEAST_CONFIDENCE = 0.5  # quantile below which points of a view are left out
 MAX_POINTS = 10_000  # first Gaussians: about 0.4 per pixel of a view of 200x125
 
@@ -69,7 +69,7 @@ def dust3r_uncalibrated(scene: TrainingScene, seed: int) -> Start:
 
 
 def estimate(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Start:
-    """Poses and points from one picture of each training view [C, H, W], linear radiance; raises as `dust3r`."""
+    """Poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
     network = load_dust3r(find_checkpoint())
     views = [resized(camera, network.shape.patch) for camera in scene.cameras]
     shown = np.stack([_resize(p, v) for p, v in zip(pictures, views, strict=True)])
@@ -95,20 +95,20 @@ def resized(camera: Camera, patch: int) -> Camera:
     return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
 
 
-def _resize(picture: Float32, view: Camera) -> Float32:
+def _resize(image: Float32, view: Camera) -> Float32:
     """Linear radiance [H, W] -> sRGB-encoded gray in [0, 1] at the network's size [h, w]."""
-    scale = LONG_SIDE / max(picture.shape)
-    left, top = ((n * scale - m) / 2 for n, m in zip(picture.shape[::-1], (view.width, view.height), strict=True))
-    # From pixel indices of the result to those of the picture; the centre of pixel i lies at i + 0.5.
+    scale = LONG_SIDE / max(image.shape)
+    left, top = ((n * scale - m) / 2 for n, m in zip(image.shape[::-1], (view.width, view.height), strict=True))
+    # From pixel indices of the result to those of the image; the centre of pixel i lies at i + 0.5.
     back = np.array([[1 / scale, 0, (left + 0.5) / scale - 0.5], [0, 1 / scale, (top + 0.5) / scale - 0.5]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    encoded = encode_srgb(picture).astype(np.float32) / 255
+    encoded = encode_srgb(image).astype(np.float32) / 255
     size = (view.width, view.height)
     return np.clip(cv2.warpAffine(encoded, back, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101), 0, 1)
 
 
 def predictor(network: Dust3r, shown: Float32) -> Predict:
-    """The network on pictures [C, H, W] in [0, 1]; on the GPU where there is one."""
+    """The network on images [C, H, W] in [0, 1]; on the GPU where there is one."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = network.to(device)
     inputs = torch.as_tensor(2 * shown - 1, device=device)[:, None].expand(-1, 3, -1, -1)
@@ -145,7 +145,7 @@ def place(
             raise problem(f"DUSt3R on {scene.id}", "points that give a focal length", "none before the camera", fix)
     known = [v if focal is None else replace(v, fx=focal, fy=focal, cx=v.width / 2, cy=v.height / 2) for v in views]
     placed, clouds = [replace(known[0], R=np.eye(3), t=np.zeros(3))], [(shared[sure], shown[0][sure])]
-    for view, pair, scale, picture in zip(known[1:], pairs, scales, shown[1:], strict=True):
+    for view, pair, scale, image in zip(known[1:], pairs, scales, shown[1:], strict=True):
         chosen = pair.confidence[1] >= np.quantile(pair.confidence[1], LEAST_CONFIDENCE)
         points = scale * pair.points[1][chosen]
         pose = solve_pose(points, _pixels(chosen), view.K, seed, reach_px=RANSAC_PX)
@@ -153,7 +153,7 @@ def place(
             fix = "use rig or colmap"
             raise problem(f"DUSt3R on {scene.id}", f"a pose for {view.id}", "no consistent points", fix)
         placed.append(replace(view, R=pose[0], t=pose[1]))
-        clouds.append((points, picture[chosen]))
+        clouds.append((points, image[chosen]))
     cameras = [_at_size(p, c) for p, c in zip(placed, scene.cameras, strict=True)]
     move = align_cameras(cameras, scene.cameras)
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))

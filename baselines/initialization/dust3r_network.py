@@ -1,6 +1,6 @@
-"""DUSt3R's network (Wang et al., CVPR 2024): two pictures to the points that they see, both in the first one's frame.
+"""DUSt3R's network (Wang et al., CVPR 2024): two images to the points that they see, both in the first one's frame.
 
-A ViT encodes each picture; two decoders attend to each other layer by layer; a DPT head (Ranftl et al. 2021) per
+A ViT encodes each image; two decoders attend to each other layer by layer; a DPT head (Ranftl et al. 2021) per
 decoder gives a point and a confidence per pixel. Parameters are named as in the published weights of
 `DUSt3R_ViTLarge_BaseDecoder_512_dpt`, so that a state dict loads by name. The weights are the authors', licensed
 CC BY-NC-SA 4.0 (no commercial use); they are neither shipped nor downloaded. The code is ours; layers and head are
@@ -45,7 +45,7 @@ class Dust3rShape:
 
 
 class CrossAttention(nn.Module):
-    """Attention of one picture's tokens to the other's."""
+    """Attention of one image's tokens to the other's."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ def _norm(width: int) -> nn.LayerNorm:
 
 
 class DecoderBlock(nn.Module):
-    """A pre-norm layer with attention to the other picture between the two usual parts."""
+    """A pre-norm layer with attention to the other image between the two usual parts."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ def _dpt(shape: Dust3rShape) -> Dpt:
 
 
 class Dust3r(nn.Module):
-    """See the module. Pictures are [B, 3, H, W] in [-1, 1], their sides multiples of the patch."""
+    """See the module. Images are [B, 3, H, W] in [-1, 1], their sides multiples of the patch."""
 
     def __init__(self, shape: Dust3rShape | None = None) -> None:
         super().__init__()
@@ -103,36 +103,36 @@ class Dust3r(nn.Module):
         self.dec_norm = _norm(s.decoder_width)
         self.downstream_head1, self.downstream_head2 = (nn.ModuleDict({"dpt": _dpt(s)}) for _ in range(2))
 
-    def encode(self, pictures: Tensor) -> Tensor:
-        """Tokens [B, N, C] of pictures, row by row."""
-        x = self.patch_embed["proj"](pictures).flatten(2).transpose(1, 2)
-        places = self._places(pictures)
+    def encode(self, images: Tensor) -> Tensor:
+        """Tokens [B, N, C] of images, row by row."""
+        x = self.patch_embed["proj"](images).flatten(2).transpose(1, 2)
+        places = self._places(images)
         for block in self.enc_blocks:
             x = block(x, places)
         out: Tensor = self.enc_norm(x)
         return out
 
-    def decode(self, first: Tensor, second: Tensor, pictures: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
+    def decode(self, first: Tensor, second: Tensor, images: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
         """(points [B, H, W, 3], confidence [B, H, W]) of both, in the first one's frame, from their tokens.
 
-        `pictures` gives the size, which is the same for both.
+        `images` gives the size, which is the same for both.
         """
-        places = self._places(pictures)
+        places = self._places(images)
         pair = self.decoder_embed(first), self.decoder_embed(second)
         layers = [(first, second)]
         for one, two in zip(self.dec_blocks, self.dec_blocks2, strict=True):
             pair = one(pair[0], pair[1], places, places), two(pair[1], pair[0], places, places)
             layers.append(pair)
         layers[-1] = (self.dec_norm(pair[0]), self.dec_norm(pair[1]))
-        rows, columns = (n // self.shape.patch for n in pictures.shape[-2:])
+        rows, columns = (n // self.shape.patch for n in images.shape[-2:])
         heads = (self.downstream_head1["dpt"], self.downstream_head2["dpt"])
         return tuple(
             unpack(head([layers[h][view] for h in self.shape.hooks], rows, columns)) for view, head in enumerate(heads)
         )
 
-    def _places(self, pictures: Tensor) -> Tensor:
-        rows, columns = (n // self.shape.patch for n in pictures.shape[-2:])
-        return grid(rows, columns, pictures.device)
+    def _places(self, images: Tensor) -> Tensor:
+        rows, columns = (n // self.shape.patch for n in images.shape[-2:])
+        return grid(rows, columns, images.device)
 
 
 # Stored in some of the published files and not needed: pre-training's mask token, and second names of the same layers.

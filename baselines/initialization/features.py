@@ -1,6 +1,6 @@
-"""What views have in common: SIFT features of one picture per view, and their matches, in a database of COLMAP's.
+"""What views have in common: SIFT features of one image per view, and their matches, in a database of COLMAP's.
 
-Pictures are enlarged before features are found, and all pairs are matched. Everything runs in one thread, so that the
+Images are enlarged before features are found, and all pairs are matched. Everything runs in one thread, so that the
 same seed gives the same matches.
 """
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to thos
 
 Float32 = NDArray[np.float32]
 
-ENLARGE = 2  # of pictures 200 px wide; at their own size SIFT finds about 400 features a view, at twice it 2,700
-PEAK_THRESHOLD = 0.002  # of SIFT's contrast, a third of COLMAP's: gray pictures of dim scenes are soft
-PAIR_ERROR_PX = 2.0  # of a match in an enlarged picture to its epipolar line
+ENLARGE = 2  # of images 200 px wide; at their own size SIFT finds about 400 features a view, at twice it 2,700
+PEAK_THRESHOLD = 0.002  # of SIFT's contrast, a third of COLMAP's: gray images of dim scenes are soft
+PAIR_ERROR_PX = 2.0  # of a match in an enlarged image to its epipolar line
 MIN_ANGLE_DEG = 0.5  # between a point's rays: the array is narrow
 FOCAL_PRIOR = 1.2  # image widths, COLMAP's own
 
 
 @dataclass(frozen=True)
 class Features:
-    """Where COLMAP finds pictures and matches; `names` are the pictures', in the views' order."""
+    """Where COLMAP finds images and matches; `names` are the images', in the views' order."""
 
     folder: Path
     database: Path
@@ -66,21 +66,21 @@ NOTHING = Mapping((), np.zeros((0, 3)), np.zeros(0, np.float32))
 
 @contextmanager
 def find_features(cameras: Sequence[Camera], pictures: Float32, seed: int, *, calibrated: bool) -> Iterator[Features]:
-    """Features and matches of pictures [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
+    """Features and matches of images [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
 
     All views share one camera: the calibrated one, or one whose focal length is a guess.
     """
     import pycolmap
 
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
-        names = _write_pictures(Path(folder), cameras, pictures)
+        names = _write_images(Path(folder), cameras, pictures)
         database = Path(folder) / "database.db"
         pycolmap.set_random_seed(seed)
         _match(database, Path(folder), cameras[0], seed, calibrated)
         yield Features(Path(folder), database, tuple(names))
 
 
-def _write_pictures(folder: Path, cameras: Sequence[Camera], pictures: Float32) -> list[str]:
+def _write_images(folder: Path, cameras: Sequence[Camera], pictures: Float32) -> list[str]:
     names = [f"{camera.id}.png" for camera in cameras]
     for name, picture in zip(names, pictures, strict=True):
         image = cv2.resize(encode_srgb(picture), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)

@@ -65,21 +65,21 @@ class Seen:
         return (both[0], both[1]) if i < j else (both[1], both[0])
 
 
-def bundle(scene: TrainingScene, guess: Float64, factor: int, pictures: Float32, seed: int) -> Mapping:
+def bundle(scene: TrainingScene, guess: Float64, factor: int, images: Float32, seed: int) -> Mapping:
     """Poses of the training cameras, whose intrinsics are taken as given, and the points that they match.
 
     guess: [h, w, 3] what the pixels of view 0 see, in view 0's frame, at any scale, NaN where unknown; a pixel is a
-    block of `factor` x `factor` of the camera's. pictures: [C, H, W] linear radiance. The same seed gives the same
+    block of `factor` x `factor` of the camera's. images: [C, H, W] linear radiance. The same seed gives the same
     poses. A view that cannot be placed is left out.
     """
-    with find_features(scene.cameras, pictures, seed, calibrated=True) as found:
+    with find_features(scene.cameras, images, seed, calibrated=True) as found:
         seen = _read(found)
         intrinsics = [camera.K for camera in scene.cameras]
         model = _adjust(found, seen, _first_poses(seen, guess, factor, intrinsics, seed), ROUGH)
         if model is None:
             return NOTHING
         model = _adjust(found, seen, _placed_again(model, seen, intrinsics, seed), FINE)
-        return NOTHING if model is None else in_scene(model, scene.cameras, found.names, pictures)
+        return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images)
 
 
 def _read(found: Features) -> Seen:

@@ -46,7 +46,7 @@ from spike4dgs.method.msdi.weights import load_network, weights_path
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-TRAINED_PX = 104  # longer side of the training pictures
+TRAINED_PX = 104  # longer side of the training images
 LEAST_CONFIDENCE = 0.3  # quantile of a view's confidence below which its points are left out
 LEAST_MATCHES = 50  # for a line through inverse depths
 LINE_ROUNDS = 10
@@ -59,7 +59,7 @@ class Glance:
 
     factor: int  # the cameras' pixels are blocks of so many by so many
     cameras: tuple[Camera, ...]  # the training cameras at this size
-    pictures: Float32  # [V, h, w] radiance
+    images: Float32  # [V, h, w] radiance
     points: Float64  # [V, h, w, 3] in view 0's frame, at any scale
     confidence: Float64  # [V, h, w]
 
@@ -155,7 +155,7 @@ def completed(cloud: Cloud, glance: Glance) -> Cloud:
     at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
     hole = (cKDTree(uv).query(at)[0] > HOLE_PX / glance.factor) & (inverse * z.max() * FARTHEST > 1)
     points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
-    return Cloud(points, np.concatenate([cloud.values, glance.pictures[0, v[hole], u[hole]]]))
+    return Cloud(points, np.concatenate([cloud.values, glance.images[0, v[hole], u[hole]]]))
 
 
 def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | None:
@@ -195,8 +195,8 @@ def unposed(scene: TrainingScene, glance: Glance, seed: int, *, calibrated: bool
     placed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
     move = align_cameras(placed, scene.cameras)
     moved = tuple(move.camera(c) for c in placed)
-    cloud = thin(moved, Cloud(move(glance.points[glance.sure]), glance.pictures[glance.sure]))
-    pictures = glance.pictures.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = thin(moved, Cloud(move(glance.points[glance.sure]), glance.images[glance.sure]))
+    pictures = glance.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
     cloud = fill(moved, pictures, cloud)
     return Start(moved, cloud.points.astype(np.float32), cloud.values)
 

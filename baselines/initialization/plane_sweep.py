@@ -1,6 +1,6 @@
 """Depth maps of a calibrated array by plane sweep, and the points on which several views agree.
 
-For a reference view, planes parallel to its image are swept over inverse depth; the other views' pictures are warped
+For a reference view, planes parallel to its image are swept over inverse depth; the other views' images are warped
 onto each plane and compared by zero-mean normalised cross-correlation. No depth range is given: it is found by a
 coarse sweep from infinity to the parallax at which the views would hardly overlap any more.
 """
@@ -21,7 +21,7 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW = 5  # px, side of the correlation window: small enough for thin things at 125x200
-NOISE = 4e-4  # variance of a picture's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
+NOISE = 4e-4  # variance of an image's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
 PARALLAX_STEP = 1.0  # px of parallax of the widest pair between planes; peaks are refined below it
 MAX_PARALLAX = 0.6  # of the image's width, of the widest pair: nearer things are seen by too few views to match
 MIN_SCORE = 0.4  # mean correlation over the other views below which a depth is not believed
@@ -55,14 +55,14 @@ def full_range(cameras: Sequence[Camera]) -> Float64:
     return step * np.arange(planes + 1, dtype=np.float64)
 
 
-def find_range(cameras: Sequence[Camera], pictures: Float32) -> Float64:
+def find_range(cameras: Sequence[Camera], images: Float32) -> Float64:
     """The inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
 
     Everything is kept where nothing matches.
     """
     planes, step = full_range(cameras), inverse_depth_step(cameras)
     half = [half_size(c) for c in cameras]
-    small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in pictures])
+    small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in images])
     maps = [sweep(half, small, i, planes[::2]) for i in range(len(cameras))]
     found = np.concatenate([m.inverse[agreed(half, maps, i)] for i, m in enumerate(maps)])
     if not len(found):
@@ -90,14 +90,14 @@ def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> 
 
 
 def sweep(
-    cameras: Sequence[Camera], pictures: Float32, index: int, planes: Float64, pixels: Mask | None = None
+    cameras: Sequence[Camera], images: Float32, index: int, planes: Float64, pixels: Mask | None = None
 ) -> DepthMap:
-    """Depth of view `index` from all other views; pictures [C, H, W], inverse depths `planes` ascending.
+    """Depth of view `index` from all other views; images [C, H, W], inverse depths `planes` ascending.
 
     With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
     """
-    top, left, bottom, right = _rectangle(pixels) if pixels is not None else (0, 0, *pictures.shape[1:])
-    reference = np.ascontiguousarray(pictures[index, top:bottom, left:right])
+    top, left, bottom, right = _rectangle(pixels) if pixels is not None else (0, 0, *images.shape[1:])
+    reference = np.ascontiguousarray(images[index, top:bottom, left:right])
     height, width = reference.shape
     mean = _box(reference)
     variance = _box(reference * reference) - mean * mean
@@ -112,14 +112,14 @@ def sweep(
                 continue
             H = there @ plane_homography(cameras[index], cameras[other], float(w)) @ here
             warped = cv2.warpPerspective(
-                pictures[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
+                images[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
             )
             inside = warped >= 0
             total += np.maximum(_correlation(reference, mean, variance, warped), 0) * inside
             seen += inside
         total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
     found = _peak(scores, planes)
-    whole = DepthMap(np.zeros(pictures.shape[1:], np.float32), np.full(pictures.shape[1:], -1, np.float32))
+    whole = DepthMap(np.zeros(images.shape[1:], np.float32), np.full(images.shape[1:], -1, np.float32))
     whole.inverse[top:bottom, left:right], whole.score[top:bottom, left:right] = found.inverse, found.score
     return whole
 

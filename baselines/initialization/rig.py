@@ -4,7 +4,7 @@ Static pixels are matched on the mean of the whole clip, where the spikes' quant
 that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
 ends those that are quiet just then, which is the background that something moving hides in the middle.
 
-`rig-flat` corrects every picture by its camera's calibrated gain and dark rate, where a scene has them.
+`rig-flat` corrects every image by its camera's calibrated gain and dark rate, where a scene has them.
 """
 
 from __future__ import annotations
@@ -73,23 +73,23 @@ def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
     middle, last = len(windows) // 2, len(windows) - 1
     for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[place]
-        pictures = window_means(scene, start, stop, flat_field)
+        images = window_means(scene, start, stop, flat_field)
         near = slice(max(0, place - 1), place + 2)
         quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
-        short = [sweep(scene.cameras, pictures, i, planes, m) for i, m in enumerate(moving)]
-        clouds.append(_points(scene.cameras, short, pictures, [m & q for m, q in zip(moving, quiet, strict=True)]))
+        short = [sweep(scene.cameras, images, i, planes, m) for i, m in enumerate(moving)]
+        clouds.append(_points(scene.cameras, short, images, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
     return thin(scene.cameras, Cloud(points, values)), mean
 
 
 def filled(scene: TrainingScene, cloud: Cloud, mean: Float32) -> Start:
-    """The start from a cloud, with points where it leaves the picture empty, coloured by the clip's means [C, H, W]."""
+    """The start from a cloud, with points where it leaves the image empty, coloured by the clip's means [C, H, W]."""
     cloud = fill(scene.cameras, mean, cloud)
     return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
 
 
 def rig_flat(scene: TrainingScene, seed: int) -> Start:
-    """`rig` on corrected pictures."""
+    """`rig` on corrected images."""
     return rig(scene, seed, flat_field=True)
 
 
@@ -121,14 +121,14 @@ def _moving(counts: NDArray[np.int64]) -> Mask:
 
 
 def _points(
-    cameras: Sequence[Camera], maps: Sequence[DepthMap], pictures: Float32, pixels: Sequence[Mask]
+    cameras: Sequence[Camera], maps: Sequence[DepthMap], images: Float32, pixels: Sequence[Mask]
 ) -> tuple[NDArray[np.float64], Float32]:
     """World points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
     points, values = [], []
     for i, camera in enumerate(cameras):
         chosen = agreed(cameras, maps, i) & pixels[i]
         points.append(lift(camera, maps[i].inverse, chosen))
-        values.append(pictures[i][chosen])
+        values.append(images[i][chosen])
     return np.concatenate(points), np.concatenate(values)
 
 
@@ -161,11 +161,11 @@ def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
 def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
     """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.
 
-    Fewer points than that are chance: all of the picture is then laid far away.
+    Fewer points than that are chance: all of the image is then laid far away.
     """
     camera = middle_camera(cameras)
     uv, z = camera.project(cloud.points)
-    # The picture's border too: outer views see beyond the middle one.
+    # The image's border too: outer views see beyond the middle one.
     margin = 0.1 * np.array([camera.width, camera.height])
     axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -183,9 +183,9 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
     return Cloud(np.concatenate([cloud.points, added]), values)
 
 
-def _look_up(camera: Camera, picture: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gray value [N] of the pixel that sees each point; NaN outside the picture."""
+def _look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gray value [N] of the pixel that sees each point; NaN outside the image."""
     uv, z = camera.project(points)
     inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
     u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
-    return np.where(inside, picture[v, u], np.nan)
+    return np.where(inside, image[v, u], np.nan)

@@ -46,7 +46,7 @@ class SpikeTimes:
 
 @lru_cache(maxsize=1)
 def spike_times(stream: SpikeStream) -> SpikeTimes:
-    """All spike times of a stream; those of the last stream are kept, since pictures come stream by stream."""
+    """All spike times of a stream; those of the last stream are kept, since images come stream by stream."""
     packed, pixels = rows(stream.packed), stream.height * stream.width
     starts = np.zeros(pixels + 1, np.int64)
     blocks = -(-packed.shape[1] // _BLOCK)

@@ -1,4 +1,4 @@
-"""The first of a recipe's four parts: what picture does a spike window give?"""
+"""The first of a recipe's four parts: what image does a spike window give?"""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def learned_from(find: Callable[[], Path], read_card: Callable[[Path], Any]) -> 
 
 @dataclass(frozen=True)
 class ImageMaker:
-    """A named way from spikes to pictures. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
+    """A named way from spikes to images. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
 
     A pixel's own rate can be corrected by its calibration afterwards. What looks at neighbours is better told before:
     `corrected` gives the rate that an ideal camera's pixels would have. `learned` tells of the weights in use; None
@@ -59,7 +59,7 @@ class ImageMaker:
     ) -> Float32:
         """Linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`; `gain`: spikes per tick of white.
 
-        `camera` corrects the pictures for what its pixels do to light; a dead pixel has seen nothing, which is not
+        `camera` corrects the images for what its pixels do to light; a dead pixel has seen nothing, which is not
         black but NaN. Raises UserError for a tick outside the clip.
         """
         images = np.empty((len(ticks), stream.height, stream.width), np.float32)

@@ -1,4 +1,4 @@
-"""MSDI's pictures (eq. 12): what its image generator makes of the ticks around an instant, view by view."""
+"""MSDI's images (eq. 12): what its image generator makes of the ticks around an instant, view by view."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ interval that it rests at:
 
     d_R = -D ln[(1 - R') / (1 - R' (1 - u'))],    d_u = -F ln[(u' - u0) / (f - u0 + u' (1 - f))].
 
-The picture is (1 / d_R + 1 / d_u) / 2 spikes per tick: exactly the rate where the light is constant and the interval
+The image is (1 / d_R + 1 / d_u) / 2 spikes per tick: exactly the rate where the light is constant and the interval
 a whole number of ticks. Where intervals alternate, d_u lies between the last one and those of the F ticks before, which
 takes some of the quantisation away; where the light changes it lags. Intervals much longer than F are TFI's.
 

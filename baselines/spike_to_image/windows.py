@@ -22,7 +22,7 @@ def mirrored(indices: NDArray[np.integer[Any]], n: int) -> NDArray[np.int64]:
 def window(stream: SpikeStream, tick: int, length: int = WINDOW) -> NDArray[np.uint8]:
     """Spikes of the `length` ticks, an odd number, around `tick` as [length, H, W] uint8 of 0 and 1.
 
-    Beyond the clip's ends the clip is mirrored in time: the picture is then still that of `tick`, as it would not be
+    Beyond the clip's ends the clip is mirrored in time: the image is then still that of `tick`, as it would not be
     if the window moved, and pixels keep their rates, as they would not if the last tick were repeated.
     """
     half = length // 2

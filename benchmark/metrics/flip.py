@@ -1,13 +1,13 @@
 """FLIP of gray images (Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", 2020, LDR version).
 
-The mean over pixels of the error that a viewer sees when two pictures alternate on a screen, in 0..1. Both pictures are
+The mean over pixels of the error that a viewer sees when two images alternate on a screen, in 0..1. Both images are
 filtered by the eye's contrast sensitivity; the difference of their lightness is compressed (exponent 0.7); where edges
 or points appear or vanish it counts more. The screen is assumed 0.7 m wide with 3840 pixels and seen from 0.7 m: 67.02
 pixels per degree, the authors' default.
 
-Gray pictures have no chroma, so of the three opponent channels only the achromatic one is computed, with separable
+Gray images have no chroma, so of the three opponent channels only the achromatic one is computed, with separable
 filters; the colour difference is that of lightness alone. The result is that of the authors' package `flip-evaluator`
-for the picture repeated to three channels, up to its float32.
+for the image repeated to three channels, up to its float32.
 """
 
 from __future__ import annotations

@@ -70,11 +70,11 @@ class ImagePair:
         )
         return float(value), np.asarray(ssim_map)
 
-    def check_picture(self) -> None:
+    def check_image(self) -> None:
         """Raise UserError for a prediction that shows nothing: one level everywhere, such as a black image."""
         if self.prediction8.min() == self.prediction8.max():
             found = f"the level {self.prediction8.flat[0]} of 255 everywhere"
-            raise problem(self.where, "a picture of something", found, "correct the method's fit or render")
+            raise problem(self.where, "an image of something", found, "correct the method's fit or render")
 
 
 def check_images(truth: Image, prediction: Image, moving: Mask, where: str) -> None:

@@ -1,6 +1,6 @@
 """Estimated poses against calibrated ones: alignment by a similarity (Sim3), and errors with and without it.
 
-Poses from pictures alone live in a frame of their own: turned, moved and scaled. The similarity that takes it to the
+Poses from images alone live in a frame of their own: turned, moved and scaled. The similarity that takes it to the
 scene's frame is found from the cameras' centres and one point along each of their axes (the idea of DUSt3R's alignment
 of posed views): centres alone leave a rig in a line free to roll, and a rig in a plane open to reflection.
 """

@@ -91,8 +91,8 @@ def _ssim_dynamic(pair: ImagePair) -> float | None:
 def _temporal_error(pair: ImagePair) -> float | None:
     if pair.earlier is None:
         return None
-    pair.check_picture()
-    pair.earlier.check_picture()
+    pair.check_image()
+    pair.earlier.check_image()
     change = (pair.prediction - pair.earlier.prediction) - (pair.truth - pair.earlier.truth)
     return float(np.mean(np.abs(change))) / pair.since_ms
 
@@ -110,21 +110,21 @@ def _flip(pair: ImagePair) -> float:
 def _brisque(pair: ImagePair) -> float:
     from spike4dgs.benchmark.metrics.iqa.brisque import brisque
 
-    pair.check_picture()
+    pair.check_image()
     return brisque(pair.prediction8, pair.where)
 
 
 def _niqe(pair: ImagePair) -> float:
     from spike4dgs.benchmark.metrics.iqa.niqe import niqe
 
-    pair.check_picture()
+    pair.check_image()
     return niqe(pair.prediction8, pair.where)
 
 
 def _metaiqa(pair: ImagePair) -> float:
     from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa
 
-    pair.check_picture()
+    pair.check_image()
     return metaiqa(pair.prediction8)
 
 

@@ -1,4 +1,4 @@
-"""What people look at after a run: the table, the picture sheets, the scatter of quality against time."""
+"""What people look at after a run: the table, the image sheets, the scatter of quality against time."""
 
 from __future__ import annotations
 

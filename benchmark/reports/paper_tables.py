@@ -23,7 +23,7 @@ from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.scene.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
-IMAGE_TABLE = 6  # pictures from spikes: no method is fitted
+IMAGE_TABLE = 6  # images from spikes: no method is fitted
 TRACKS = ("calibrated", "uncalibrated")  # are methods given the rig's poses?
 UNCALIBRATED_NOTE = (
     "How the published rows got their poses is not stated: the same values stand here and in the calibrated track."
@@ -74,7 +74,7 @@ def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
     tables = json.loads(text)
     if str(number) not in tables:
         known = [f"{n} ({tables[n]['title'].lower()})" for n in tables if n.isdecimal()]
-        expected = ", ".join([*known, f"{IMAGE_TABLE} (pictures from spikes)"])
+        expected = ", ".join([*known, f"{IMAGE_TABLE} (images from spikes)"])
         raise problem("--table", expected, str(number), "choose one of them")
     table = tables[str(number)]
     ids, names = zip(*table["metrics"], strict=True)

@@ -1,6 +1,6 @@
 """Refined scores: held-out cameras moved to where a model sees them, by pixels that are not scored.
 
-A model that estimates poses may have `refine(camera, picture, still, t_us) -> Camera`. It gets one picture of each
+A model that estimates poses may have `refine(camera, image, still, t_us) -> Camera`. It gets one image of each
 held-out camera, taken from its spikes over a time without targets, and the pixels at which nothing moves in any target.
 Everything else is rendered from the camera that it returns. Such scores use test pixels, so they stand in a record of
 their own, METHOD.refined, beside the scores at the calibrated pose.
@@ -19,14 +19,14 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene
 
 SUFFIX = ".refined"
-MAX_TICKS = 200  # of the picture: at 20 kHz 10 ms
+MAX_TICKS = 200  # of the image: at 20 kHz 10 ms
 
 
 class Refinable(Protocol):
-    """A model that can say from where it sees a picture."""
+    """A model that can say from where it sees an image."""
 
-    def refine(self, camera: Camera, picture: NDArray[np.float32], still: NDArray[np.bool_], t_us: float) -> Camera:
-        """The camera near `camera` from which `picture` [H, W] is seen at `t_us`, by the pixels of `still` [H, W]."""
+    def refine(self, camera: Camera, image: NDArray[np.float32], still: NDArray[np.bool_], t_us: float) -> Camera:
+        """The camera near `camera` from which `image` [H, W] is seen at `t_us`, by the pixels of `still` [H, W]."""
         ...
 
 
@@ -36,13 +36,13 @@ def refined_cameras(model: Refinable, scene: Scene) -> dict[str, Camera]:
     for name in scene.test:
         targets = [t for t in scene.targets if t.camera == name]
         start, stop = free_ticks([t.tick for t in targets], scene.n_ticks)
-        picture = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
+        image = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
         still = ~np.any([scene.moving(t) for t in targets], axis=0)
         if not still.any():
             fix = "publish the scores at the calibrated pose only"
             raise problem(f"{scene.id}, {name}", "pixels at which nothing moves", "none", fix)
         t_us = 0.5 * (scene.t_us(start) + scene.t_us(stop))
-        cameras[name] = model.refine(scene.cameras[name], picture.astype(np.float32), still, t_us)
+        cameras[name] = model.refine(scene.cameras[name], image.astype(np.float32), still, t_us)
     return cameras
 
 

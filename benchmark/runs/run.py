@@ -1,4 +1,4 @@
-"""`run-benchmark`: every method on every scene, then scores, table, pictures and leaderboard entries.
+"""`run-benchmark`: every method on every scene, then scores, table, images and leaderboard entries.
 
 OUT/predictions/METHOD/SCENE/   what was rendered: the only thing a later run resumes by (its content key)
 OUT/models/METHOD/SCENE.safetensors   the fitted model, for `render` and `view`
@@ -158,12 +158,12 @@ def run_benchmark(
     Args:
         scenes: Scene folders.
         table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
-            (number of views; drawn as views.png), 6 (pictures from spikes), 7 (MSDI without SPSS).
+            (number of views; drawn as views.png), 6 (images from spikes), 7 (MSDI without SPSS).
         track: Of table 1 or 2: calibrated (methods are given the rig's poses) or uncalibrated (each estimates its own).
         data: Folder of the table's scenes.
         profile: Profile of the table's scenes.
         methods: Methods by name; all that are installed, or all rows of the table, if left out.
-        out: Folder for predictions, results, pictures and logs; for another split than the default, OUT/SPLIT is.
+        out: Folder for predictions, results, images and logs; for another split than the default, OUT/SPLIT is.
         seed: Seed that every fit gets.
         device: auto, cpu or cuda.
         budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
@@ -199,8 +199,8 @@ def run_benchmark(
         settings = Settings(folder, *place)
         records = run_matrix(opened, chosen, settings, console)
         console.print(results_table(records))
-        write_pictures(opened, records, folder)
-        _say(console, f"pictures: {folder}/sheet_*.png and {folder}/scatter.png")
+        write_images(opened, records, folder)
+        _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png")
         refused |= _submit(records, scenes, settings, leaderboard, replace)
         runs.append((opened, records))
     if paper:
@@ -221,7 +221,7 @@ def _say(console: Console, text: str) -> None:
 
 
 def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path, allow_gaps: bool) -> int:
-    """Table 6 compares pictures, not methods: the command `speed images` measures it."""
+    """Table 6 compares images, not methods: the command `speed images` measures it."""
     from spike4dgs.benchmark.cli import load_speed
 
     worlds = [world for number in (1, 2) for world in published(number).worlds]
@@ -233,7 +233,7 @@ def _image_table(scenes: tuple[Path, ...], data: Path, profile: str, out: Path, 
     return int(load_speed("images")([*map(str, chosen), "--out", str(out), *gaps]))
 
 
-def write_pictures(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
+def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
     """Write sheet_SCENE.png for each scene, and scatter.png."""
     for scene in scenes:
         folders = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}

@@ -1,4 +1,4 @@
-"""Image files: half-float EXR for linear radiance, EXR for geometry, 8-bit PNG for masks and pictures."""
+"""Image files: half-float EXR for linear radiance, EXR for geometry, 8-bit PNG for masks and images."""
 
 from __future__ import annotations
 

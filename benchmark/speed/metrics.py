@@ -25,8 +25,8 @@ SIZES = ((125, 200), (250, 400))  # of the profiles small and paper
 COLUMNS = ("metric", "height", "width", "by", "min ms", "median ms", "error")
 
 
-def picture_pair(height: int, width: int, seed: int = 0) -> ImagePair:
-    """A smooth random picture, a noisy version, and both as they were one millisecond before."""
+def make_image_pair(height: int, width: int, seed: int = 0) -> ImagePair:
+    """A smooth random image, a noisy version, and both as they were one millisecond before."""
     from scipy.ndimage import gaussian_filter
 
     rng = np.random.default_rng(seed)
@@ -34,8 +34,8 @@ def picture_pair(height: int, width: int, seed: int = 0) -> ImagePair:
     truth = (smooth - smooth.min()) / np.ptp(smooth)
     noisy = truth + 0.05 * rng.standard_normal(truth.shape)
     moving = truth[0] > 0.5
-    earlier, now = (ImagePair(t, p, moving, "picture") for t, p in zip(truth, noisy, strict=True))
-    return ImagePair(now.truth_radiance, now.predicted_radiance, moving, "picture", earlier=earlier, since_ms=1.0)
+    earlier, now = (ImagePair(t, p, moving, "image") for t, p in zip(truth, noisy, strict=True))
+    return ImagePair(now.truth_radiance, now.predicted_radiance, moving, "image", earlier=earlier, since_ms=1.0)
 
 
 def runs(pair: ImagePair) -> dict[str, Callable[[], object]]:
@@ -73,7 +73,7 @@ def metrics(argv: Sequence[str] = ()) -> int:
     a = p.parse_args(list(argv))
     rows = []
     for height, width in SIZES:
-        pair = picture_pair(height, width)
+        pair = make_image_pair(height, width)
         for name, call in runs(pair).items():
             shown = [f"{ms:.2f}" for ms in time_ms(call, a.repeats)]
             rows.append((name, str(height), str(width), "spike4dgs", *shown, ""))

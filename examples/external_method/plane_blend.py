@@ -1,17 +1,17 @@
-"""A method from another package: the scene as one plane, on which the two nearest training cameras' pictures meet."""
+"""A method from another package: the scene as one plane, on which the two nearest training cameras' images meet."""
 
 import cv2
 import numpy as np
 
 
-def picture(scene, index, first, last):
+def make_image(scene, index, first, last):
     """Linear radiance [H, W] that a training camera saw in ticks [first, last)."""
     counts = scene.streams[index].counts(first, last)
     return counts.astype(np.float32) / np.float32((last - first) * scene.radiance_gain)
 
 
 def warp(image, source, camera, distance):
-    """The picture of `source` as `camera` would see it, if all were on the plane z = `distance` before `camera`."""
+    """The image of `source` as `camera` would see it, if all were on the plane z = `distance` before `camera`."""
     R = source.R @ camera.R.T
     T = source.t - R @ camera.t
     H = source.K @ (R + np.outer(T, [0, 0, 1 / distance])) @ np.linalg.inv(camera.K)
@@ -35,12 +35,12 @@ class PlaneBlendModel:
         first, last = max(0, tick - self.half_window), min(self.scene.n_ticks, tick + self.half_window)
         away = np.array([np.linalg.norm(c.center - camera.center) for c in cameras])
         nearest = np.argsort(away, kind="stable")[:2]
-        pair = [warp(picture(self.scene, i, first, last), cameras[i], camera, self.distance) for i in nearest]
+        pair = [warp(make_image(self.scene, i, first, last), cameras[i], camera, self.distance) for i in nearest]
         return np.average(pair, axis=0, weights=1 / (away[nearest] + 1e-9)).astype(np.float32)
 
 
 class PlaneBlend:
-    """Fits one number: the distance at which the training cameras' mean pictures agree best."""
+    """Fits one number: the distance at which the training cameras' mean images agree best."""
 
     name = "plane-blend"
     version = "0.1.0"
@@ -51,7 +51,7 @@ class PlaneBlend:
         across = [np.eye(3) - np.outer(c.R[2], c.R[2]) for c in scene.cameras]
         towards = [a @ c.center for a, c in zip(across, scene.cameras, strict=True)]
         meeting = np.linalg.lstsq(sum(across), sum(towards), rcond=None)[0]
-        means = [picture(scene, i, 0, scene.n_ticks) for i in range(len(scene.cameras))]
+        means = [make_image(scene, i, 0, scene.n_ticks) for i in range(len(scene.cameras))]
         first, *others = scene.cameras
         distances = (first.R @ meeting + first.t)[2] * np.geomspace(0.5, 2, self.params["planes"])
         errors = []

@@ -123,8 +123,8 @@ def make_msdi_data(
         variants: Training variants of each world.
         rigs: Rigs of nine cameras in each training variant; hidden variants have half of it.
         instants: Instants of each rig.
-        width: Width of the pictures in pixels.
-        height: Height of the pictures in pixels.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
         spp: Samples per pixel of what moves, a power of two; what stands still gets twice as many.
         seed: Seed of everything random.
         workers: Processes that render; one uses all cores.

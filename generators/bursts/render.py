@@ -1,8 +1,8 @@
-"""Rendering training bursts: a rig's still picture once, and around each instant only what moves, at a few ticks.
+"""Rendering training bursts: a rig's still image once, and around each instant only what moves, at a few ticks.
 
 Less exact than `render`, and much cheaper: fewer samples, and light that moving things throw far around them is left
-out. A learner is not misled, for truth and spikes come from the same pictures. As there, pixels that see no moving
-thing, only its shadow, are the still picture plus the difference of two renderings with the same random numbers.
+out. A learner is not misled, for truth and spikes come from the same images. As there, pixels that see no moving
+thing, only its shadow, are the still image plus the difference of two renderings with the same random numbers.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from spike4dgs.generators.rendering.visibility import GROW_PX, Sight
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.worlds import WorldScene
 
-KEY_COUNTS = (3, 7, 15)  # pictures of a burst: 21, 7 or 3 ticks apart
-STILL_SAMPLES = 2  # times those of what moves in three pictures: 64 leave 43 dB of noise in a street, 16 only 36 dB
+KEY_COUNTS = (3, 7, 15)  # images of a burst: 21, 7 or 3 ticks apart
+STILL_SAMPLES = 2  # times those of what moves in three images: 64 leave 43 dB of noise in a street, 16 only 36 dB
 MOST_PX = 1.0  # that what moves may move between two of them; the last count serves whatever is faster still
 _FASTEST = 99.0  # percentile of the moving pixels' speeds: shadows that light grazes have no bound
 
@@ -32,7 +32,7 @@ _FASTEST = 99.0  # percentile of the moving pixels' speeds: shadows that light g
 class BurstRenderer(Sight):
     """Bursts of `cameras` (one resolution) in a world.
 
-    `spp`, a power of two, are the samples per pixel of what moves; where it moves so fast that more than three pictures
+    `spp`, a power of two, are the samples per pixel of what moves; where it moves so fast that more than three images
     are needed, each has fewer.
     """
 
@@ -77,7 +77,7 @@ class BurstRenderer(Sight):
         )
 
     def _trace_moving(self, keys: Float32, moving: np.ndarray, times_s: np.ndarray) -> None:
-        """Fill in the pixels `moving` [V, H, W] of the still pictures `keys` [k, V, H, W] at k times."""
+        """Fill in the pixels `moving` [V, H, W] of the still images `keys` [k, V, H, W] at k times."""
         where = np.flatnonzero(moving)
         spp = max(1, 4 * self.spp // (len(keys) + 1))  # all of them, half, a quarter: powers of two
         first = self._radiance(where, spp, moving=False)

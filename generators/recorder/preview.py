@@ -1,4 +1,4 @@
-"""What a capture looks like: its states and spike rates while it runs, and a sheet of every camera's picture."""
+"""What a capture looks like: its states and spike rates while it runs, and a sheet of every camera's image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.recorder.profile.profile import RigProfile
 from spike4dgs.generators.recorder.rates import Rate
 
-WINDOW_TICKS = 32  # of a picture on the sheet
+WINDOW_TICKS = 32  # of an image on the sheet
 _BAR = 20  # characters for one spike per tick
 
 
@@ -81,15 +81,15 @@ class Watch:
 
 
 def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
-    """Write one PNG with a picture of every camera: the spikes of `WINDOW_TICKS` ticks near the middle (TFP).
+    """Write one PNG with an image of every camera: the spikes of `WINDOW_TICKS` ticks near the middle (TFP).
 
-    One scale for all: white is the 99th percentile of all pictures. Where no such window is without a gap, the place
+    One scale for all: white is the 99th percentile of all images. Where no such window is without a gap, the place
     stays empty.
     """
     from matplotlib.figure import Figure
 
     streams = dict(sorted(streams.items()))
-    pictures = {camera: middle_picture(stream) for camera, stream in streams.items()}
+    pictures = {camera: middle_image(stream) for camera, stream in streams.items()}
     seen = [image for _, image in (p for p in pictures.values() if p is not None)]
     white = max(float(np.percentile(np.concatenate([i.ravel() for i in seen]), 99)), 1e-6) if seen else 1.0
     first = next(iter(streams.values()))
@@ -111,7 +111,7 @@ def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
         figure.savefig(part, dpi=100)
 
 
-def middle_picture(stream: SpikeStream) -> tuple[int, NDArray[np.float32]] | None:
+def middle_image(stream: SpikeStream) -> tuple[int, NDArray[np.float32]] | None:
     """First tick and mean [H, W] of the window without a gap that is nearest the middle; None where there is none."""
     length = min(WINDOW_TICKS, stream.n_ticks)
     kept = np.concatenate([[0], np.cumsum(present(stream.gaps, stream.n_ticks))])

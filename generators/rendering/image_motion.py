@@ -1,4 +1,4 @@
-"""How things move across the picture, exactly from geometry, and at which ticks key frames are rendered for it."""
+"""How things move across the image, exactly from geometry, and at which ticks key frames are rendered for it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class KeyPlan:
 
     Attributes:
         n_ticks, rate_hz: length of the clip and ticks per second.
-        max_px: how far a point of the picture may move between two of its keys.
+        max_px: how far a point of the image may move between two of its keys.
         chain: spacings in ticks, coarsest first, each a divisor of the one before. Keys at multiples of `chain[0]` are
             whole; at other multiples of `chain[k]` only pixels are traced whose motion over `chain[k - 1]` ticks is
             more than `max_px`; the others are interpolated from the coarser keys.
@@ -104,7 +104,7 @@ def key_plan(
         cameras: the views.
         n_ticks: length of the clip.
         rate_hz: ticks per second, a multiple of 1000.
-        max_px: how far a point of the picture may move between two of its keys.
+        max_px: how far a point of the image may move between two of its keys.
         adaptive: False renders every pixel that changes at every tick: the slow, exact way.
         sub_ticks: False never renders instants inside a tick.
     """

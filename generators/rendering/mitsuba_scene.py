@@ -128,8 +128,8 @@ def _batches(world: WorldScene) -> dict[str, _Batch]:
     for number, group in enumerate(world.instances.values()):
         for part in world.groups[group]:
             m = part.material
-            picture = id(m.albedo) if isinstance(m.albedo, np.ndarray) else None
-            alike.setdefault((picture, m.gloss, m.metal, part.mesh.smooth), []).append((number, part))
+            image = id(m.albedo) if isinstance(m.albedo, np.ndarray) else None
+            alike.setdefault((image, m.gloss, m.metal, part.mesh.smooth), []).append((number, part))
     found = {}
     for k, members in enumerate(alike.values()):
         numbers, parts = zip(*members, strict=True)
@@ -171,7 +171,7 @@ def _in_palettes(parts: Mapping[str, Part]) -> dict[str, Part]:
 
 
 def _in_palette(parts: Sequence[Part]) -> Part:
-    """Surfaces that differ in their plain colours only as one, with these colours in a picture of one row."""
+    """Surfaces that differ in their plain colours only as one, with these colours in an image of one row."""
     material = parts[0].material
     colours = np.array([part.material.albedo for part in parts], np.float32)[None]  # [1, N, 3]
     meshes = [

@@ -39,8 +39,8 @@ import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 import numpy as np
 scene = mi.load_dict(mi.cornell_box())
-picture = np.array(mi.render(scene, spp=1, sensor=0))
-assert np.isfinite(picture).all() and picture.mean() > 0
+image = np.array(mi.render(scene, spp=1, sensor=0))
+assert np.isfinite(image).all() and image.mean() > 0
 print("works")
 """
 
@@ -117,7 +117,7 @@ def _cached_probe() -> str:
 
 
 def _probe(timeout_s: float = 180.0) -> str:
-    """Render a small picture in a child process; returns "" or one line that says what went wrong."""
+    """Render a small image in a child process; returns "" or one line that says what went wrong."""
     try:
         child = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:

@@ -10,7 +10,7 @@ Three kinds of pixel, cheapest first:
 Keys between two coarse ones hold only traced pixels in which something moves too fast for the coarse ones (`motion`).
 
 Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. What stands still
-keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole picture, bit for
+keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole image, bit for
 bit. Traced pixels that see no moving surface, only its shadow, get the background plus the *difference* of two such
 renderings: the background's low noise stays, and nothing jumps where the traced region ends.
 
@@ -66,10 +66,10 @@ class Still:
 
 
 class MultiViewRenderer(Sight):
-    """Renders all `cameras` (one resolution) of a world together: one launch per time. Pictures are [C, H, W] float32.
+    """Renders all `cameras` (one resolution) of a world together: one launch per time. Images are [C, H, W] float32.
 
     >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
-    >>> pictures = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
+    >>> images = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class MultiViewRenderer(Sight):
             seed: of all random numbers.
             spp: samples per pixel of keys, a power of two.
             background_spp: of what stands still, a power of two, at least `spp`.
-            color: pictures are linear RGB, [C, H, W, 3].
+            color: images are linear RGB, [C, H, W, 3].
             still: what a renderer with the same arguments returned from `still`; else it is rendered when needed.
             whole_frames: trace every pixel of every key: the slow, exact way.
         """
@@ -111,7 +111,7 @@ class MultiViewRenderer(Sight):
         if still is not None:
             self.still = still
 
-    # ------------------------------------------------------------ pictures
+    # ------------------------------------------------------------ images
 
     @cached_property
     def still(self) -> Still:
@@ -129,7 +129,7 @@ class MultiViewRenderer(Sight):
 
     @cached_property
     def background(self) -> np.ndarray:
-        """`still.background`, in the kind of the pictures: [C, H, W], or in colour [C, H, W, 3]."""
+        """`still.background`, in the kind of the images: [C, H, W], or in colour [C, H, W, 3]."""
         return self.still.background if self.color else gray(self.still.background)
 
     def keys(self, t_s: float) -> np.ndarray:
@@ -137,10 +137,10 @@ class MultiViewRenderer(Sight):
         if self.whole_frames:
             return self.crn_frames(t_s)
         change = self._soft_light.change(t_s)
-        picture = self.background * (1 + (change[..., None] if self.color else change))
+        image = self.background * (1 + (change[..., None] if self.color else change))
         where = np.flatnonzero(self.traced(t_s))
-        self._flat(picture)[where] = self._traced_at(where, t_s)
-        return picture
+        self._flat(image)[where] = self._traced_at(where, t_s)
+        return image
 
     def key_arrays(self, tick: int, plan: KeyPlan) -> dict[str, np.ndarray]:
         """What `KeyStore` keeps of a tick: for each view v the pixels that are given, packed, and their values.
@@ -151,9 +151,9 @@ class MultiViewRenderer(Sight):
         """
         t_s, level = tick / plan.rate_hz, plan.level(tick)
         if level == 0:
-            picture = self.keys(t_s)
-            given = np.ones(self.shape, bool) if self.whole_frames else picture != self.background
-            values = picture.ravel()[given.ravel()]
+            image = self.keys(t_s)
+            given = np.ones(self.shape, bool) if self.whole_frames else image != self.background
+            values = image.ravel()[given.ravel()]
         else:
             given = self._fast(t_s, plan.chain[level - 1] / plan.rate_hz, plan.max_px)
             values = self._traced_at(np.flatnonzero(given), t_s)
@@ -232,9 +232,9 @@ class MultiViewRenderer(Sight):
             self._scene.place(t_s)
         return gray(self._tracer.trace(pixels, spp, 0, moving))
 
-    def _flat(self, picture: np.ndarray) -> np.ndarray:
-        """A view of the picture as [N] or [N, 3]."""
-        return picture.reshape(-1, 3) if self.color else picture.reshape(-1)
+    def _flat(self, image: np.ndarray) -> np.ndarray:
+        """A view of the image as [N] or [N, 3]."""
+        return image.reshape(-1, 3) if self.color else image.reshape(-1)
 
     def _sparse(self, mask_name: str, values_name: str, given: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:
         bounds = np.concatenate([[0], np.cumsum(given.reshape(len(given), -1).sum(1))])

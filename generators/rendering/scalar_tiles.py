@@ -55,10 +55,8 @@ class TileTracer:
             self._sensors[key] = self._sensor(*key)
         scene = self._scene.full if moving else self._scene.empty
         name = f"{self._seed} {self._cameras[view].id} {y} {x} {stream}"
-        picture = mi.render(
-            scene, sensor=self._sensors[key], integrator=self._integrator, seed=zlib.crc32(name.encode())
-        )
-        return np.asarray(picture, np.float32)[..., :3]
+        image = mi.render(scene, sensor=self._sensors[key], integrator=self._integrator, seed=zlib.crc32(name.encode()))
+        return np.asarray(image, np.float32)[..., :3]
 
     def _sensor(self, view: int, y: int, x: int, spp: int) -> Any:
         camera = self._cameras[view]
@@ -111,7 +109,12 @@ def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:
             "near_clip": 0.01,
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(mitsuba_to_world(camera)),
-            "film": {"pixel_format": "rgb", "component_format": "float32", "rfilter": {"type": "box"}, **film},
+            "film": {
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+                **film,
+            },
             "sampler": {"type": "multijitter", "sample_count": strata},
         }
     )

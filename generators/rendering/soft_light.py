@@ -1,6 +1,6 @@
 """Light that the moving things throw or take far around them: bounced light, wide penumbrae, dim reflections.
 
-It varies slowly over the picture and in time, so it is not worth tracing per key. At anchor times, on every second
+It varies slowly over the image and in time, so it is not worth tracing per key. At anchor times, on every second
 pixel of every second row, cheap renderings with and without the instances from the same random numbers give the
 relative change of radiance. Smoothed over space and blended in time it multiplies the background, whose texture and
 low noise stay. Where it is below 0.5 % it is exactly zero: those pixels are the background, bit for bit.

@@ -1,1 +1,1 @@
-"""Tables and pictures of scenes and of what their making costs."""
+"""Tables and images of scenes and of what their making costs."""

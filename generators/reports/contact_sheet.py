@@ -1,4 +1,4 @@
-"""One picture that shows what a scene folder holds."""
+"""One image that shows what a scene folder holds."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.model import Float32
 
 _FRAMES, _FRAME_MS, _QUALITY = 45, 60, 35
-_WINDOW = 16  # ticks of a count picture
+_WINDOW = 16  # ticks of a count image
 
 
 def preview(

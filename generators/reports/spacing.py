@@ -62,8 +62,8 @@ def spacing(
     Args:
         world: Name of a world.
         out: Folder for the table and the plot.
-        width: Width of the picture in pixels.
-        height: Height of the picture in pixels.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
         ticks: Length of the clip, a multiple of 64 ticks; every tick is rendered once.
         spp: Samples per pixel, a power of two.
         seed: Seed of the world and the rendering.

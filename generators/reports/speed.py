@@ -26,7 +26,7 @@ _SPIKEZOO = "spikezoo video2spike_simulation"
 def simulate_numpy(
     keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32
 ) -> Iterator[UInt8]:
-    """The same model in plain numpy, float32, whole pictures at a time: what one writes first. Yields packed ticks."""
+    """The same model in plain numpy, float32, whole images at a time: what one writes first. Yields packed ticks."""
     level = (charge / THRESHOLD).astype(np.float32)
     gain = np.float32(sensor.radiance_gain) * (np.float32(1) if sensor.gain is None else sensor.gain)
     dark = np.float32(0) if sensor.dark is None else sensor.dark
@@ -54,7 +54,7 @@ def exact_counts(
 
 
 def pattern(height: int, width: int, n_keys: int, moving: float) -> Float32:
-    """Keys [K, H, W]: a smooth pattern, drifting in the left `moving` share of the picture, still in the rest."""
+    """Keys [K, H, W]: a smooth pattern, drifting in the left `moving` share of the image, still in the rest."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     shift = np.where(x < moving * width, 0.5, 0.0) * np.arange(n_keys)[:, None, None]
     light = 0.45 + 0.4 * np.sin((x - shift) / 5) * np.cos(y / 7)
@@ -81,7 +81,7 @@ def simulate(argv: Sequence[str] = ()) -> int:
     p.add_argument("--height", type=int, default=250)
     p.add_argument("--ticks", type=int, default=1000)
     p.add_argument("--spacing", type=int, default=10, help="ticks between key frames")
-    p.add_argument("--moving", type=float, default=1.0, help="share of the picture that moves")
+    p.add_argument("--moving", type=float, default=1.0, help="share of the image that moves")
     p.add_argument("--repeats", type=int, default=5, help="the median of so many runs counts")
     p.add_argument("--csv", type=Path, help="write the table here too")
     a = p.parse_args(list(argv))

@@ -134,8 +134,8 @@ def _truth(job: Job, ticks: Sequence[int]) -> tuple[NDArray[np.float32], NDArray
     view = held_out_view(job)
     camera, p = cameras_of(job)[view : view + 1], job.profile
     renderer = MultiViewRenderer(world_of(job), camera, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
-    pictures = [renderer.reference_frames(t / RATE_HZ, _MORE * p.spp)[0] for t in ticks]
-    return np.stack(pictures), np.stack([renderer.traced(t / RATE_HZ)[0] for t in ticks])
+    images = [renderer.reference_frames(t / RATE_HZ, _MORE * p.spp)[0] for t in ticks]
+    return np.stack(images), np.stack([renderer.traced(t / RATE_HZ)[0] for t in ticks])
 
 
 def _measure(
@@ -179,7 +179,7 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
     figure = Figure(figsize=(10, 5), layout="constrained")
     markers = "os^vDPX"  # settings that cost the same lie on each other
     for axes, kind, where in zip(
-        figure.subplots(1, 2), ("", "_moving"), ("whole picture", "where it moves"), strict=True
+        figure.subplots(1, 2), ("", "_moving"), ("whole image", "where it moves"), strict=True
     ):
         for row, marker in zip(rows, markers, strict=False):
             values: Any = (row.keys_minutes, getattr(row, f"mean_percent{kind}"))

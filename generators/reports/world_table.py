@@ -1,4 +1,4 @@
-"""`worlds`: one table of all worlds: how fast, how much of the picture moves, how deep, how often a key, how long."""
+"""`worlds`: one table of all worlds: how fast, how much of the image moves, how deep, how often a key, how long."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
 
     Args:
         scene: Scene folder with calibration/flat and calibration/dark.
-        out: Folder for the maps and their pictures.
+        out: Folder for the maps and their images.
     """
     from rich.console import Console
     from rich.table import Table
@@ -66,7 +66,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
         row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
         table.add_row(*row, *(f"{e:.3f}" if e is not None else "-" for e in truth_errors(opened, camera, found)))
     Console(width=120).print(table)
-    print(f"maps and pictures: {out}")
+    print(f"maps and images: {out}")
     return 0
 
 

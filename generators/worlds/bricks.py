@@ -65,7 +65,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     places, ball, still = _places(), _ball(shot), _room(rng)
     bodies = [Body("box", tuple(v / 2 for v in BRICK_M), p, density=650.0) for p in places]
     path = simulate([*bodies, ball], start_s, duration_s, blocks=_blocks(still))
-    meshes, picture = _bricks(places, shot, rng)
+    meshes, image = _bricks(places, shot, rng)
     mesh, (owner, bodies_of_faces) = merge(meshes), owners(meshes)
 
     def ball_pose(t_s: float) -> dict[str, np.ndarray]:
@@ -96,7 +96,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         notes={"speed_m_s": shot.speed_m_s, "length_m": 2 * BALL_M, "brick_length_m": BRICK_M[0]},
         deforming={
             "brick": Deforming(
-                Part(mesh, Material(picture, 0.35)),
+                Part(mesh, Material(image, 0.35)),
                 lambda t_s: path.vertices(t_s, mesh.vertices, owner),
                 bodies_of_faces,
             )
@@ -147,14 +147,14 @@ def _blocks(room: dict[str, Part]) -> list[Block]:
 def _bricks(
     places: list[tuple[float, float, float]], shot: _Shot, rng: np.random.Generator
 ) -> tuple[list[Mesh], np.ndarray]:
-    """One box for each brick, in its own coordinates, and their picture: the painted front, then a cell for each."""
+    """One box for each brick, in its own coordinates, and their image: the painted front, then a cell for each."""
     colours = [np.array(_PAINTS[shot.paint][int(k)]) * rng.uniform(0.8, 1.2) for k in rng.integers(0, 4, len(places))]
     width, height = (COLUMNS + 0.5) * BRICK_M[0], ROWS * BRICK_M[2]
     front_h, front_w = (int(np.ceil(v * _TEXELS - 1e-9)) for v in (height, width))
     per_row = front_w // _CELL
     cell_rows = -(-len(places) // per_row)
-    picture = plain((front_h + cell_rows * _CELL, front_w), (0.3, 0.3, 0.3))
-    c = Canvas(picture, _TEXELS)
+    image = plain((front_h + cell_rows * _CELL, front_w), (0.3, 0.3, 0.3))
+    c = Canvas(image, _TEXELS)
     for (x, _, z), colour in zip(places, colours, strict=True):
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.rectangle(left, top, left + BRICK_M[0], top + BRICK_M[2], tuple(colour))
@@ -164,18 +164,18 @@ def _bricks(
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.line([(left, top), (left + BRICK_M[0], top)], 0.003, (0.78, 0.74, 0.66), 0.7)
         c.line([(left, top), (left, top + BRICK_M[2])], 0.003, (0.15, 0.12, 0.10), 0.7)
-    picture = c.picture
+    image = c.image
     meshes = []
     for k, ((x, _, z), colour) in enumerate(zip(places, colours, strict=True)):
         row, column = divmod(k, per_row)
         y0, x0 = front_h + row * _CELL, column * _CELL
-        picture[y0 : y0 + _CELL, x0 : x0 + _CELL] = colour
+        image[y0 : y0 + _CELL, x0 : x0 + _CELL] = colour
         corner = np.array([x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2]) * _TEXELS
         front = (corner, np.array([BRICK_M[0], BRICK_M[2]]) * _TEXELS)
         own = (np.array([x0 + 2.0, y0 + 2.0]), np.full(2, _CELL - 4.0))
-        meshes.append(_brick(front, own, np.array(picture.shape[1::-1], np.float64)))
-    picture *= (0.86 + 0.22 * fractal(picture.shape[:2], rng, 32, 1))[..., None]
-    return meshes, picture
+        meshes.append(_brick(front, own, np.array(image.shape[1::-1], np.float64)))
+    image *= (0.86 + 0.22 * fractal(image.shape[:2], rng, 32, 1))[..., None]
+    return meshes, image
 
 
 def _brick(front: tuple[np.ndarray, np.ndarray], own: tuple[np.ndarray, np.ndarray], size: np.ndarray) -> Mesh:

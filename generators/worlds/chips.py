@@ -60,7 +60,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     path = simulate(_bodies(throw, duration_s / 2 - start_s, rng), start_s, duration_s, friction=0.3, blocks=blocks)
     chips = [_chip(int(kind)) for kind in rng.integers(0, len(_COLOURS), throw.count)]
     mesh, (owner, bodies) = merge(chips), owners(chips)
-    surface = Part(mesh, Material(_picture(rng), 0.3))
+    surface = Part(mesh, Material(_image(rng), 0.3))
     return WorldScene(
         name="chips",
         seed=seed,
@@ -109,7 +109,7 @@ def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body
 
 
 def _chip(kind: int) -> Mesh:
-    """A chip about the origin, its axis along z; its colours are column `kind` of the picture: face above edge."""
+    """A chip about the origin, its axis along z; its colours are column `kind` of the image: face above edge."""
     a = np.linspace(0, 2 * np.pi, _SEGMENTS, endpoint=False)
     h, r, n = THICK_M / 2, RADIUS_M, len(_COLOURS)
     rows = _CELL + 16
@@ -128,7 +128,7 @@ def _chip(kind: int) -> Mesh:
     return merge(parts)
 
 
-def _picture(rng: np.random.Generator) -> np.ndarray:
+def _image(rng: np.random.Generator) -> np.ndarray:
     """Faces with a value, a ring and edge spots; below, the stripes of the edges."""
     n = len(_COLOURS)
     c = Canvas(plain((_CELL + 16, n * _CELL), (0.5, 0.5, 0.5)), _CELL)
@@ -147,7 +147,7 @@ def _picture(rng: np.random.Generator) -> np.ndarray:
         c.ellipse(x, 0.5, 0.30, 0.30, colour)
         c.ellipse(x, 0.5, 0.25, 0.25, (0.80, 0.76, 0.64))
         c.text(value, x, 0.5, 0.20 if len(value) < 3 else 0.15, (0.04, 0.04, 0.05))
-    return np.asarray(c.picture * (0.92 + 0.12 * fractal(c.picture.shape[:2], rng, 16, 1))[..., None])
+    return np.asarray(c.image * (0.92 + 0.12 * fractal(c.image.shape[:2], rng, 16, 1))[..., None])
 
 
 def _table(felt: Colour, rng: np.random.Generator) -> dict[str, Part]:
@@ -165,12 +165,12 @@ def _table(felt: Colour, rng: np.random.Generator) -> dict[str, Part]:
         c.rectangle(x, 0.66, x + 0.11, 0.75, (0.80, 0.74, 0.50))
         c.rectangle(x + 0.005, 0.665, x + 0.105, 0.745, (0.50, 0.05, 0.05) if k % 2 else (0.04, 0.04, 0.05))
         c.text(str(7 * k % 36), x + 0.055, 0.705, 0.035, _WHITE)
-    picture = c.picture * (0.88 + 0.16 * fractal(size, rng, 8, 1))[..., None]
+    image = c.image * (0.88 + 0.16 * fractal(size, rng, 8, 1))[..., None]
     room = desk.room(rng)
     return {k: room[k] for k in ("wall", "poster0", "poster1", "poster2")} | {
         "skirting": Part(room["skirting"].mesh.at(0, 0, _FLOOR_M), room["skirting"].material),
         "floor": Part(quad((0, 0.0, _FLOOR_M), (3.4, 0, 0), (0, 2.4, 0)), room["desk"].material),
-        "felt": Part(quad((0, 0.05, 0), (1.3, 0, 0), (0, 0.78, 0)), Material(picture)),
+        "felt": Part(quad((0, 0.05, 0), (1.3, 0, 0), (0, 0.78, 0)), Material(image)),
         "edge": Part(merge(_edges()), Material((0.30, 0.14, 0.06), 0.2)),
     }
 

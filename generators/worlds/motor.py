@@ -149,7 +149,7 @@ def body(livery: Livery) -> tuple[Part, ...]:
         Part(screen, Material((0.10, 0.11, 0.13), 0.06)),
         Part(merge(lamp), Material((0.86, 0.86, 0.80), 0.08)),
         Part(tail_lamp, Material((0.7, 0.03, 0.03), 0.1)),
-        Part(quad((-0.93, 0, 0.66), (0, -0.22, 0), (0.03, 0, 0.16)), Material(plate.picture)),
+        Part(quad((-0.93, 0, 0.66), (0, -0.22, 0), (0.03, 0, 0.16)), Material(plate.image)),
     )
 
 
@@ -217,7 +217,7 @@ def _paint(livery: Livery) -> np.ndarray:
     x, y = _ATLAS.place("front", np.array([(0, 0, 0.84)]))[0]
     c.ellipse(x, y, 0.10, 0.08, _WHITE)
     c.text(livery.number, x, y, 0.09, (0.02, 0.02, 0.02))
-    return c.picture
+    return c.image
 
 
 WORLD = World("motor", "A motorcycle races along a street", build)

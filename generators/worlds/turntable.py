@@ -108,7 +108,7 @@ def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
         ]
     )
     parts = [
-        Part(disc(DISC_RADIUS_M - 0.006, DISC_TOP_M, 128), Material(_top_picture(setup, rng), 0.3)),
+        Part(disc(DISC_RADIUS_M - 0.006, DISC_TOP_M, 128), Material(_top_image(setup, rng), 0.3)),
         Part(edge, Material(stripes)),
         Part(collar, Material((0.72, 0.70, 0.64), 0.2)),
         Part(revolve(hub, 48).at(0, 0, DISC_TOP_M), Material((0.78, 0.76, 0.70), 0.25, metal=True)),
@@ -118,7 +118,7 @@ def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
         size = (0.066, 0.058, 0.072)[k]
         block = box((size, size, size), (0, 0, DISC_TOP_M + size / 2)).moved(rotation("z", 0.4 + k))
         at = translation(0.165 * np.cos(angle), 0.165 * np.sin(angle), 0)
-        parts.append(Part(block.moved(at), Material(_block_picture("XYZ"[k], colour, rng), 0.25)))
+        parts.append(Part(block.moved(at), Material(_block_image("XYZ"[k], colour, rng), 0.25)))
     parts += _small_things(rng)
     return tuple(parts)
 
@@ -160,7 +160,7 @@ def _small_things(rng: np.random.Generator) -> list[Part]:
     ]
 
 
-def _top_picture(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
+def _top_image(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
     """Sectors, letters that read from the rim inwards, a tick scale and a dark middle with a hand."""
     n, r = 720, DISC_RADIUS_M - 0.006
     c = Canvas(plain((n, n), (0.74, 0.71, 0.62)), n / (2 * r))
@@ -185,15 +185,15 @@ def _top_picture(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
         c.ellipse(*dot, size, size, (0.75, 0.70, 0.50))
     hand = [polar(0.05, -0.15), polar(0.094, 0.0), polar(0.05, 0.15)]
     c.polygon(hand, (0.82, 0.62, 0.10))
-    return c.picture * (0.86 + 0.18 * fractal((n, n), rng, 64, 2))[..., None]
+    return c.image * (0.86 + 0.18 * fractal((n, n), rng, 64, 2))[..., None]
 
 
-def _block_picture(letter: str, colour: Colour, rng: np.random.Generator) -> np.ndarray:
+def _block_image(letter: str, colour: Colour, rng: np.random.Generator) -> np.ndarray:
     """A toy block's face: a coloured frame around a light field with a letter."""
     c = Canvas(plain((96, 96), colour) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
     c.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
     c.text(letter, 0.5, 0.5, 0.50, tuple(0.5 * v for v in colour))
-    return c.picture
+    return c.image
 
 
 WORLD = World("turntable", "Letters and blocks on a spinning disc", build)

@@ -14,14 +14,14 @@ from spike4dgs.method.splat import RenderOutput
 
 
 @dataclass(eq=False)
-class Pressure:
-    """Screen-space gradients gathered since the last refinement: where the picture asks for more Gaussians."""
+class GradientStatistics:
+    """Screen-space gradients gathered since the last refinement: where the image asks for more Gaussians."""
 
     gradient: Tensor  # [N] sum of |dLoss/dmeans2d| in half-image units, as if each view were a loss of its own
     seen: Tensor  # [N] number of views that saw the Gaussian
 
     @classmethod
-    def zero(cls, n: int, device: torch.device) -> Pressure:
+    def zero(cls, n: int, device: torch.device) -> GradientStatistics:
         """Nothing gathered yet for `n` Gaussians."""
         return cls(torch.zeros(n, device=device), torch.zeros(n, device=device))
 
@@ -42,14 +42,19 @@ class Pressure:
 
 
 def refine(
-    gaussians: Gaussians, pressure: Pressure, settings: TrainSettings, scale: float, limit: int, rng: torch.Generator
+    gaussians: Gaussians,
+    statistics: GradientStatistics,
+    settings: TrainSettings,
+    scale: float,
+    limit: int,
+    rng: torch.Generator,
 ) -> list[Edit]:
     """Edits, to be applied one after the other: move the dead, then densify where the gradient is high.
 
     Faint Gaussians are relocated instead of deleted while the number is at its `limit`, and deleted before.
     """
     dead = gaussians.logits.detach().sigmoid() < settings.min_opacity
-    grow = pressure.mean() * ~dead
+    grow = statistics.mean() * ~dead
     room = limit - (len(gaussians) - int(dead.sum()))
     if room <= 0:
         return [relocate(gaussians, dead, rng)]

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import Splats, Views
 
 
@@ -43,11 +43,11 @@ class Motion(nn.Module):
         """What is drawn at t in [0, 1] of the clip, or a piece; differentiable in Gaussians and own parameters."""
         raise NotImplementedError
 
-    def picture(self, image: Tensor, views: Views) -> Tensor:
+    def image(self, image: Tensor, views: Views) -> Tensor:
         """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
         return image[..., 0]
 
-    def attach(self, gaussians: Gaussians, footage: Footage) -> Gaussians:
+    def attach(self, gaussians: Gaussians, footage: TrainingImages) -> Gaussians:
         """The first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
         return gaussians
 
@@ -59,8 +59,8 @@ class Motion(nn.Module):
         """The Gaussians of a piece as those with which the next one begins, or, not forward, the one before it."""
         raise NotImplementedError
 
-    def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
-        """The Gaussians followed by new ones where pictures are bad; asked for `guided_rounds` times in a fit."""
+    def guide(self, gaussians: Gaussians, footage: TrainingImages, generator: torch.Generator) -> Gaussians:
+        """The Gaussians followed by new ones where images are bad; asked for `guided_rounds` times in a fit."""
         return gaussians
 
     def rates(self) -> dict[str, Decay]:

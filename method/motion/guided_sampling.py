@@ -1,12 +1,12 @@
 """STG's guided sampling: where the worst views stay bad, new Gaussians are laid along the rays of the bad pixels.
 
-Of the two views with the lowest SSIM, pixels count as bad where the difference of picture and render, each divided by
+Of the two views with the lowest SSIM, pixels count as bad where the difference of image and render, each divided by
 its mean, lies in the upper 40 %; patches of 16x16 pixels that are bad for more than 85 % are sampled, three of four
-pixels each, two points a ray. A tenth of the picture at its borders is left out. All as published, with these changes:
+pixels each, two points a ray. A tenth of the image at its borders is left out. All as published, with these changes:
 
 - Two points a ray lie at the near and the far end of what the view sees (the 5 % and 95 % quantiles of its rendered
   depth), moved by up to 5 %. There they lie at 0.7 and 7.5 times the largest depth of the view's first points.
-- The worst views are taken whatever their SSIM is. There they must lie below 0.91, which pictures made of spikes,
+- The worst views are taken whatever their SSIM is. There they must lie below 0.91, which images made of spikes,
   with their noise, do at any fit.
 - A view is judged at five times of the clip. There a view is one time of one camera.
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.spacetime_decoder import rays
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import RenderOutput, Views, render
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.supervision.base import known
@@ -33,9 +33,9 @@ OPACITY = 0.1
 
 @torch.no_grad()
 def guide(
-    motion: Motion, gaussians: Gaussians, footage: Footage, rng: torch.Generator
+    motion: Motion, gaussians: Gaussians, footage: TrainingImages, rng: torch.Generator
 ) -> list[tuple[Gaussians, float]]:
-    """New Gaussians and the time in [0, 1] of the picture that asked for them, for each of the two worst views."""
+    """New Gaussians and the time in [0, 1] of the image that asked for them, for each of the two worst views."""
     indices = np.unique(np.linspace(0, len(footage.ticks) - 1, TIMES).astype(int)).tolist()
     found: list[tuple[float, int, int]] = []  # SSIM, view, time
     for view in range(len(footage.views)):
@@ -45,7 +45,7 @@ def guide(
     for _, view, index in sorted(found)[:VIEWS]:
         t = footage.ticks[index] / footage.n_ticks
         out, image = _draw(motion, gaussians, footage, view, t)
-        picture, camera = known(footage.pictures[index, view], image), _one(footage.views, view)
+        picture, camera = known(footage.images[index, view], image), _one(footage.views, view)
         pixels = bad_pixels(image, picture)
         if len(pixels) >= 2:  # four points at least
             points = along_rays(camera, pixels, out, rng)
@@ -60,20 +60,22 @@ def _one(views: Views, view: int) -> Views:
     return Views(views.w2c[[view]], views.K[[view]], views.width, views.height)
 
 
-def _draw(motion: Motion, gaussians: Gaussians, footage: Footage, view: int, t: float) -> tuple[RenderOutput, Tensor]:
-    """One view at t: everything, and the gray picture [H, W]."""
+def _draw(
+    motion: Motion, gaussians: Gaussians, footage: TrainingImages, view: int, t: float
+) -> tuple[RenderOutput, Tensor]:
+    """One view at t: everything, and the gray image [H, W]."""
     camera = _one(footage.views, view)
     out = render(motion.splats(gaussians, t), camera, depth=True)
-    return out, motion.picture(out.image, camera)[0]
+    return out, motion.image(out.image, camera)[0]
 
 
-def _score(motion: Motion, gaussians: Gaussians, footage: Footage, view: int, index: int) -> float:
+def _score(motion: Motion, gaussians: Gaussians, footage: TrainingImages, view: int, index: int) -> float:
     _, image = _draw(motion, gaussians, footage, view, footage.ticks[index] / footage.n_ticks)
-    return float(ssim(image[None], known(footage.pictures[index, view], image)[None]))
+    return float(ssim(image[None], known(footage.images[index, view], image)[None]))
 
 
 def bad_pixels(image: Tensor, picture: Tensor) -> Tensor:
-    """Indices into H * W of the pixels to sample, for a render and its picture [H, W]."""
+    """Indices into H * W of the pixels to sample, for a render and its image [H, W]."""
     height, width = picture.shape
     error = (image / image.mean() - picture / picture.mean()).abs()
     rows, columns = height // PATCH, width // PATCH

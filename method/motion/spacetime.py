@@ -8,14 +8,14 @@ With d = t - mu, and without gradient through d in the last three lines, as publ
     rotation(t) = q + d w, normalised
     time feature(t) = d f
 
-Scales are constant. "Full" splats features that a small decoder turns into pictures (`spacetime_decoder`); "lite"
+Scales are constant. "Full" splats features that a small decoder turns into images (`spacetime_decoder`); "lite"
 splats gray values.
 
 What differs from the published code, and why:
 
 - Times are shares of the clip as there, but the clip is 20 ms and the points are those of the recipe's initialisation,
   which have no times. There every frame of a video has its points, each with the time of its frame. Here points whose
-  place changes in the pictures (`moving`) are laid down several times over the clip, with the gray value that the
+  place changes in the images (`moving`) are laid down several times over the clip, with the gray value that the
   views see at each time and a short life; all others live throughout, as they would in a static scene.
 - A Gaussian that densification adds gets a random time, as published, and stays on its parent's path: its polynomial
   is the same one around the new time. There the path is shifted with the time, which tears moving things apart.
@@ -36,13 +36,13 @@ from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.guided_sampling import guide
 from spike4dgs.method.motion.spacetime_decoder import Decoder
 from spike4dgs.method.observations.lookup import look_up, moving
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Splats, Views
 
 CUBIC = 9  # m1, m2, m3
 PIECE_TICKS = 400  # 20 ms at 20 kHz
-PIECE_PICTURES = 20  # at least about as many times of a view in each
+PIECE_IMAGES = 20  # at least about as many times of a view in each
 
 
 class SpacetimeLite(Motion):
@@ -62,7 +62,7 @@ class SpacetimeLite(Motion):
         """What is splatted at t: gray [N, 1]."""
         return gaussians.colors
 
-    def attach(self, gaussians: Gaussians, footage: Footage) -> Gaussians:
+    def attach(self, gaussians: Gaussians, footage: TrainingImages) -> Gaussians:
         """Give every Gaussian a time, a life and a path at rest; lay the moving ones down at several times."""
         s = self.settings
         shift = moving(gaussians.means, footage) > s.moving_change
@@ -87,7 +87,7 @@ class SpacetimeLite(Motion):
         }
         return replace(gaussians, extra=extra)
 
-    def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
+    def guide(self, gaussians: Gaussians, footage: TrainingImages, generator: torch.Generator) -> Gaussians:
         """Gaussians for what the worst views lack (`guided`)."""
         life = self.settings.moving_life
         new = guide(self, gaussians, footage, generator)
@@ -121,13 +121,13 @@ class Paths(SpacetimeLite):
 
     @property
     def pieces(self) -> int:
-        """About 20 ms each, what a cubic can follow, or longer where pictures are too far apart for that.
+        """About 20 ms each, what a cubic can follow, or longer where images are too far apart for that.
 
         The cost of drawing does not grow with the clip.
         """
         s, ticks = self.settings, self.extent.n_ticks
-        pictures = min(s.max_times, ticks / s.time_spacing_ticks)
-        return 2 * round((min(ticks / PIECE_TICKS, pictures / PIECE_PICTURES) - 1) / 2) + 1
+        images = min(s.max_times, ticks / s.time_spacing_ticks)
+        return 2 * round((min(ticks / PIECE_TICKS, images / PIECE_IMAGES) - 1) / 2) + 1
 
     def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
         """The Gaussians as they are at the piece's end, or beginning, going on straight at the speed that they have."""
@@ -141,7 +141,7 @@ class Paths(SpacetimeLite):
             new.extra["paths"][:, :3], new.extra["spins"][:] = speed, spins
         return new
 
-    def attach(self, gaussians: Gaussians, footage: Footage) -> Gaussians:
+    def attach(self, gaussians: Gaussians, footage: TrainingImages) -> Gaussians:
         """All at rest in the middle of the clip, for as long as it lasts."""
         return self.timed(gaussians, torch.full((len(gaussians),), 0.5), self.settings.static_life)
 
@@ -150,7 +150,7 @@ class Paths(SpacetimeLite):
         s, scale = self.settings, self.extent.scale
         return {**super().rates(), "paths": Decay(s.paths_rate * scale, s.paths_rate_last * scale)}
 
-    def guide(self, gaussians: Gaussians, footage: Footage, generator: torch.Generator) -> Gaussians:
+    def guide(self, gaussians: Gaussians, footage: TrainingImages, generator: torch.Generator) -> Gaussians:
         """Nothing: what things lack is added to them, by densification, for as long as they are seen."""
         return gaussians
 
@@ -172,8 +172,8 @@ class Spacetime(SpacetimeLite):
         d = t - gaussians.extra["times"].detach()
         return torch.stack([gaussians.colors[:, 0], view, d * time], -1)
 
-    def picture(self, image: Tensor, views: Views) -> Tensor:
-        """The decoder's picture."""
+    def image(self, image: Tensor, views: Views) -> Tensor:
+        """The decoder's image."""
         decoded: Tensor = self.decoder(image, views)
         return decoded
 

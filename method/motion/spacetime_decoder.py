@@ -3,8 +3,8 @@
     radiance = albedo + W2 relu(W1 [view feature, time feature, ray origin, ray direction])
 
 without biases. The published decoder works on nine channels, three of each kind for RGB, with W1 [6, 12] and
-W2 [3, 6]; pictures here are gray, so that one channel of each kind is left, W1 is [6, 8] and W2 [1, 6]. No activation
-follows, as in the preset for linear pictures: radiance may exceed 1.
+W2 [3, 6]; images here are gray, so that one channel of each kind is left, W1 is [6, 8] and W2 [1, 6]. No activation
+follows, as in the preset for linear images: radiance may exceed 1.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Decoder(nn.Module):
         first = torch.empty(HIDDEN, CHANNELS - 1 + 6)
         nn.init.kaiming_uniform_(first, a=5**0.5, generator=generator)  # what torch's convolutions start from
         self.first = nn.Parameter(first)
-        # Zero: the first pictures are the albedo. The published layer starts at random.
+        # Zero: the first images are the albedo. The published layer starts at random.
         self.second = nn.Parameter(torch.zeros(1, HIDDEN))
 
     def forward(self, channels: Tensor, views: Views) -> Tensor:

@@ -53,15 +53,15 @@ class HexPlane4DGS(HexPlaneMotion, Motion):
 
 
 def hexplane_shape(extent: Extent, settings: TrainSettings) -> HexPlaneShape:
-    """As fine as the pictures and the clip ask: spatial cells by the view's width, time cells by the clip's length."""
+    """As fine as the images and the clip ask: spatial cells by the view's width, time cells by the clip's length."""
     finest = max(2, round(extent.width / settings.cell_px))
     spatial = tuple(max(2, finest >> (settings.levels - 1 - level)) for level in range(settings.levels))
     times = max(4, round(extent.n_ticks / settings.cell_ticks) + 1)
     return HexPlaneShape(spatial, times, settings.features, settings.mlp_width)
 
 
-# Step counts of the publications, in this trainer's steps of four pictures: a static 3DGS sees 30,000 single pictures,
-# 4DGS's preset for several views 3,000 and 15,000. STG sees 30,000 pairs of pictures and densifies 6 or 12 times, which
+# Step counts of the publications, in this trainer's steps of four images: a static 3DGS sees 30,000 single images,
+# 4DGS's preset for several views 3,000 and 15,000. STG sees 30,000 pairs of images and densifies 6 or 12 times, which
 # is 7 times here.
 PUBLISHED: dict[str, dict[str, int]] = {
     "static": {"coarse_steps": 7500},

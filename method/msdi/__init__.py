@@ -1,4 +1,4 @@
-"""MSDI: from the spike streams of an array to points, camera poses and pictures, by one network."""
+"""MSDI: from the spike streams of an array to points, camera poses and images, by one network."""
 
 from __future__ import annotations
 

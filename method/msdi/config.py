@@ -10,7 +10,7 @@ class MsdiConfig:
     """What `Msdi` is built from. Widths are channels."""
 
     name: str
-    ticks: int  # T, of the window that the network sees; its picture is that of the middle
+    ticks: int  # T, of the window that the network sees; its image is that of the middle
     extractor_widths: tuple[int, ...]  # of each level, the first at full size, each next at half; one: a single layer
     generator_widths: tuple[int, int]  # of the first two of BCONV's three layers
     generator_sees_pixel: bool  # BCONV also gets the spikes of its own pixel, to which the features are blind
@@ -68,7 +68,7 @@ PAPER = MsdiConfig(
 )
 
 # For two CPU cores, at 64x104 px: patches of 8 give as many tokens there as patches of 16 at twice the size, for a
-# quarter of the pixels. The extractor is a pyramid, for one layer sees three rows and columns; the picture also takes
+# quarter of the pixels. The extractor is a pyramid, for one layer sees three rows and columns; the image also takes
 # the pixel's own spikes, which say more of it than any neighbour.
 SMALL = MsdiConfig(
     name="small",

@@ -90,7 +90,7 @@ class SpikeExtractor(nn.Module):
 
 
 class ImageGenerator(nn.Module):
-    """BCONV of eq. 12: three 1x1 convolutions from a pixel's features to its picture.
+    """BCONV of eq. 12: three 1x1 convolutions from a pixel's features to its image.
 
     With `ticks` > 0 they also get the pixel's own spikes. The published network learns without ground truth and must
     be blind to them; with ground truth there is no need, and no neighbour says as much of a pixel as its own spikes.

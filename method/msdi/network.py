@@ -1,6 +1,6 @@
 """MSDI: multi-view spike-based dense initialisation (the paper's section 3.3, eqs. 5-12).
 
-Spikes of V cameras go through one extractor (eqs. 6, 7). From its features, BCONV makes a picture of each view
+Spikes of V cameras go through one extractor (eqs. 6, 7). From its features, BCONV makes an image of each view
 (eq. 12); a ViT encodes each view (eq. 9), a transformer of 24 layers fuses all views' tokens (eq. 10), and a DPT head
 gives the point that each pixel sees, in the frame of view 0, with a confidence (eq. 11). Poses follow from the points,
 by `pose.solve_poses`. Encoder, fusion and head are those of DUSt3R and Fast3R; `checkpoints` loads their weights.
@@ -166,7 +166,7 @@ class Msdi(nn.Module):
         features = self.extractor(padded[:, : self.config.ticks])
         images = around.cut(self.generator(features, padded))
         rays = around.pad(ray_map(intrinsics, batch * views, height, width, padded))
-        # The pictures alone teach the extractor: the points' gradients, larger and noisier, would cost them several dB.
+        # The images alone teach the extractor: the points' gradients, larger and noisier, would cost them several dB.
         tokens = self.encoder(features.detach(), rays)
         layers = self.fusion(tokens.unflatten(0, (batch, views)))
         patch = self.config.patch
@@ -179,7 +179,7 @@ class Msdi(nn.Module):
         )
 
     def images(self, spikes: Tensor, sensors: Sensors | None = None, *, half: bool = False) -> Tensor:
-        """The pictures alone, of `spikes` [N, T, H, W], `sensors` [N, H, W]: spikes per tick [N, H, W]; raises as
+        """The images alone, of `spikes` [N, T, H, W], `sensors` [N, H, W]: spikes per tick [N, H, W]; raises as
         `forward`. With `half` the features are bfloat16: 0.001 dB, in two thirds of the time where `has_bfloat16`."""
         _check_shapes((1, *spikes.shape), None, self.config.ticks)
         around = margins(spikes.shape[2], spikes.shape[3], self.config.patch)

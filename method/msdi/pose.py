@@ -33,7 +33,7 @@ class PnpSettings:
 
     rounds: int = 2000
     certainty: float = 0.9999
-    reach: float = 0.01  # of the picture's longer side: a point within this distance of its pixel is an inlier
+    reach: float = 0.01  # of the image's longer side: a point within this distance of its pixel is an inlier
     least_inliers: float = 0.1  # share of the points below which a pose counts as none
     least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
     most_points: int = 4000  # evenly drawn from a view's points; more take longer and find no other pose

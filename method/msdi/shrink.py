@@ -1,7 +1,7 @@
 """The stream that a sensor of larger pixels would have given: for an estimator that was trained at low resolution.
 
 Attention costs the square of the number of patches, and a network sees best at the size that it was trained at. A
-stream cannot be resized like a picture, but what several pixels fire together can charge one larger pixel, which fires
+stream cannot be resized like an image, but what several pixels fire together can charge one larger pixel, which fires
 whenever the sum makes a whole spike for each of them: again a stream of 0 and 1, of the mean rate to within one spike.
 """
 

@@ -1,6 +1,6 @@
-"""What moves in a clip: a mask for each view from how much its pictures change, the moving points, and their window.
+"""What moves in a clip: a mask for each view from how much its images change, the moving points, and their window.
 
-A fixed camera sees a static scene as one picture with noise, so the standard deviation of a pixel over the clip tells
+A fixed camera sees a static scene as one image with noise, so the standard deviation of a pixel over the clip tells
 moving things from static ones without any learned segmentation. Uniform surfaces change only at their outline: holes
 of a mask are filled. What it cannot tell is where a thing is at one instant: the mask holds all places it passes.
 """
@@ -18,10 +18,10 @@ from torch import Tensor
 
 from spike4dgs.method.splat import Views
 
-BLUR_PX = 3  # pictures are averaged over this width first: spike noise is white, things are not
+BLUR_PX = 3  # images are averaged over this width first: spike noise is white, things are not
 NOISE_SHARE = 0.25  # at least this share of the pixels shows nothing but noise
 NOISE_FACTOR = 4.0  # noise differs by a factor of two between dark and bright; motion exceeds it by ten
-LOWEST, HIGHEST = 0.01, 0.05  # of white; bounds of the threshold where pictures are clean, or where everything moves
+LOWEST, HIGHEST = 0.01, 0.05  # of white; bounds of the threshold where images are clean, or where everything moves
 SMALLEST_PX = 20  # pixels of a part; noise makes smaller ones
 CLOSE_PX = 7  # gaps up to this width between changing parts belong to the thing
 GROW_PX = 1  # the blurred outline, and Gaussians whose centre lies just outside
@@ -29,11 +29,11 @@ MOST_VIEWS = 0.5  # share of the views in which a moving point lies in the mask
 
 
 def temporal_deviation(pictures: Tensor) -> Tensor:
-    """Standard deviation over time [C, H, W] of pictures [T, C, H, W], each averaged over 3x3 pixels."""
+    """Standard deviation over time [C, H, W] of images [T, C, H, W], each averaged over 3x3 pixels."""
     total = torch.zeros(pictures.shape[1:], dtype=torch.float64, device=pictures.device)
     square = total.clone()
-    for picture in pictures:  # one time after another: a float64 copy of the clip would not fit
-        smooth = torch.nn.functional.avg_pool2d(picture[:, None].double(), BLUR_PX, 1, BLUR_PX // 2)[:, 0]
+    for image in pictures:  # one time after another: a float64 copy of the clip would not fit
+        smooth = torch.nn.functional.avg_pool2d(image[:, None].double(), BLUR_PX, 1, BLUR_PX // 2)[:, 0]
         total += smooth
         square += smooth * smooth
     n = len(pictures)
@@ -41,7 +41,7 @@ def temporal_deviation(pictures: Tensor) -> Tensor:
 
 
 def foreground_masks(pictures: Tensor) -> Tensor:
-    """Where something moves in the clip: bool [C, H, W] from pictures [T, C, H, W] of linear radiance."""
+    """Where something moves in the clip: bool [C, H, W] from images [T, C, H, W] of linear radiance."""
     deviation = temporal_deviation(pictures).cpu().numpy()
     limit = float(np.clip(NOISE_FACTOR * np.quantile(deviation, NOISE_SHARE), LOWEST, HIGHEST))
     masks = np.stack([_solid(view > limit) for view in deviation])
@@ -55,7 +55,7 @@ def _solid(changes: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), np.uint8)
 
     opened = cv2.medianBlur(changes.astype(np.uint8), 3)
-    border = CLOSE_PX  # closing must not see the picture's edge as something static
+    border = CLOSE_PX  # closing must not see the image's edge as something static
     padded = cv2.copyMakeBorder(opened, border, border, border, border, cv2.BORDER_REPLICATE)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc(CLOSE_PX // 2))[border:-border, border:-border]
     _, parts, stats, _ = cv2.connectedComponentsWithStats(closed)
@@ -65,7 +65,7 @@ def _solid(changes: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def foreground_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
-    """Which points [N, 3] m lie in the masks [C, H, W] of most of the views that have them in the picture: bool [N].
+    """Which points [N, 3] m lie in the masks [C, H, W] of most of the views that have them in the image: bool [N].
 
     Something static behind a moving thing lies in its mask from some places only, where the array is wide enough.
     """
@@ -74,23 +74,23 @@ def foreground_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
 
 
 def stray_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
-    """Which points [N, 3] m are in some pictures, but not in the masks of most of them: bool [N].
+    """Which points [N, 3] m are in some images, but not in the masks of most of them: bool [N].
 
-    Nothing moves there. What has left all pictures is not astray.
+    Nothing moves there. What has left all images is not astray.
     """
     hits, seen = _votes(points, views, masks)
     return (seen > 0) & (hits <= MOST_VIEWS * seen)
 
 
 def _votes(points: Tensor, views: Views, masks: Tensor) -> tuple[Tensor, Tensor]:
-    """In how many masks, and in how many pictures, each point is: ([N], [N])."""
-    inside, uv = _in_picture(points, views)
+    """In how many masks, and in how many images, each point is: ([N], [N])."""
+    inside, uv = _in_image(points, views)
     x, y = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)  # [C, N]
     hit = masks[torch.arange(len(views), device=masks.device)[:, None], y, x] & inside
     return hit.sum(0), inside.sum(0)
 
 
-def _in_picture(points: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+def _in_image(points: Tensor, views: Views) -> tuple[Tensor, Tensor]:
     """(bool [C, N], px [C, N, 2]) of points [N, 3] in the views, in float64."""
     w2c, K = views.w2c.double(), views.K.double()
     eye = torch.einsum("cij,nj->cni", w2c[:, :3, :3], points.detach().double()) + w2c[:, None, :3, 3]

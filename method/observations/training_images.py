@@ -10,10 +10,10 @@ from spike4dgs.method.splat import Views
 
 
 @dataclass(frozen=True, eq=False)
-class Footage:
-    """Pictures of all training views at some times."""
+class TrainingImages:
+    """Images of all training views at some times."""
 
     views: Views
     ticks: tuple[int, ...]  # ascending
-    pictures: Tensor  # [T, C, H, W] linear radiance
+    images: Tensor  # [T, C, H, W] linear radiance
     n_ticks: int  # length of the clip

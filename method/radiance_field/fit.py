@@ -2,7 +2,7 @@
 
 A step takes random pixels of all views at one time of the clip (the publication: of one image, static scenes), marches
 their rays through the coarse and the fine field, lets the spiking layer fire on both radiances, and compares its rates
-with the recorded mean spikes, which the recipe's pictures hold: with `tfp` exactly, in a window around the instant.
+with the recorded mean spikes, which the recipe's images hold: with `tfp` exactly, in a window around the instant.
 
 Everything random is drawn from generators seeded by (seed, step), as in the trainer of Gaussians: a fit that resumes
 gives the bits of one that never stopped (on the CPU).
@@ -69,11 +69,11 @@ class RadianceFieldSettings:
     ramp: float = 0.6  # share of the steps in which the times open up from the middle to the whole clip; 0.3: too fast
     first_share: float = 0.2  # middle share of the clip that is seen at first
 
-    # Times at which pictures are made from the spikes (as TrainSettings).
+    # Times at which images are made from the spikes (as TrainSettings).
     time_spacing_ticks: int = 10
     edge_ticks: int = 10
     max_times: int = 256
-    flat_field: bool = False  # correct the pictures by each camera's calibration, if known
+    flat_field: bool = False  # correct the images by each camera's calibration, if known
 
     # Networks.
     depth: int = 4
@@ -88,7 +88,7 @@ class RadianceFieldSettings:
     # Deformation: 4DGS's planes, sized as for Gaussians.
     features: int = 8
     deformation_width: int = 32
-    # At the Gaussians' rates (1e-2, 1e-3), which see whole pictures in a step, a moving plane was not followed.
+    # At the Gaussians' rates (1e-2, 1e-3), which see whole images in a step, a moving plane was not followed.
     grid_rate: float = 3e-2
     grid_rate_last: float = 3e-3
     deformation_rate: float = 5e-3
@@ -146,7 +146,7 @@ class Fitter:
         self.field = DynamicField(shape, bounds, 1 / gain, seeded(job.seed, -1)).to(job.device)
         views = [camera_rays(c, job.device) for c in start.cameras]
         self.rays = Rays(torch.cat([r.origins for r in views]), torch.cat([r.directions for r in views]))
-        self.recorded = (job.footage.pictures * gain).flatten(1)  # [T, C * H * W] mean spikes per tick
+        self.recorded = (job.training_images.images * gain).flatten(1)  # [T, C * H * W] mean spikes per tick
         self._begin_grid()
         field, grid, mlp = self.field.parameter_groups()
         self.adam = make_adam({"field": field, "grid": grid, "deformation": mlp}, (s.beta1, s.beta2))
@@ -158,14 +158,14 @@ class Fitter:
 
     def _begin_grid(self) -> None:
         """Tell the occupancy grid where there are points, and where something may move."""
-        start, shape = self.job.start, self.job.footage.pictures.shape
+        start, shape = self.job.start, self.job.training_images.images.shape
         moving = (self.recorded.std(0, correction=0) > CHANGE).view(shape[1:]).cpu().numpy()
         points = torch.as_tensor(start.points, device=self.job.device)
         self.field.occupancy.begin(points, may_move(self.field.occupancy, start.cameras, moving))
 
     def choose_time(self) -> int:
         """Index of the step's time: the middle of the clip first, and then more and more of it."""
-        s, times = self.settings, len(self.job.footage.ticks)
+        s, times = self.settings, len(self.job.training_images.ticks)
         opened = min(1.0, self.step / (s.ramp * s.steps)) if s.ramp else 1.0
         share = s.first_share + (1 - s.first_share) * opened
         return min(times - 1, int((0.5 + share * ((self.step * GOLDEN) % 1.0 - 0.5)) * times))
@@ -176,9 +176,11 @@ class Fitter:
         index = self.choose_time()
         pixels = torch.randint(len(self.rays), (s.rays,), generator=generator).to(self.recorded.device)
         recorded = self.recorded[index, pixels]
-        pictures = self.field.trace(self.rays[pixels], job.footage.ticks[index] / job.footage.n_ticks, generator)
+        images = self.field.trace(
+            self.rays[pixels], job.training_images.ticks[index] / job.training_images.n_ticks, generator
+        )
         start = torch.rand(s.rays, generator=generator).to(recorded) * (not s.hard_reset)  # published: from 0
-        rates = [firing_rate(job.scene.radiance_gain * x, start, s.spike_steps, s.reset) for x in pictures]
+        rates = [firing_rate(job.scene.radiance_gain * x, start, s.spike_steps, s.reset) for x in images]
         planes = self.field.deformation.planes
         space, times = list(planes.space), list(planes.time)
         smooth = s.smooth_weight * time_smoothness(times) + s.sparse_weight * time_sparsity(times)
@@ -230,7 +232,7 @@ class Fitter:
 
 
 def fit_radiance_field(job: FitJob) -> RadianceModel:
-    """Fit a dynamic radiance field to the job's footage; see the module.
+    """Fit a dynamic radiance field to the job's training images; see the module.
 
     Raises UserError for a damaged checkpoint or one of another fit.
     """

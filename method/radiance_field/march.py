@@ -56,7 +56,7 @@ def spread(rays: int, count: int, generator: torch.Generator | None) -> Tensor:
 def resample(places: Tensor, weights: Tensor, u: Tensor) -> Tensor:
     """Places [R, m] distributed as the weights along the rays: the inverse of their piecewise linear CDF at u [R, m].
 
-    `places` [R, n] ascend, `weights` [R, n] are their samples' shares of the picture. A sample's weight is spread
+    `places` [R, n] ascend, `weights` [R, n] are their samples' shares of the image. A sample's weight is spread
     evenly over the stretch between the middles of its neighbours, so that the ends' weights are not used (as
     published). A little is added to each weight, so that a ray that meets nothing is sampled everywhere.
     """
@@ -71,7 +71,7 @@ def resample(places: Tensor, weights: Tensor, u: Tensor) -> Tensor:
 
 
 def weigh(density: Tensor, z: Tensor, lengths: Tensor) -> Tensor:
-    """Share [R, n] of each sample in its ray's picture; the last one takes what is left, so that they sum to 1.
+    """Share [R, n] of each sample in its ray's image; the last one takes what is left, so that they sum to 1.
 
     w_i = T_i (1 - exp(-density_i delta_i)), T_i = exp(-sum_{j<i} density_j delta_j), where delta_i is the distance to
     the next sample: `density` [R, n] in 1/m, depths z [R, n] ascending, `lengths` [R] metres per metre of depth.

@@ -1,4 +1,4 @@
-"""Everything that is learned, and how a ray's two pictures come out of it: hierarchical sampling with skipping."""
+"""Everything that is learned, and how a ray's two images come out of it: hierarchical sampling with skipping."""
 
 from __future__ import annotations
 

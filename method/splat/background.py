@@ -1,9 +1,9 @@
 """Gaussians that stay as they are before fixed cameras: projected and listed once, then drawn with others that change.
 
-A fit of a mostly static scene renders the same Gaussians into the same views again and again. A `Backdrop` keeps, for
-each view, what they project to, their tile lists and their picture. A tile that no other Gaussian touches is copied
-from that picture; in the others both lists are sorted and composited together, so that the result is what rendering all
-Gaussians at once gives, to the bit. No gradient flows to the backdrop.
+A fit of a mostly static scene renders the same Gaussians into the same views again and again. A `Background` keeps, for
+each view, what they project to, their tile lists and their image. A tile that no other Gaussian touches is copied
+from that image; in the others both lists are sorted and composited together, so that the result is what rendering all
+Gaussians at once gives, to the bit. No gradient flows to the background.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NEAR, EPS2D = 0.01, 0.3  # `render`'s defaults
 
 @dataclass(frozen=True, eq=False)
 class _Still:
-    """The backdrop in one view."""
+    """The background in one view."""
 
     projection: cpu.Projection
     colors: Array  # [passes, N * channels]
@@ -35,7 +35,7 @@ class _Still:
     alpha: Array  # [H, W]
 
 
-class Backdrop:
+class Background:
     """Splats seen by views, none of which changes. Splats that are drawn with it need the same number of channels."""
 
     def __init__(self, splats: Splats, views: Views) -> None:
@@ -47,7 +47,7 @@ class Backdrop:
         return len(self.splats)
 
     def render(self, splats: Splats, chosen: Sequence[int]) -> RenderOutput:
-        """Draw `splats` [N] and the backdrop into the views `chosen`, differentiable in `splats`; no depth.
+        """Draw `splats` [N] and the background into the views `chosen`, differentiable in `splats`; no depth.
 
         `radii` and `means2d` are those of `splats` alone. Raises UserError for values that are not finite.
         """
@@ -69,7 +69,7 @@ class Backdrop:
         return cpu.Settings(self.views.width, self.views.height, NEAR, EPS2D, antialiased=False, depth=False)
 
     def still(self, view: int) -> _Still:
-        """The backdrop in a view, made when it is first asked for."""
+        """The background in a view, made when it is first asked for."""
         if view not in self._still:
             s, n = self.settings(), len(self)
             geometry = tuple(t.float().contiguous().numpy() for t in self.splats.geometry)
@@ -91,9 +91,9 @@ def _tensors(splats: Splats) -> tuple[Tensor, ...]:
 
 
 def _join(still: cpu.Projection, own: cpu.Projection, across: int) -> cpu.Projection:
-    """Both sets of Gaussians, the backdrop's first, with lists for the tiles that `own` touches.
+    """Both sets of Gaussians, the background's first, with lists for the tiles that `own` touches.
 
-    A Gaussian of the backdrop has, instead of gradient records of its own, the record of its tile behind all others:
+    A Gaussian of the background has, instead of gradient records of its own, the record of its tile behind all others:
     it is written to, by one thread at a time, and never read. `across`: tiles in a row.
     """
     n, counts = len(still.keys), np.diff(own.offsets)
@@ -113,7 +113,7 @@ def _join(still: cpu.Projection, own: cpu.Projection, across: int) -> cpu.Projec
 def _merge(
     still_pairs: Any, still_offsets: Any, own_pairs: Any, own_offsets: Any, n: int, offsets: Any, pairs: Any
 ) -> None:
-    """Fill each tile's list with the backdrop's pairs and the others', whose index moves up by n."""
+    """Fill each tile's list with the background's pairs and the others', whose index moves up by n."""
     for tile in range(len(offsets) - 1):
         at = offsets[tile]
         if offsets[tile + 1] == at:
@@ -139,15 +139,15 @@ class _Over(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, probe: Tensor,
-        backdrop: Backdrop, chosen: tuple[int, ...], radii: Tensor,
+        background: Background, chosen: tuple[int, ...], radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        s, channels = backdrop.settings(), colors.shape[1]
+        s, channels = background.settings(), colors.shape[1]
         geometry = tuple(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities))
         packed = cpu.pack_colors(colors.detach().contiguous().numpy(), None)
         images, alphas, frames = [], [], []
         with cpu.busy:
             for c, view in enumerate(chosen):
-                still = backdrop.still(view)
+                still = background.still(view)
                 camera = still.projection.camera
                 own = cpu.project_view(geometry, camera, s, probe.detach()[c].numpy(), radii[c].numpy())
                 both = np.concatenate([still.colors, packed], axis=1)

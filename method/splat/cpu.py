@@ -151,8 +151,8 @@ def record_sums(frame: Frame, s: Settings, d_image: Array, d_alpha: Array, chann
     sums = aligned((len(frame.colors), count * record_width(channels)), np.float32)
     _, backward = raster_kernels(host_lanes(), channels)
     lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
-    pictures = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
-    run(backward, (*lists, *pictures, sums), [_thread_memory(t)[2:7] for t in range(get_threads())])
+    images = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
+    run(backward, (*lists, *images, sums), [_thread_memory(t)[2:7] for t in range(get_threads())])
     return sums.reshape(len(frame.colors), count, record_width(channels))
 
 

@@ -96,7 +96,7 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """Pictures of C views, and what densification wants to know of the N Gaussians in each.
+    """Images of C views, and what densification wants to know of the N Gaussians in each.
 
     `means2d` holds the projected centres in pixels (0 where invisible). Where the render is differentiated,
     `means2d.grad` is dLoss/dmeans2d in the same units after `backward()`, on every back end.

@@ -19,7 +19,7 @@ class Sample:
     t: float  # in [0, 1]
     tick: int
     views: tuple[int, ...]  # indices into the scene's training cameras
-    pictures: Tensor  # [V, H, W] made from the spikes around the tick, 1.0 = white
+    images: Tensor  # [V, H, W] made from the spikes around the tick, 1.0 = white
     step: int  # of the fit: seeds what is random in a loss
 
 
@@ -39,14 +39,14 @@ class Supervision(nn.Module):
 
 
 def known(picture: Tensor, image: Tensor) -> Tensor:
-    """The picture, and the rendered `image` of the same shape, without its gradient, where the picture is no number."""
+    """The image, and the rendered `image` of the same shape, without its gradient, where the image is no number."""
     return torch.where(picture.isfinite(), picture, image.detach())
 
 
 def difference(image: Tensor, picture: Tensor, w: float) -> Tensor:
-    """(1 - w) mean |image - picture| + w (1 - SSIM) of batches [V, H, W].
+    """(1 - w) mean |image - image| + w (1 - SSIM) of batches [V, H, W].
 
-    A pixel of `picture` that is no number counts as met.
+    A pixel of `image` that is no number counts as met.
     """
     picture = known(picture, image)
     absolute = (image - picture).abs().mean()

@@ -1,4 +1,4 @@
-"""The supervision `spike`: SpikeNeRF's spike loss, on pictures rendered from Gaussians.
+"""The supervision `spike`: SpikeNeRF's spike loss, on images rendered from Gaussians.
 
 What is public. Spike4DGS's Table 4 compares "pixel loss in vanilla 4DGS, spike loss in SpikeNeRF, and the combination
 of the above" with its own, and does not write the spike loss down. SpikeNeRF's code does: the rendered intensity passes

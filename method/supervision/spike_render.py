@@ -1,7 +1,7 @@
-"""The supervision `spike-render` of Dy-SpikeGS: fire spikes from the rendered picture, compare them with the recorded.
+"""The supervision `spike-render` of Dy-SpikeGS: fire spikes from the rendered image, compare them with the recorded.
 
 Dy-SpikeGS is SpikeGS (Yu et al. 2024, arXiv 2409.15176) with the deformation of 4DGS. What is public of SpikeGS is its
-abstract: Gaussians whose pictures pass a "noise embedding" and "spiking neurons", trained with a "spike rendering loss
+abstract: Gaussians whose images pass a "noise embedding" and "spiking neurons", trained with a "spike rendering loss
 that generalises over illumination". Its equations and code are not. All of the following is our reading:
 
     rate(x) = gain (I(x, t) exp(a(x)) + b(x))              a, b: noise embedding of every camera, learnt, 0 at first
@@ -9,8 +9,8 @@ that generalises over illumination". Its equations and code are not. All of the 
     L = (1 - w) mean |S - R| + w (1 - SSIM(S, R)) + v mean (a^2 + b^2),   S = mean_k s_k / gain, R: recorded
 
 Integrate-and-fire with subtractive reset is the camera's public model, and L1 with SSIM is 3DGS's loss. `gain` is the
-scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own. The picture is
-taken as constant for M ticks. v keeps the embedding from painting the picture itself: every camera stands still, so
+scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own. The image is
+taken as constant for M ticks. v keeps the embedding from painting the image itself: every camera stands still, so
 that a(x) alone could explain what it sees.
 """
 

@@ -7,8 +7,8 @@
 What is public is the text of these equations. What it leaves open, and how it is read here:
 
 - The neuron: subtractive reset, random charge at the start of each step (`spike_cameras.fire`).
-- "A single spike", the value (H, W, 1) that the neuron gives for one rendered picture, is its mean spikes over
-  `neuron_ticks` ticks, as in SpikeNeRF. With 1 it would be binary, and no picture minimises the L1 distance of a binary
+- "A single spike", the value (H, W, 1) that the neuron gives for one rendered image, is its mean spikes over
+  `neuron_ticks` ticks, as in SpikeNeRF. With 1 it would be binary, and no image minimises the L1 distance of a binary
   value to a mean: in expectation the straight-through gradient of |S - R| draws every rate to 1/2. A fit of a car
   (64x40 pixels, a quarter of `quick`) came to 3.0 dB with 1 and to 30.6 dB with 256.
 - phi_s: one linear layer and a sigmoid, since what comes out are spikes. It begins as the sequence that an even stream

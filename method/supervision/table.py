@@ -17,7 +17,7 @@ from spike4dgs.method.supervision.spss import SpikeVariation
 
 
 class Pixel(Supervision):
-    """(1 - w) mean |I - P| + w (1 - SSIM(I, P)): the rendered against the reconstructed picture (3DGS).
+    """(1 - w) mean |I - P| + w (1 - SSIM(I, P)): the rendered against the reconstructed image (3DGS).
 
     w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14).
     """
@@ -28,11 +28,11 @@ class Pixel(Supervision):
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """The loss of one rendered sample."""
-        return difference(render(sample.t), sample.pictures, self.ssim_weight)
+        return difference(render(sample.t), sample.images, self.ssim_weight)
 
 
 class Sum(Supervision):
-    """The plain sum of losses that look at the same rendered pictures, those of the sample's own time."""
+    """The plain sum of losses that look at the same rendered images, those of the sample's own time."""
 
     def __init__(self, *parts: Supervision) -> None:
         super().__init__()

@@ -2,7 +2,7 @@
 
 At the first time all Gaussians are optimised and densified by the one trainer. Then their sizes and opacities stand.
 At each further time the moving ones go on with the velocity that they had, x + (x - x') and likewise the rotations,
-and are optimised against that time's pictures for a few steps of a fresh Adam, with the terms of `tracking_losses`:
+and are optimised against that time's images for a few steps of a fresh Adam, with the terms of `tracking_losses`:
 
     1.0 image + 3.0 silhouette + 4.0 rigidity + 4.0 rotation + 2.0 isometry + 20 background + 0.01 colour,
     image = 0.8 mean |I - P| + 0.2 (1 - SSIM(I, P))
@@ -14,7 +14,7 @@ What differs from the publication, and why:
 - Its masks are silhouettes of each instant, ours hold all places that a thing passes (`foreground`). So the silhouette
   term only forbids moving Gaussians to be seen where nothing ever moves.
 - Gaussians of the background stand still, the limit of an infinite background weight, and only the part of the
-  pictures in which something moves is rendered again. `freeze_background` False gives the published soft term.
+  images in which something moves is rendered again. `freeze_background` False gives the published soft term.
 - A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
   stays where it was at the time before.
 - Lengths are relative to the Gaussians' spacing (`tracking_losses`), learning rates fall within each time.
@@ -54,9 +54,9 @@ from spike4dgs.method.trainer import Trainer, one_torch_thread, seeded
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """Hyper-parameters. One step renders several views at one time, where the publication takes one picture.
+    """Hyper-parameters. One step renders several views at one time, where the publication takes one image.
 
-    The published 10,000 and 2,000 steps are 200,000 pictures for a clip of 100 times. Here a fit has the time of 4DGS:
+    The published 10,000 and 2,000 steps are 200,000 images for a clip of 100 times. Here a fit has the time of 4DGS:
     things move by about a pixel between two times, and a few steps follow that.
     """
 
@@ -68,7 +68,7 @@ class TrackingSettings:
     time_spacing_ticks: int = 16  # 0.8 ms at 20 kHz; between times everything is interpolated
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut
     max_times: int = 40  # bounds the time of a fit
-    flat_field: bool = False  # correct the pictures by each camera's calibration, if known
+    flat_field: bool = False  # correct the images by each camera's calibration, if known
     start: float = 0.5  # where in the clip the first time is: 0 at its beginning, as published, 1 at its end
     clean_background: bool = True  # pixels that never change show their mean over the clip, without the spikes' noise
     margin_px: int = 8  # around what moves, more than half a window of SSIM
@@ -100,7 +100,7 @@ class TrackingSettings:
         return replace(self, first_steps=first, later_steps=later)
 
 
-PUBLISHED = {"first_steps": 2500, "later_steps": 500}  # 10,000 and 2,000 single pictures in steps of four
+PUBLISHED = {"first_steps": 2500, "later_steps": 500}  # 10,000 and 2,000 single images in steps of four
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,11 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
     Raises UserError for a damaged checkpoint or one of another fit.
     """
     saved = load_checkpoint(job.checkpoint, job.key) if job.checkpoint else None
-    masks = foreground_masks(job.footage.pictures)
+    masks = foreground_masks(job.training_images.images)
     if job.settings.clean_background:
-        pictures = job.footage.pictures
-        clean = torch.where(masks, pictures, pictures.mean(0))
-        job = replace(job, footage=replace(job.footage, pictures=clean))
+        images = job.training_images.images
+        clean = torch.where(masks, images, images.mean(0))
+        job = replace(job, training_images=replace(job.training_images, images=clean))
     if saved:
         gaussians = Gaussians.from_tensors({k: v.to(job.device) for k, v in saved.part("gaussians").items()})
     else:
@@ -145,13 +145,13 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
 
 def first_index(job: FitJob) -> int:
     """Index of the time that everything starts from."""
-    last = len(job.footage.ticks) - 1
+    last = len(job.training_images.ticks) - 1
     return min(max(round(job.settings.start * last), 0), last)
 
 
 def later_total(job: FitJob) -> int:
     """Steps of all further times."""
-    return sum(step_count(job.settings, v) for v in visits(first_index(job), len(job.footage.ticks)))
+    return sum(step_count(job.settings, v) for v in visits(first_index(job), len(job.training_images.ticks)))
 
 
 def step_count(settings: TrackingSettings, visit: Visit) -> int:
@@ -161,8 +161,8 @@ def step_count(settings: TrackingSettings, visit: Visit) -> int:
 
 def fit_first(job: FitJob) -> Gaussians:
     """Optimise and densify Gaussians at the first time, with the one trainer as for a static scene."""
-    s, footage, i = job.settings, job.footage, first_index(job)
-    still = replace(footage, ticks=footage.ticks[i : i + 1], pictures=footage.pictures[i : i + 1])
+    s, training_images, i = job.settings, job.training_images, first_index(job)
+    still = replace(training_images, ticks=training_images.ticks[i : i + 1], images=training_images.images[i : i + 1])
     settings = TrainSettings(coarse_steps=s.first_steps, views_per_step=s.views_per_step, ssim_weight=s.ssim_weight)
     motion = MOTIONS["static"](job.extent, settings, seeded(job.seed, -1))
     supervision = SUPERVISIONS["pixel"](settings, job.scene)
@@ -178,25 +178,25 @@ class Tracker:
 
     def __init__(self, job: FitJob, gaussians: Gaussians, masks: Tensor) -> None:
         self.job, self.gaussians, self.settings = job, gaussians, job.settings
-        footage = job.footage
-        self.window = moving_window(footage.views, masks, self.settings.margin_px)
+        training_images = job.training_images
+        self.window = moving_window(training_images.views, masks, self.settings.margin_px)
         self.masks = masks
-        self.pictures, self.quiet = self.window.cut(footage.pictures), ~self.window.cut(masks)
-        moving = foreground_points(gaussians.means, footage.views, masks)
+        self.images, self.quiet = self.window.cut(training_images.images), ~self.window.cut(masks)
+        moving = foreground_points(gaussians.means, training_images.views, masks)
         with torch.no_grad():
             seen = render(gaussians.splats(), self.window.views).visible.any(0)
         # The moving Gaussians come first, then what else the window shows.
         rows = [torch.nonzero(m)[:, 0] for m in (moving, seen & ~moving)]
         self.count, self.rows = len(rows[0]), torch.cat(rows)
         free = self.rows[: self.count] if self.settings.freeze_background else self.rows
-        self.tracks = Tracks.start(gaussians, free, self.rows, footage.ticks, job.scene.rate_hz)
-        self.plan = visits(first_index(job), len(footage.ticks)) if self.count > 1 else []
+        self.tracks = Tracks.start(gaussians, free, self.rows, training_images.ticks, job.scene.rate_hz)
+        self.plan = visits(first_index(job), len(training_images.ticks)) if self.count > 1 else []
         self.done = 0
         self.local = gaussians.rows(self.rows)
         self.flag = torch.zeros(len(self.rows), 1, device=job.device)
         self.flag[: self.count] = 1
         area = self.window.views.width * self.window.views.height
-        self.share = area / (footage.views.width * footage.views.height)
+        self.share = area / (training_images.views.width * training_images.views.height)
 
     def run(self, checkpoint_s: float) -> None:
         """Track the times that are left."""
@@ -246,7 +246,7 @@ class Tracker:
             loss.backward()
             adam.step()
         found = {name: leaf.detach() for name, leaf in leaves.items()}
-        stray = stray_points(found["means"][: self.count], self.job.footage.views, self.masks)
+        stray = stray_points(found["means"][: self.count], self.job.training_images.views, self.masks)
         for name in ("means", "quats"):
             found[name][: self.count][stray] = old[name][: self.count][stray]
         tracks.put(index, found)
@@ -266,9 +266,9 @@ class Tracker:
             splats = Splats(*everything, scales, opacities, torch.cat([leaves["colors"], self.flag], 1))
             views = Views(every.w2c[chosen], every.K[chosen], every.width, every.height)
             image, silhouette = render(splats, views).image.unbind(-1)
-            total = s.image_weight * difference(image, self.pictures[index][chosen], s.ssim_weight)
+            total = s.image_weight * difference(image, self.images[index][chosen], s.ssim_weight)
             total = total + s.silhouette_weight * (silhouette * self.quiet[chosen]).mean()
-            # A mean over whole pictures, as published: outside of the window nothing changes.
+            # A mean over whole images, as published: outside of the window nothing changes.
             total = self.share * total + physical_loss(self.graph, before, means[:n], quats[:n], weights)
             if not s.freeze_background:
                 rest = (means[n:], quats[n:], local.means[n:], local.quats[n:], self.graph.unit)

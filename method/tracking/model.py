@@ -110,13 +110,13 @@ class TrackedModel:
         """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
         image = render(self.splats(t_us), views).image
-        return self.picture(image, views)[0].clamp(min=0).cpu().numpy()
+        return self.image(image, views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
         """What is drawn at `t_us`."""
         return self.at(t_us).splats()
 
-    def picture(self, image: Tensor, views: Views) -> Tensor:
+    def image(self, image: Tensor, views: Views) -> Tensor:
         """The drawn channel [V, H, W, 1] -> gray radiance [V, H, W]."""
         return image[..., 0]
 

@@ -30,7 +30,7 @@ def render(
     frames: Path | None = None,
     device: str = "cpu",
 ) -> int:
-    """Render a fitted model along a path of cameras, in slow motion, to a video or a folder of pictures.
+    """Render a fitted model along a path of cameras, in slow motion, to a video or a folder of images.
 
     Args:
         model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
@@ -63,9 +63,9 @@ def render(
             writers.append(stack.enter_context(video_writer(out, (first.width, first.height), fps)))
         if frames is not None:
             writers.append(png_writer(frames))
-        for picture in _shown(pictures(saved, views, times, scale), len(times), saved.title):
+        for image in _shown(make_images(saved, views, times, scale), len(times), saved.title):
             for write in writers:
-                write(picture)
+                write(image)
     seconds = len(times) / fps
     for target in filter(None, (out, frames)):
         print(f"{target}: {len(times)} frames of {first.width}x{first.height}, {seconds:.1f} s at {fps:g} frames/s")
@@ -79,7 +79,7 @@ def frame_times(duration_us: float, slow_motion: float, fps: float) -> list[floa
     return [i * step_us for i in range(count)]
 
 
-def pictures(saved: SavedModel, path: camera_paths.Path, times: list[float], scale: float) -> Iterator[UInt8]:
+def make_images(saved: SavedModel, path: camera_paths.Path, times: list[float], scale: float) -> Iterator[UInt8]:
     """The frames [H, W]: the model along the path, at each of the times, sRGB-encoded."""
     for i, t_us in enumerate(times):
         camera = resized(path(i / max(len(times) - 1, 1)), scale)
@@ -89,7 +89,7 @@ def pictures(saved: SavedModel, path: camera_paths.Path, times: list[float], sca
 def png_writer(folder: Path) -> Write:
     """What writes frames as FOLDER/00000.png and so on."""
     count = iter(range(10**9))
-    return lambda picture: write_png(folder / f"{next(count):05d}.png", picture)
+    return lambda image: write_png(folder / f"{next(count):05d}.png", image)
 
 
 def _shown(frames: Iterator[UInt8], total: int, title: str) -> Iterator[UInt8]:

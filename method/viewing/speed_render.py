@@ -1,7 +1,7 @@
 """`speed render`: how fast saved models render, side by side in one process, and how far from float64.
 
 Models take turns at every camera and time, so that whatever else the machine does meets all of them alike. The exact
-picture is composited in float64 at some patches; how a model moves its Gaussians is not part of the comparison.
+image is composited in float64 at some patches; how a model moves its Gaussians is not part of the comparison.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from spike4dgs.method.trainer import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
 
 PATCH = (32, 16)  # px, width and height
-PATCHES = ((0.2, 0.3), (0.5, 0.3), (0.8, 0.3), (0.2, 0.7), (0.5, 0.7), (0.8, 0.7))  # their middles, in pictures
+PATCHES = ((0.2, 0.3), (0.5, 0.3), (0.8, 0.3), (0.2, 0.7), (0.5, 0.7), (0.8, 0.7))  # their middles, in images
 
 
 @runtime_checkable
@@ -44,13 +44,13 @@ class Splatting(Protocol):
         """What is drawn at `t_us`."""
         ...
 
-    def picture(self, image: Tensor, views: Views) -> Tensor:
+    def image(self, image: Tensor, views: Views) -> Tensor:
         """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
         ...
 
 
 def render(argv: Sequence[str] = ()) -> int:
-    """Time the pictures of saved models at the training cameras, over the clip, and compare them with float64."""
+    """Time the images of saved models at the training cameras, over the clip, and compare them with float64."""
     p = argparse.ArgumentParser("spike4dgs speed render", description=render.__doc__)
     p.add_argument("models", type=Path, nargs="+", help="OUT/models/METHOD/SCENE.safetensors")
     p.add_argument("--times", type=int, default=10, help="times of the clip at each camera")
@@ -70,7 +70,7 @@ def render(argv: Sequence[str] = ()) -> int:
         rows = [_row(*of) for of in zip(models, shots, times, strict=True)]
     columns = ("model", "pixels", "Gaussians", "min ms", "median ms", "frames/s", "mean error", "largest error")
     threads = f"{a.device}, torch {torch.__version__} on one thread beside the kernels' own"
-    show_table(f"Pictures of saved models; {threads}; errors against float64", columns, rows, a.csv)
+    show_table(f"Images of saved models; {threads}; errors against float64", columns, rows, a.csv)
     return 0
 
 
@@ -83,7 +83,7 @@ def _shots(saved: SavedModel, times: int, scale: float) -> list[tuple[Camera, fl
 
 def _time_ms(saved: SavedModel, camera: Camera, t_us: float) -> float:
     start = time.perf_counter()
-    saved.model.render(camera, t_us)  # a picture in memory of the host: a GPU has finished
+    saved.model.render(camera, t_us)  # an image in memory of the host: a GPU has finished
     return 1e3 * (time.perf_counter() - start)
 
 
@@ -101,7 +101,7 @@ def _row(saved: SavedModel, shots: list[tuple[Camera, float]], times_ms: list[fl
 
 @torch.no_grad()
 def errors(model: Splatting, camera: Camera, t_us: float) -> Iterator[Float32]:
-    """Absolute differences [h, w] of a model's picture from the exact one, at patches of it."""
+    """Absolute differences [h, w] of a model's image from the exact one, at patches of it."""
     picture = model.render(camera, t_us)
     width, height = min(PATCH[0], camera.width), min(PATCH[1], camera.height)
     for u, v in PATCHES:
@@ -115,9 +115,9 @@ def errors(model: Splatting, camera: Camera, t_us: float) -> Iterator[Float32]:
 def exact_patch(
     model: Splatting, camera: Camera, t_us: float, corner: tuple[int, int], size: tuple[int, int]
 ) -> Float32:
-    """Part of a model's picture, composited in float64: `size` (width, height) pixels from `corner` (x, y) on: [h, w].
+    """Part of a model's image, composited in float64: `size` (width, height) pixels from `corner` (x, y) on: [h, w].
 
-    The Gaussians are projected as for the whole picture; those that cannot reach the patch are left out.
+    The Gaussians are projected as for the whole image; those that cannot reach the patch are left out.
     """
     defaults: dict[str, Any] = rasterise.__kwdefaults__ or {}
     drawn, views = model.splats(t_us), Views.from_cameras([camera])
@@ -133,5 +133,5 @@ def exact_patch(
     K[:, :2, 2] -= offset
     device = drawn.means.device
     cut = Views(views.w2c.to(device), K.to(device), *size)
-    picture = model.picture(image[None].to(drawn.colors), cut)
+    picture = model.image(image[None].to(drawn.colors), cut)
     return picture[0].clamp(min=0).cpu().numpy()

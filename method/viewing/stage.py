@@ -1,4 +1,4 @@
-"""What the viewer shows: the model's picture, what the spikes say, and the difference of the two."""
+"""What the viewer shows: the model's image, what the spikes say, and the difference of the two."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from spike4dgs.method.saved_model import SavedModel
 Mode = Literal["rendered", "spike rate", "error"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 WINDOW_TICKS = 40  # of the spike rate: 2 ms at 20 kHz, in which a bright pixel fires 24 times
-ERROR_MAX = 0.3  # white in an error picture, as in the sheets of a run
-BORDER = 24  # gray around a picture that is not as wide or high as the window
+ERROR_MAX = 0.3  # white in an error image, as in the sheets of a run
+BORDER = 24  # gray around an image that is not as wide or high as the window
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Stage:
         """What can be shown: without the scene there are no spikes."""
         return MODES if self.scene else MODES[:1]
 
-    def picture(self, mode: Mode, camera: Camera, t_us: float) -> UInt8:
+    def image(self, mode: Mode, camera: Camera, t_us: float) -> UInt8:
         """RGB [H, W, 3] at `t_us`. For other modes than `rendered`, `camera` is a training camera of the scene."""
         if mode == "rendered":
             return _gray(self.saved.model.render(camera, t_us))
@@ -103,7 +103,7 @@ def error_colors() -> UInt8:
 
 
 def padded(picture: UInt8, aspect: float) -> UInt8:
-    """The picture in the middle of a gray one whose width is `aspect` times its height."""
+    """The image in the middle of a gray one whose width is `aspect` times its height."""
     height, width = picture.shape[:2]
     full = (max(height, round(width / aspect)), max(width, round(height * aspect)))
     out = np.full((*full, 3), BORDER, np.uint8)
@@ -123,7 +123,7 @@ def free_camera(
 
 
 def matching(cameras: Sequence[Camera], name: str, aspect: float) -> tuple[Camera, float]:
-    """A camera by name, and the vertical angle of a window of that aspect that holds its whole picture."""
+    """A camera by name, and the vertical angle of a window of that aspect that holds its whole image."""
     camera = next(c for c in cameras if c.id == name)
     height = max(camera.height, camera.width / aspect)
     return camera, float(2 * np.arctan(0.5 * height / camera.fy))

@@ -1,6 +1,6 @@
-"""`view`: a fitted model in the browser. Pictures are drawn here, by the project's own rasteriser, and sent as JPEG.
+"""`view`: a fitted model in the browser. Images are drawn here, by the project's own rasteriser, and sent as JPEG.
 
-While something changes, pictures have as many pixels as a training view; at rest they are drawn once more, with four
+While something changes, images have as many pixels as a training view; at rest they are drawn once more, with four
 times as many. Controls are shared by all browsers that look; each has its own camera.
 """
 
@@ -94,10 +94,10 @@ class Viewer:
 
     def __init__(self, stage: Stage, host: str, port: int) -> None:
         self.stage, self.target = stage, focus(stage.cameras)
-        self.pictures = 0  # drawn so far
+        self.images = 0  # drawn so far
         self._windows: dict[int, Window] = {}
         self._wake, self._ended = threading.Event(), threading.Event()
-        self._ms: list[float] = []  # of the last pictures
+        self._ms: list[float] = []  # of the last images
         self._told = 0.0
         self.server = need_viser().ViserServer(host, port, label="Spike4DGS", verbose=False)
         self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
@@ -139,7 +139,7 @@ class Viewer:
         self.server.stop()
 
     def redraw(self) -> None:
-        """Draw every window's picture again."""
+        """Draw every window's image again."""
         for w in list(self._windows.values()):
             w.stale = True
         self._wake.set()
@@ -155,13 +155,13 @@ class Viewer:
             camera = matching(self.stage.cameras, chosen, seen.aspect)[0]
         if mode == "rendered":
             camera = resized(camera, scale)
-        picture = self.stage.picture(mode, camera, self.time.value)
-        w.client.scene.set_background_image(padded(picture, seen.aspect), format="jpeg", jpeg_quality=JPEG)
-        self.pictures += 1
+        image = self.stage.image(mode, camera, self.time.value)
+        w.client.scene.set_background_image(padded(image, seen.aspect), format="jpeg", jpeg_quality=JPEG)
+        self.images += 1
         self._tell(1e3 * (time.perf_counter() - start), camera)
 
     def _tell(self, ms: float, camera: Camera) -> None:
-        """Show the speed: of the last pictures, now and then."""
+        """Show the speed: of the last images, now and then."""
         self._ms = [*self._ms[-19:], ms]
         now = time.monotonic()
         if now - self._told > 0.5:

@@ -1,4 +1,4 @@
-"""The export against an independent reading of the D-NeRF layout: the same pixels, pictures and times."""
+"""The export against an independent reading of the D-NeRF layout: the same pixels, images and times."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_known_points_fall_on_the_same_pixels(exported: Path) -> None:
     assert seen == set(cameras)
 
 
-def test_training_pictures_are_made_of_the_training_spikes(small_scene: Path, exported: Path) -> None:
+def test_training_images_are_made_of_the_training_spikes(small_scene: Path, exported: Path) -> None:
     scene, frames = open_scene(small_scene), load(exported, "train")
     assert [f.name for f in frames] == [f"{c}_{t:06d}" for c in scene.train for t in (0, 20, 40, 60)]
     assert [f.time for f in frames[:4]] == [0, 0.25, 0.5, 0.75]
@@ -88,13 +88,13 @@ def test_training_pictures_are_made_of_the_training_spikes(small_scene: Path, ex
     assert np.abs(found - np.clip(expected, 0, 1)[..., None]).max() < 0.006, "half a step of 8 bits near white"
 
 
-def test_validation_pictures_lie_between_the_training_times(exported: Path) -> None:
+def test_validation_images_lie_between_the_training_times(exported: Path) -> None:
     train, val = ({f.time for f in load(exported, part)} for part in ("train", "val"))
     assert val == {10 / TICKS} and not val & train
     assert {f.name.rpartition("_")[0] for f in load(exported, "val")} == {"cam_00", "cam_01", "cam_02"}
 
 
-def test_test_pictures_are_the_ground_truth(small_scene: Path, exported: Path) -> None:
+def test_test_images_are_the_ground_truth(small_scene: Path, exported: Path) -> None:
     scene, frames = open_scene(small_scene), load(exported, "test")
     assert [f.name for f in frames] == [f"{t.camera}_{t.tick:06d}" for t in scene.targets]
     for frame, target in zip(frames, scene.targets, strict=True):
@@ -103,7 +103,7 @@ def test_test_pictures_are_the_ground_truth(small_scene: Path, exported: Path) -
         assert frame.time == pytest.approx(target.tick / TICKS)
 
 
-def test_test_pictures_in_colour(small_scene: Path, tmp_path: Path) -> None:
+def test_test_images_in_colour(small_scene: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected a colour image"):
         export_nerfstudio(small_scene, tmp_path / "gray", colour=True)
     assert not (tmp_path / "gray").exists()
@@ -115,7 +115,7 @@ def test_test_pictures_in_colour(small_scene: Path, tmp_path: Path) -> None:
     assert np.abs(linear(load(tmp_path / "export", "test")[0].rgb) - rgb).max() < 0.006
 
 
-def test_other_pictures_and_steps(small_scene: Path, tmp_path: Path) -> None:
+def test_other_images_and_steps(small_scene: Path, tmp_path: Path) -> None:
     export_nerfstudio(small_scene, tmp_path / "export", images="tfi", every=30, split="center")
     frames, scene = load(tmp_path / "export", "train"), open_scene(small_scene)
     assert len(frames) == 9
@@ -126,12 +126,12 @@ def test_other_pictures_and_steps(small_scene: Path, tmp_path: Path) -> None:
 def test_what_is_lost_is_said(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     export_nerfstudio(small_scene, tmp_path / "export", every=40)
     text = capsys.readouterr().out
-    assert "transforms_train.json: 6 pictures" in text and "transforms_test.json: 3 pictures" in text
+    assert "transforms_train.json: 6 images" in text and "transforms_test.json: 3 images" in text
     for loss in ("8-bit", "clipped at white", "principal point", "window of spikes", "masks"):
         assert loss in text
 
 
-def test_a_recording_without_ground_truth_has_no_test_pictures(
+def test_a_recording_without_ground_truth_has_no_test_images(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses = {"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}
@@ -140,7 +140,7 @@ def test_a_recording_without_ground_truth_has_no_test_pictures(
     import_spikecv(tmp_path / "spikecv", tmp_path / "back", rate_hz=20000.0, transforms=tmp_path / "poses.json")
     export_nerfstudio(tmp_path / "back", tmp_path / "export")
     assert len(load(tmp_path / "export", "train")) == 16 and not (tmp_path / "export/transforms_test.json").exists()
-    assert "no transforms_test.json: the scene has no such pictures" in capsys.readouterr().out
+    assert "no transforms_test.json: the scene has no such images" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_refinement_without_still_pixels_is_refused() -> None:
 
 
 @given(st.sets(st.integers(0, 59), max_size=30), st.integers(60, 400))
-def test_the_picture_comes_from_the_longest_time_without_targets(ticks: set[int], n_ticks: int) -> None:
+def test_the_image_comes_from_the_longest_time_without_targets(ticks: set[int], n_ticks: int) -> None:
     start, stop = free_ticks(sorted(ticks), n_ticks)
     assert 0 <= start < stop <= n_ticks and not ticks & set(range(start, stop))
     runs = "".join("x" if t in ticks else "." for t in range(n_ticks)).split("x")
@@ -139,7 +139,7 @@ def test_a_run_publishes_unrefined_and_refined_scores(small_scene: Path, tmp_pat
     assert run(tmp_path, [small_scene], again)[1]["scenes"] == refined["scenes"] and again.fits == 0
 
 
-def test_the_picture_for_refinement_is_unscored_and_still(small_scene: Path, tmp_path: Path) -> None:
+def test_the_image_for_refinement_is_unscored_and_still(small_scene: Path, tmp_path: Path) -> None:
     method, scene = Posed(), open_scene(small_scene)
     run(tmp_path, [small_scene], method)
     camera, picture, still, t_us = method.given[0]
@@ -161,7 +161,7 @@ def test_a_failure_fails_both_records_and_absent_weights_skip_them(small_scene: 
 
 @pytest.mark.parametrize("motion", ["static", "tracking"])
 def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
-    """All training poses are shifted by the same: at the calibrated held-out pose the picture is off, refined not."""
+    """All training poses are shifted by the same: at the calibrated held-out pose the image is off, refined not."""
     shift = np.array([0.02, 0.0, 0.0])
 
     def shifted(scene: TrainingScene, seed: int) -> Any:

@@ -50,15 +50,15 @@ def test_steady_light_leaves_two_adjacent_intervals_and_random_spikes_do_not() -
     assert examine("random", stream_of(noise)).two_intervals < 0.05
 
 
-def test_a_raw_stream_becomes_an_upright_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fired = np.random.default_rng(2).random((60, 24, 40)) < np.where(np.arange(24) < 12, 0.6, 0.05)[:, None]
     with SpikeWriter(tmp_path / "top.dat", 40, 24) as writer:
         writer.write(pack(fired))
     assert inspect(tmp_path / "top.dat", width=40, height=24, fps=20_000, out=tmp_path / "out") == 0
     with Image.open(tmp_path / "out" / "top" / "top.png") as png:
-        picture = np.asarray(png.convert("L"), np.float64)
-    height, width = picture.shape
-    tfp = picture[height // 10 : height // 2, width // 10 : width * 4 // 10]  # inside the first panel
+        image = np.asarray(png.convert("L"), np.float64)
+    height, width = image.shape
+    tfp = image[height // 10 : height // 2, width // 10 : width * 4 // 10]  # inside the first panel
     assert tfp[: len(tfp) // 3].mean() > tfp[-len(tfp) // 3 :].mean() + 40
     assert "top" in capsys.readouterr().out
 
@@ -108,6 +108,6 @@ def test_the_real_recording_is_upright_and_of_the_known_rate() -> None:
     assert report.rate.mean() == pytest.approx(0.366, abs=5e-4)
     bits = np.unpackbits(np.fromfile(path, np.uint8), bitorder="little").reshape(-1, 250, 400)[:, ::-1]
     np.testing.assert_array_equal(stream.window(0, 200), bits)
-    # Bits of the wrong order break up every edge: the right order is the smoother picture.
+    # Bits of the wrong order break up every edge: the right order is the smoother image.
     wrong = np.unpackbits(np.fromfile(path, np.uint8)).reshape(-1, 250, 400)[:, ::-1].mean(axis=0)
     assert np.abs(np.diff(report.rate, axis=1)).mean() < 0.8 * np.abs(np.diff(wrong, axis=1)).mean()

@@ -17,7 +17,7 @@ from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 
 TINY = Budget(scale=0.01)
-# One of each kind of fit that needs nothing that a user brings, and no features in the pictures.
+# One of each kind of fit that needs nothing that a user brings, and no features in the images.
 FITTED = [
     "nearest-view",
     "tfp+static",
@@ -177,7 +177,7 @@ def test_recipes_that_are_compared_differ_in_one_part() -> None:
 
     for motion in ("d3dgs", "stg", "4dgs"):
         assert differ(f"tfi+{motion}", f"tfp+{motion}") == {"images"}
-        # Spk2ImgNet's pictures take time, so a quick fit has fewer of them, and 4DGS fewer steps.
+        # Spk2ImgNet's images take time, so a quick fit has fewer of them, and 4DGS fewer steps.
         assert differ(f"tfi+{motion}", f"spk2img+{motion}") == {"images"} | (
             {"settings"} if motion != "d3dgs" else set()
         )

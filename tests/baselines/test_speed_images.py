@@ -1,4 +1,4 @@
-"""`speed images`: every generator is timed and scored as its pictures deserve; what cannot run says why."""
+"""`speed images`: every generator is timed and scored as its images deserve; what cannot run says why."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def prepare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(speed_images, name, value)
 
 
-def rows(path: Path, key: str = "pictures") -> dict[str, dict[str, str]]:
+def rows(path: Path, key: str = "images") -> dict[str, dict[str, str]]:
     with open(path) as f:
         return {row[key]: row for row in csv.DictReader(f)}
 
@@ -105,7 +105,7 @@ def test_what_cannot_run_is_a_row_with_its_reason(measured: Path) -> None:
     assert float(untrained["ms 40x24"]) > 0 and untrained["PSNR"] == "-" and "no weights" in untrained["note"]
 
 
-def test_scores_are_those_of_the_held_out_streams_pictures(measured: Path) -> None:
+def test_scores_are_those_of_the_held_out_streams_images(measured: Path) -> None:
     by_scene = rows(measured / "images_by_scene.csv", "scene")
     psnr, ssim = [], []
     for i in range(2):
@@ -126,7 +126,7 @@ def test_scores_are_those_of_the_held_out_streams_pictures(measured: Path) -> No
     assert float(row["SSIM"]) == pytest.approx(np.mean(ssim), abs=6e-5)
 
 
-def test_pictures_are_scored_again_where_the_camera_is_known(measured: Path, tmp_path: Path) -> None:
+def test_images_are_scored_again_where_the_camera_is_known(measured: Path, tmp_path: Path) -> None:
     assert rows(measured / "images.csv")["tfp"]["PSNR, corrected"] == "-"
     for camera in array_cameras():
         pixels = camera.height, camera.width, 0, camera.id
@@ -153,12 +153,12 @@ def test_spikezoo_sees_the_stream_upright_and_at_the_right_time(measured: Path) 
     assert abs(float(table["tfp, spikezoo"]["PSNR"]) - float(table["tfp"]["PSNR"])) < 0.5
 
 
-def test_a_strip_of_pictures_for_each_scene(measured: Path) -> None:
+def test_a_strip_of_images_for_each_scene(measured: Path) -> None:
     for i in range(2):
         with Image.open(measured / f"strip_pattern-{i}.png") as strip:
             assert strip.width > 4 * WIDTH and strip.height > 2 * HEIGHT
             pixels = np.asarray(strip.convert("L"))
-        assert pixels.std() > 20, "there are pictures in it"
+        assert pixels.std() > 20, "there are images in it"
 
 
 def test_without_scenes_only_time_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

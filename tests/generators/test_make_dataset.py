@@ -35,7 +35,7 @@ PLAN = KeyPlan(80, 20_000, 0.5, (20, 10))
 
 
 class FakeRenderer:
-    """Pictures without Mitsuba: a bright square over noise, to the right with time."""
+    """Images without Mitsuba: a bright square over noise, to the right with time."""
 
     def __init__(self, world, cameras, *, seed, spp, background_spp, color=False, still=None, whole_frames=False):
         self.cameras, self.color = tuple(cameras), color
@@ -327,8 +327,8 @@ def test_the_audit_finds_noise_and_no_more(made):
 
 
 @pytest.mark.slow
-def test_flow_and_depth_of_a_scene_carry_its_pictures_over(made):
-    """Ground truth warped by its flow is the next frame, and depth warps one camera's picture into another's."""
+def test_flow_and_depth_of_a_scene_carry_its_images_over(made):
+    """Ground truth warped by its flow is the next frame, and depth warps one camera's image into another's."""
     scene = open_scene(made / "car-0-tiny")
     tick, (camera, other) = 40, ("cam_04", "cam_00")
     here, later, there = (

@@ -1,4 +1,4 @@
-"""The recipes as they are listed, on a world with known pictures: from spikes to held-out views."""
+"""The recipes as they are listed, on a world with known images: from spikes to held-out views."""
 
 from functools import cache
 

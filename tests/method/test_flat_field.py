@@ -1,4 +1,4 @@
-"""Pictures and first points corrected by the cameras' calibrations: what a perfect sensor would have given."""
+"""Images and first points corrected by the cameras' calibrations: what a perfect sensor would have given."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
-from spike4dgs.method.fit import film
+from spike4dgs.method.fit import make_training_images
 from spike4dgs.method.settings import TrainSettings
 
 GAIN, TICKS = 0.6, 200
@@ -45,17 +45,19 @@ def light(camera):
 
 
 def error(scene, **settings):
-    pictures = film(scene, scene.cameras, IMAGES["adaptive"], TrainSettings(**settings), "cpu").pictures.numpy()
+    images = make_training_images(
+        scene, scene.cameras, IMAGES["adaptive"], TrainSettings(**settings), "cpu"
+    ).images.numpy()
     truth = np.stack([light(c) for c in scene.cameras])
-    return float(np.sqrt(np.mean((pictures - truth) ** 2)))
+    return float(np.sqrt(np.mean((images - truth) ** 2)))
 
 
-def test_pictures_lose_the_pattern_of_the_pixels(scene):
+def test_images_lose_the_pattern_of_the_pixels(scene):
     assert error(scene) > 0.04
     assert error(scene, flat_field=True) < 0.008
 
 
-def test_without_recordings_pictures_stay_as_they_are(scene):
+def test_without_recordings_images_stay_as_they_are(scene):
     bare = replace(scene, recordings=())
     assert error(bare, flat_field=True) == error(bare)
 

@@ -15,7 +15,7 @@ from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import film, measure
+from spike4dgs.method.fit import make_training_images, measure
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.settings import TrainSettings
@@ -104,13 +104,13 @@ FITS = [
 @pytest.mark.parametrize("name", CASES)
 def test_losses_gradients_and_parameters_are_numbers(name, images, motion, supervision, extra) -> None:
     if name == "100,000 ticks" and images == "tfstp":
-        pytest.skip("TFSTP looks at every tick before the picture's: minutes")
+        pytest.skip("TFSTP looks at every tick before the image's: minutes")
     scene, s = case(name), replace(SETTINGS, time_spacing_ticks=20, max_times=4, **extra)
     start = surfaces(usual(), 0)
-    footage = film(scene, start.cameras, IMAGES[images], s, "cpu")
+    training_images = make_training_images(scene, start.cameras, IMAGES[images], s, "cpu")
     model = MOTIONS[motion](measure(start, scene), s, seeded(0, -1))
-    gaussians = model.attach(from_points(start.points[::8], start.values[::8], opacity=0.5), footage)
-    fit = Trainer(footage, gaussians, model, SUPERVISIONS[supervision](s, scene), s, scale=1.0, seed=0)
+    gaussians = model.attach(from_points(start.points[::8], start.values[::8], opacity=0.5), training_images)
+    fit = Trainer(training_images, gaussians, model, SUPERVISIONS[supervision](s, scene), s, scale=1.0, seed=0)
     while fit.step < fit.total:
         assert fit.train_step().isfinite()
         leaves = [*fit.gaussians.tensors().values(), *model.parameters(), *fit.supervision.parameters()]
@@ -119,4 +119,4 @@ def test_losses_gradients_and_parameters_are_numbers(name, images, motion, super
     with torch.no_grad():
         fit.run(silent)
         for t in (0.0, 1.0):
-            assert fit._render(model.splats(fit.gaussians, t), footage.views).image.isfinite().all()
+            assert fit._render(model.splats(fit.gaussians, t), training_images.views).image.isfinite().all()

@@ -12,7 +12,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.method import Budget, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Parts, RecipeMethod, Start, at_most, film, measure
+from spike4dgs.method.fit import Parts, RecipeMethod, Start, at_most, make_training_images, measure
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.motion import spacetime
@@ -27,7 +27,7 @@ from spike4dgs.method.trainer import Trainer, seeded
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
 
 
-def pictures(stream, ticks, gain, camera=None):  # type: ignore[no-untyped-def]
+def images(stream, ticks, gain, camera=None):  # type: ignore[no-untyped-def]
     """Mean of the spikes 12 ticks around."""
     spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
     return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
@@ -99,9 +99,9 @@ def trainer(**settings: float) -> Trainer:
     s = replace(s, time_spacing_ticks=20, freeze_still=True)
     extent = measure(start, scene)
     motion = MOTIONS["paths"](extent, s, seeded(0, -1))
-    footage = film(scene, start.cameras, pictures, s, "cpu")
-    first = motion.attach(from_points(start.points[::3], start.values[::3], opacity=0.5), footage)
-    return Trainer(footage, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
+    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
+    first = motion.attach(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
+    return Trainer(training_images, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
 
 
 def quiet(done: int, total: int, note: str = "") -> None:
@@ -131,7 +131,7 @@ def test_a_piece_that_has_ended_stays_as_it_is() -> None:
     assert all(torch.equal(v, middle[k]) for k, v in ended.items())
 
 
-def test_a_cap_holds_whatever_the_pictures_size() -> None:
+def test_a_cap_holds_whatever_the_images_size() -> None:
     fit = trainer(fine_steps=30, coarse_steps=20, max_gaussians=1500, grow_gradient=0.0)
     start = len(fit.gaussians)
     fit.run(quiet)
@@ -178,7 +178,7 @@ def test_a_time_is_drawn_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = Parts({"short": pictures}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
+    parts = Parts({"short": images}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
     steps = {"coarse_steps": 100, "fine_steps": 250, "piece_steps": 200, "time_spacing_ticks": 20}
 
     def fitted(**settings: float) -> FittedModel:

@@ -90,7 +90,7 @@ def errors(cameras: tuple[Camera, ...]) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_wrong_poses_become_better_and_the_picture_sharp() -> None:
+def test_wrong_poses_become_better_and_the_image_sharp() -> None:
     before = errors(wrong(SCENE, 0).cameras)
     refined, kept = (method(refine_poses=r).fit(SCENE, Budget(), "cpu", 0, quiet) for r in (True, False))
     assert isinstance(refined, FittedModel) and isinstance(kept, FittedModel)
@@ -119,6 +119,6 @@ def test_a_resumed_fit_has_the_same_poses(tmp_path: Path) -> None:
         assert a.id == "cam_00" or not np.array_equal(a.w2c, start.w2c)
 
 
-def test_a_backdrop_has_fixed_poses() -> None:
+def test_a_background_has_fixed_poses() -> None:
     with pytest.raises(UserError, match="expected refine_poses or freeze_still, found both"):
         method(freeze_still=True).fit(SCENE, Budget(), "cpu", 0, quiet)

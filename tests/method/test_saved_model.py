@@ -1,4 +1,4 @@
-"""Models on disk: the same pictures, one clear error for anything else, and what a run writes."""
+"""Models on disk: the same images, one clear error for anything else, and what a run writes."""
 
 import json
 from pathlib import Path
@@ -29,9 +29,9 @@ def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path) -> None
     loaded = load_model(path)
     assert type(loaded.model) is type(original)
     for t_us in (-10.0, 0.0, 1234.5, 0.5 * DURATION_US, DURATION_US):
-        picture = original.render(camera, t_us)
-        assert picture.std() > 0.01, "a test of nothing"
-        np.testing.assert_array_equal(loaded.model.render(camera, t_us), picture)
+        image = original.render(camera, t_us)
+        assert image.std() > 0.01, "a test of nothing"
+        np.testing.assert_array_equal(loaded.model.render(camera, t_us), image)
     assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
 
 
@@ -57,8 +57,8 @@ def test_a_model_that_refines_views_saves_what_it_holds(tmp_path: Path) -> None:
     wrapped = RefinableModel(model("hexplane"), Refinement())
     assert isinstance(wrapped, Savable)
     wrapped.save(tmp_path / "m", provenance())
-    picture = load_model(tmp_path / "m").model.render(WORLD.held_out, 500.0)
-    np.testing.assert_array_equal(picture, wrapped.render(WORLD.held_out, 500.0))
+    image = load_model(tmp_path / "m").model.render(WORLD.held_out, 500.0)
+    np.testing.assert_array_equal(image, wrapped.render(WORLD.held_out, 500.0))
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from toy_fits import PARTS, WORLD, method, pictures, silent, surfaces
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget
-from spike4dgs.method.fit import RecipeMethod, choose_ticks, film, measure
+from spike4dgs.method.fit import RecipeMethod, choose_ticks, make_training_images, measure
 from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.density import GradientStatistics, refine
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.observations.lookup import moving
@@ -53,9 +53,9 @@ def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel
     extent = measure(start, scene)
     first = from_points(start.points[::3], start.values[::3], opacity=0.5)
     model = MOTIONS[motion](extent, s, seeded(0, -1))
-    footage = film(scene, start.cameras, pictures, s, "cpu")
+    training_images = make_training_images(scene, start.cameras, pictures, s, "cpu")
     loss = SUPERVISIONS[supervision](s, scene)
-    return Trainer(footage, model.attach(first, footage), model, loss, s, scale=extent.scale, seed=3)
+    return Trainer(training_images, model.attach(first, training_images), model, loss, s, scale=extent.scale, seed=3)
 
 
 @pytest.mark.parametrize("motion", ["paths", "hexplane"])
@@ -69,7 +69,11 @@ def test_what_never_changes_is_frozen_after_the_static_stage(motion: str) -> Non
     frozen = {k: v.clone() for k, v in fit.still.tensors().items()}
     assert len(fit.still) > 50 and len(fit.gaussians) > 50
     limit = fit.settings.moving_change
-    assert moving(fit.still.means, fit.footage).max() <= limit < moving(fit.gaussians.means.detach(), fit.footage).max()
+    assert (
+        moving(fit.still.means, fit.training_images).max()
+        <= limit
+        < moving(fit.gaussians.means.detach(), fit.training_images).max()
+    )
     before = fit.gaussians.colors.detach().clone()
     while fit.step < 10:
         fit.train_step()
@@ -77,12 +81,12 @@ def test_what_never_changes_is_frozen_after_the_static_stage(motion: str) -> Non
     assert all(torch.equal(v, fit.still.tensors()[k]) for k, v in frozen.items())
 
 
-def test_paths_lay_nothing_down_where_the_backdrop_is_not_drawn() -> None:
+def test_paths_lay_nothing_down_where_the_background_is_not_drawn() -> None:
     """Guided sampling would take what is frozen for missing."""
     fit = trainer(24, motion="paths", freeze_still=True)
     while fit.step < 12:
         fit.train_step()
-    assert fit.motion.guide(fit.gaussians, fit.footage, seeded(0, 0)) is fit.gaussians
+    assert fit.motion.guide(fit.gaussians, fit.training_images, seeded(0, 0)) is fit.gaussians
     assert (fit.gaussians.extra["times"].detach() - 0.5).abs().max() < 0.1
 
 
@@ -98,7 +102,7 @@ PARTS_WITH_STATE = {
     "hexplane": {},
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
-    "paths": {"motion": "paths", "freeze_still": True, "steps": 24},  # a backdrop from step 8 on
+    "paths": {"motion": "paths", "freeze_still": True, "steps": 24},  # a background from step 8 on
 }
 
 
@@ -243,10 +247,10 @@ def test_full_scene_relocates_and_open_scene_prunes_and_grows():
         np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32), np.ones(20, np.float32), opacity=0.5
     )
     g.logits[:5] = -10.0
-    pressure = Pressure(torch.full((20,), 1.0), torch.ones(20))
-    (moved,) = refine(g, pressure, s, 1.0, 15, torch.Generator())
+    statistics = GradientStatistics(torch.full((20,), 1.0), torch.ones(20))
+    (moved,) = refine(g, statistics, s, 1.0, 15, torch.Generator())
     assert len(moved.gaussians) == 20 and (moved.gaussians.logits > -6).all()
-    (grown,) = refine(g, pressure, s, 1.0, 40, torch.Generator())
+    (grown,) = refine(g, statistics, s, 1.0, 40, torch.Generator())
     assert len(grown.gaussians) == 30 and (grown.source[:5] < 15).sum() >= 0
-    (calm,) = refine(g, Pressure.zero(20, g.means.device), s, 1.0, 40, torch.Generator())
+    (calm,) = refine(g, GradientStatistics.zero(20, g.means.device), s, 1.0, 40, torch.Generator())
     assert len(calm.gaussians) == 15 and (calm.source >= 5).all()

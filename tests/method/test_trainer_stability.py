@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from toy_fits import WORLD, method, pictures, silent, surfaces
+from toy_fits import WORLD, images, method, silent, surfaces
 
 from spike4dgs.benchmark.method import Budget
-from spike4dgs.method.fit import film, measure
+from spike4dgs.method.fit import make_training_images, measure
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.settings import TrainSettings
@@ -28,7 +28,7 @@ class PixelTwin(Pixel):
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         image, w = render(sample.t), self.ssim_weight
-        return (1 - w) * (image - sample.pictures).abs().mean() + w * (1 - ssim_reference(image, sample.pictures))
+        return (1 - w) * (image - sample.images).abs().mean() + w * (1 - ssim_reference(image, sample.images))
 
 
 class TrainerTwin(Trainer):
@@ -39,29 +39,31 @@ class TrainerTwin(Trainer):
 
 
 def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Pictures [3, V, H, W] near the clip's ends and at its middle, before and after 50 steps of a trainer."""
+    """Images [3, V, H, W] near the clip's ends and at its middle, before and after 50 steps of a trainer."""
     scene = WORLD.training
     start = surfaces(scene, 0)
     extent = measure(start, scene)
     s = replace(SETTINGS, time_spacing_ticks=40)
     first = from_points(start.points[::9], start.values[::9], opacity=0.5)
     model = MOTIONS[motion](extent, s, seeded(0, -1))
-    footage = film(scene, start.cameras, pictures, s, "cpu")
-    gaussians = model.attach(first, footage)
+    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
+    gaussians = model.attach(first, training_images)
     twin = dtype == torch.float64
     if twin:
         gaussians = Gaussians.from_tensors({k: v.double() for k, v in gaussians.tensors().items()})
-        views = replace(footage.views, w2c=footage.views.w2c.double(), K=footage.views.K.double())
-        footage = replace(footage, views=views, pictures=footage.pictures.double())
+        views = replace(
+            training_images.views, w2c=training_images.views.w2c.double(), K=training_images.views.K.double()
+        )
+        training_images = replace(training_images, views=views, images=training_images.images.double())
         model = model.double()
     loss = (PixelTwin if twin else Pixel)(s, scene)
-    fit = (TrainerTwin if twin else Trainer)(footage, gaussians, model, loss, s, scale=extent.scale, seed=3)
+    fit = (TrainerTwin if twin else Trainer)(training_images, gaussians, model, loss, s, scale=extent.scale, seed=3)
     assert fit.gaussians.means.dtype == dtype
 
     def drawn() -> Tensor:
         with torch.no_grad():
             splats = [model.splats(fit.gaussians, t) for t in (0.1, 0.5, 0.9)]
-            return torch.stack([fit._render(g, footage.views).image[..., 0] for g in splats])
+            return torch.stack([fit._render(g, training_images.views).image[..., 0] for g in splats])
 
     before = drawn()
     fit.run(silent)

@@ -1,4 +1,4 @@
-"""The no-reference metrics' features once more, slow and from the definitions, and pictures to try them on.
+"""The no-reference metrics' features once more, slow and from the definitions, and images to try them on.
 
 Nothing here is separable, vectorised over blocks or looked up: a full 7x7 window added tap by tap, shifts by np.roll,
 and a search of the whole grid of shapes.
@@ -109,7 +109,7 @@ def niqe_features(image: NDArray[np.uint8]) -> Array:
 
 
 def leaves(height: int = 192, width: int = 288, seed: int = 0) -> NDArray[np.uint8]:
-    """Opaque discs of all sizes, one over the other: a picture with statistics much like natural ones."""
+    """Opaque discs of all sizes, one over the other: an image with statistics much like natural ones."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width), 128, np.uint8)
     for radius in 2 / (rng.random(3000) + 0.02):

@@ -16,7 +16,7 @@ from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.motion.hexplane import HexPlaneShape
 from spike4dgs.method.motion.table import MOTIONS, Extent
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.radiance_field.model import Bounds, DynamicField, FieldShape, RadianceModel
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views
@@ -69,7 +69,7 @@ def gaussian_model(motion: str, still: int = 0) -> FittedModel:
     """A model of the trainer with any motion; some of its Gaussians stand still beside it."""
     spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), SETTINGS)
     made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.2)
-    footage = Footage(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
+    footage = TrainingImages(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
     gaussians = made.attach(points(), footage)
     rng = seeded(4, 0)
     extra = {k: v + 0.1 * torch.randn(v.shape, generator=rng) for k, v in gaussians.extra.items()}

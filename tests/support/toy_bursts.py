@@ -11,7 +11,7 @@ from spike4dgs.benchmark.scene.bursts import Burst, BurstFacts, burst_path, stac
 
 
 def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
-    """`count` pictures around `t` in [0, 1]; everything within reach of the board counts as moving."""
+    """`count` images around `t` in [0, 1]; everything within reach of the board counts as moving."""
     times = t + np.linspace(-0.05, 0.05, count)
     looks = [[world.look(camera, when) for camera in world.cameras] for when in times]
     keys = np.array([[image for image, _, _ in row] for row in looks], np.float32)

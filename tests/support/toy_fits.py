@@ -21,7 +21,7 @@ def silent(done: int, total: int, note: str = "") -> None:
     pass
 
 
-def pictures(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
+def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
     """A stand-in for the images part: mean of the spikes 12 ticks around."""
     spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
     return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
@@ -32,7 +32,7 @@ def surfaces(scene: TrainingScene, seed: int) -> Start:
     return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
-PARTS = Parts({"short": pictures}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
+PARTS = Parts({"short": images}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
 QUICK = {"coarse_steps": 60, "fine_steps": 300, "mlp_width": 16, "features": 8, "views_per_step": 4}
 
 

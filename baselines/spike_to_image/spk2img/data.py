@@ -4,7 +4,7 @@ Every image of a scene counts, those of the held-out camera (every 20 ticks) and
 public benchmark, variant 0 of every world, is refused: nothing that is scored may have been seen.
 
 Augmentation is exact: the eight symmetries of the square, and time reversal. An integrator's spikes played backwards
-are those of an integrator that saw the light backwards; the picture of the start of tick t is then that of the end of
+are those of an integrator that saw the light backwards; the image of the start of tick t is then that of the end of
 tick t, so the reversed window is taken one tick earlier.
 """
 
@@ -88,7 +88,7 @@ def _is_whole(stream: SpikeStream, tick: int) -> bool:
 def draw(examples: Sequence[Example], count: int, patch: int, moving_share: float, rng: np.random.Generator) -> Batch:
     """Draw `count` patches of random examples; a `moving_share` of them around a moving pixel, where there is one.
 
-    `patch` is in pixels, at most the pictures' shorter side.
+    `patch` is in pixels, at most the images' shorter side.
     """
     spikes = np.empty((count, WINDOW, patch, patch), np.float32)
     rate = np.empty((count, patch, patch), np.float32)

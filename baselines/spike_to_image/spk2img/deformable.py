@@ -1,7 +1,7 @@
 """Modulated deformable convolution (DCNv2), 3x3: every tap of every group looks where an offset sends it.
 
 y(p) = bias + sum over taps k of weight_k * mask_k(p) * x(p + k + offset_k(p)), x read bilinearly and 0 outside the
-picture (Zhu, Hu, Lin, Dai: Deformable ConvNets v2, CVPR 2019). The samples of all taps and groups are one call of
+image (Zhu, Hu, Lin, Dai: Deformable ConvNets v2, CVPR 2019). The samples of all taps and groups are one call of
 `grid_sample`, the sum over taps and channels is one matrix product. Without gradients,
 `deformable_cpu` does the same on the CPU in a quarter of the time.
 """
@@ -27,7 +27,7 @@ def deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, b
     u = offsets[:, :, :, 0] + _places(width, x).view(1, 1, 1, 1, width) + _taps(x).repeat(3).view(TAPS, 1, 1)
     v = offsets[:, :, :, 1] + _places(height, x).view(1, 1, 1, height, 1)
     v = v + _taps(x).repeat_interleave(3).view(TAPS, 1, 1)
-    # grid_sample without aligned corners: the picture's outer edges, half a pixel off the outer centres, are -1 and 1.
+    # grid_sample without aligned corners: the image's outer edges, half a pixel off the outer centres, are -1 and 1.
     grid = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], dim=-1)  # [B, G, 9, H, W, 2]
     samples = F.grid_sample(
         x.reshape(batch * groups, channels // groups, height, width),

@@ -46,7 +46,7 @@ def _blend(typing_context: Any, x: Any, corners: Any, weights: Any, columns: Any
 
 @njit(inline="always")
 def _side(place: np.float32, size: int) -> tuple[int, int, np.float32, np.float32]:
-    """The two neighbours of a place within the picture, and their weights: 0 for a neighbour outside."""
+    """The two neighbours of a place within the image, and their weights: 0 for a neighbour outside."""
     place = min(max(place, np.float32(-2)), np.float32(size + 1))  # no offset is too large for an integer
     low = np.floor(place)
     i, upper = int(low), place - low

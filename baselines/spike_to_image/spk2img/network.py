@@ -1,8 +1,8 @@
-"""Spk2ImgNet: a picture from 41 ticks of spikes (Zhao, Xiong, Liu, Huang: Spk2ImgNet, CVPR 2021).
+"""Spk2ImgNet: an image from 41 ticks of spikes (Zhao, Xiong, Liu, Huang: Spk2ImgNet, CVPR 2021).
 
 Five overlapping blocks of 13 ticks each give features, by a shared extractor that fuses four windows of different
 length. The features of the outer blocks are aligned to those of the middle one by a pyramid of deformable
-convolutions, masked, and fused to one picture: the rate of spikes at the middle tick.
+convolutions, masked, and fused to one image: the rate of spikes at the middle tick.
 
 All channel counts follow `width`; 64 is the paper's, with 3,904,185 parameters. Deformable groups have 8 channels at
 every width (the paper has 8 groups), which keeps the cost proportional to width squared. The published sources leave
@@ -62,7 +62,7 @@ class _Residual(nn.Module):
 
 
 class Extractor(nn.Module):
-    """A block's features, and what each of the four branches takes the picture to be."""
+    """A block's features, and what each of the four branches takes the image to be."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ def _mask(width: int) -> nn.Sequential:
 
 
 class Spk2ImgNet(nn.Module):
-    """The network. It takes pictures of any size: their sides are mirrored up to multiples of four and cut again."""
+    """The network. It takes images of any size: their sides are mirrored up to multiples of four and cut again."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()

@@ -58,12 +58,12 @@ class TrainingSettings:
 
 
 def loss_of(found: Reconstruction, rate: Tensor, gain: Tensor, estimate_weight: float) -> Tensor:
-    """L1 in radiance, of the picture and of the middle block's estimates. rate [B, P, P], gain [B]."""
+    """L1 in radiance, of the image and of the middle block's estimates. rate [B, P, P], gain [B]."""
     scale = 1 / gain
-    picture = ((found.rate - rate).abs().mean(dim=(1, 2)) * scale).mean()
+    image = ((found.rate - rate).abs().mean(dim=(1, 2)) * scale).mean()
     estimates = (found.estimates[:, MIDDLE] - rate[:, None]).abs().mean(dim=(2, 3))  # [B, 4]
     weight = estimate_weight * len(BLOCK_STARTS)
-    return picture + weight * (estimates.sum(dim=1) * scale).mean()
+    return image + weight * (estimates.sum(dim=1) * scale).mean()
 
 
 class Training:
@@ -138,7 +138,7 @@ def train_spk2img(
         hidden: Scene folders that are only scored, while training and at its end.
         out: Folder for the weights and the checkpoint.
         width: Channels; 64 is the publication's (a GPU's work), 8 the shipped weights'.
-        steps: Steps of 8 patches of 48x48 pixels (smaller ones where pictures are smaller).
+        steps: Steps of 8 patches of 48x48 pixels (smaller ones where images are smaller).
         device: auto, cpu or cuda.
         seed: Seed of the first weights and of the patches.
         allow_gaps: Accept recordings with gaps; images whose spikes lack ticks are not trained on.

@@ -1,4 +1,4 @@
-"""Image quality without a reference picture: BRISQUE and NIQE, with LIVE's published parameters (see NOTICE)."""
+"""Image quality without a reference image: BRISQUE and NIQE, with LIVE's published parameters (see NOTICE)."""
 
 from spike4dgs.benchmark.metrics.iqa.brisque import brisque
 from spike4dgs.benchmark.metrics.iqa.niqe import niqe

@@ -1,8 +1,8 @@
-"""BRISQUE: how unnatural a picture looks, by a regression on the statistics of its brightness.
+"""BRISQUE: how unnatural an image looks, by a regression on the statistics of its brightness.
 
 36 numbers (18 at each of two scales) go into the support vector machine that the authors trained on the LIVE database.
-About 0 is a good picture and 100 a bad one; the regression knows no bounds, so that scores below 0 and above 100 occur
-and are kept. It was trained on photographs: compare pictures of one scene with it, not scenes.
+About 0 is a good image and 100 a bad one; the regression knows no bounds, so that scores below 0 and above 100 occur
+and are kept. It was trained on photographs: compare images of one scene with it, not scenes.
 
 Source: Mittal, Moorthy, Bovik, "No-Reference Image Quality Assessment in the Spatial Domain", IEEE TIP 2012, and the
 release of 2011. MATLAB's Image Processing Toolbox has a `brisque` with another model and other scores.

@@ -62,7 +62,7 @@ def predict(network: nn.Module, image: UInt8) -> float:
     if image.dtype != np.uint8 or image.ndim != 2:
         raise problem("MetaIQA", "an 8-bit gray image", f"{image.dtype} {image.shape}", "encode it as sRGB first")
     if image.min() == image.max():
-        raise problem("MetaIQA", "a picture of something", "one value everywhere", "render the scene")
+        raise problem("MetaIQA", "an image of something", "one value everywhere", "render the scene")
     small = np.clip(resize(image / 255, (SIDE, SIDE), anti_aliasing=True), 0, 1)  # type: ignore[no-untyped-call]
     channels = np.stack([(small - mean) / std for mean, std in zip(_MEAN, _STD, strict=True)])  # [3, 224, 224]
     with torch.inference_mode():

@@ -1,6 +1,6 @@
 """The statistics that BRISQUE and NIQE share: locally normalised brightness, and distributions fitted to it.
 
-A natural picture, after each pixel loses its neighbourhood's mean and is divided by its neighbourhood's contrast
+A natural image, after each pixel loses its neighbourhood's mean and is divided by its neighbourhood's contrast
 ("mean subtracted, contrast normalised": MSCN), has nearly Gaussian values, and the products of neighbours follow an
 asymmetric distribution. Blur, noise and compression bend these laws; the shapes and widths of the fits say how.
 
@@ -32,7 +32,7 @@ WINDOW = 7  # pixels; the side of the Gaussian window w ...
 WINDOW_SIGMA = WINDOW / 6  # ... which ends at three standard deviations
 
 # In a flat region I - mu is zero but for the last bits, and those depend on the order in which a filter adds. The fits
-# count values by their sign, so that noise would move BRISQUE by points (10 for a picture with 30 % flat pixels). The
+# count values by their sign, so that noise would move BRISQUE by points (10 for an image with 30 % flat pixels). The
 # rounding is about 1e-13. A difference of one gray level at a corner of the window is 1.6e-4, so that real texture
 # below 1e-6 takes a coincidence.
 NOISE = 1e-6

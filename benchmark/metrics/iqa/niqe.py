@@ -1,11 +1,11 @@
-"""NIQE: how far a picture's statistics lie from those of undistorted photographs.
+"""NIQE: how far an image's statistics lie from those of undistorted photographs.
 
 The image is cut into blocks of 96x96 pixels. The 36 features of the blocks (18 at each of two scales) have a mean and a
 covariance, and so had those of the authors' pristine photographs; the score is a distance between the two Gaussians:
 
     D = sqrt((m - m')^T ((C + C') / 2)^-1 (m - m'))
 
-About 3 is a natural picture; larger is worse. Few blocks give an uncertain covariance: parts of one 250x400 picture
+About 3 is a natural image; larger is worse. Few blocks give an uncertain covariance: parts of one 250x400 image
 have been seen to score between 3.1 and 5.2. Never compare scores of different resolutions.
 
 Source: Mittal, Soundararajan, Bovik, "Making a 'Completely Blind' Image Quality Analyzer", IEEE SPL 2013, and the

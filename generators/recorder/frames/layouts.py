@@ -12,7 +12,7 @@ our own, which the emulator follows: row r of frame n ends in the 16-bit little-
     w(r) = a(r mod 2) + 257 r  (mod 2^16),    a(0) = n mod 2^16,    a(1) = (n div 2^16) + 40503 (n mod 2^16)
 
 Every row so tells its number and, given a neighbour, the frame's: both bytes of the word grow by one from row to row,
-which no picture does. Two rows give n modulo 2^32 (59 hours at 20 kHz), all others confirm it. As 40503 is odd, rows of
+which no image does. Two rows give n modulo 2^32 (59 hours at 20 kHz), all others confirm it. As 40503 is odd, rows of
 frames n and n + m disagree with each other for every m that is no multiple of 2^16: a frame that begins with one and
 ends with the other is found out, except where they meet within the first row, whose tag comes after its pixels, or,
 in the dark and where that tag is zero (n a multiple of 2^16), within the second; the tick is right even then. A camera
@@ -20,7 +20,7 @@ with other tags needs another class here.
 
 `line-tagged` is the published format of the 1000x1000 camera: a block's last word holds 4 pixels (bits 0..3), the line
 1..H/2 (bits 4..13) and the channel (14..15). Blocks come as (H/2, 0), (H/2, 1), (H/2 - 1, 0) ... (1, 1), then (1, 2),
-(1, 3), (2, 2) ... (H/2, 3): two make a row. This camera's pictures are turned by 180 degrees against the scene.
+(1, 3), (2, 2) ... (H/2, 3): two make a row. This camera's images are turned by 180 degrees against the scene.
 
 Pixels are row-major and least significant bit first in every layout, as in `benchmark/spikes/stream.py`.
 """
@@ -156,7 +156,7 @@ class _LineTagged(Layout):
 
 
 def make_layout(name: str, width: int, height: int) -> Layout:
-    """The layout of that name for a picture size. Raises UserError for an unknown name or a size it cannot have."""
+    """The layout of that name for an image size. Raises UserError for an unknown name or a size it cannot have."""
     if name not in _MAKERS:
         raise problem("layout", f"one of {', '.join(_MAKERS)}", repr(name), "correct the name")
     if width < 1 or height < 1 or width * height > 1 << 26:
@@ -193,7 +193,7 @@ LAYOUTS = tuple(_MAKERS)
 def orient(packed: UInt8, width: int, height: int, flip: bool, mirror: bool) -> UInt8:
     """Packed ticks [n, bytes] with the rows in reverse order if `flip`, and left and right exchanged if `mirror`.
 
-    Both together turn the picture by 180 degrees. Returns `packed` itself where there is nothing to do.
+    Both together turn the image by 180 degrees. Returns `packed` itself where there is nothing to do.
     """
     if not (flip or mirror):
         return packed

@@ -47,10 +47,10 @@ _VECTOR = tuple_of(_FINITE, "a list of numbers")
 
 @dataclass(frozen=True, eq=False)
 class CameraProfile:
-    """One camera: how it is found, how it is started and stopped, how its pictures lie, and its calibration.
+    """One camera: how it is found, how it is started and stopped, how its images lie, and its calibration.
 
     `start` and `stop` are written to `endpoint_out`, one bulk write for each item. `rows` and `mirrored` tell how the
-    camera sends its picture; streams on disk are always bottom-up and not mirrored.
+    camera sends its image; streams on disk are always bottom-up and not mirrored.
     """
 
     id: str

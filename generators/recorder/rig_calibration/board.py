@@ -1,9 +1,9 @@
-"""A chessboard for calibration: its geometry, and its corners in a picture.
+"""A chessboard for calibration: its geometry, and its corners in an image.
 
 Board coordinates, seen from the front: x to the right, y down, z into the board; the origin is its middle. Corners are
 the inner ones, where four squares meet, row by row from the top left. The square below and right of the first corner is
 dark. One of `columns` and `rows` is odd and the other even, so half a turn of the board exchanges dark and light, and
-every picture tells which way up the board is.
+every image tells which way up the board is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 _FEWEST = 3  # corners in a row that the detector needs
-_SMALL = 640  # px; a smaller picture is enlarged by two for the detector
+_SMALL = 640  # px; a smaller image is enlarged by two for the detector
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ def _bounds(camera: Camera, board: Board, R: Float64, t: Float64) -> tuple[int, 
 
 @kernel
 def _draw(h: Float64, columns: int, rows: int, left: int, top: int, image: Float32, start: int, stop: int) -> None:
-    """Rows [start, stop) of a part of a picture. h [3, 3]: pixel -> board in squares, over the depth."""
+    """Rows [start, stop) of a part of an image. h [3, 3]: pixel -> board in squares, over the depth."""
     for v in range(start, stop):
         for u in range(image.shape[1]):
             x, y = left + u, top + v
@@ -134,7 +134,7 @@ def _draw(h: Float64, columns: int, rows: int, left: int, top: int, image: Float
 
 @kernel
 def _square(h: Float64, columns: int, rows: int, x: float, y: float) -> Any:
-    """Column and row of the board's square at a place of the picture; the first square is (-1, -1)."""
+    """Column and row of the board's square at a place of the image; the first square is (-1, -1)."""
     over = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     a = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / over + (columns - 1) / 2
     b = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / over + (rows - 1) / 2

@@ -1,6 +1,6 @@
-"""Pictures of a board in recorded clips, and where its corners are.
+"""Images of a board in recorded clips, and where its corners are.
 
-A picture is the count of a window of ticks that all cameras share (TFP). A board that moves during the window is
+An image is the count of a window of ticks that all cameras share (TFP). A board that moves during the window is
 blurred along its path, in every camera around the same instant, and its corners are found in the middle of the blur.
 """
 
@@ -70,7 +70,7 @@ def choose_views(recordings: Sequence[BoardRecording], n: int, window_ticks: int
     return views
 
 
-def picture(recording: BoardRecording, camera: str, view: View) -> Float32 | None:
+def make_image(recording: BoardRecording, camera: str, view: View) -> Float32 | None:
     """Spikes per tick [H, W] of a camera in a view; None where the recording lacks some of its ticks."""
     stream = recording.streams[camera]
     if any(gap.first_tick < view.stop and view.start < gap.stop_tick for gap in stream.gaps):
@@ -91,10 +91,10 @@ def common_cameras(recordings: Sequence[BoardRecording]) -> tuple[tuple[str, ...
 def find_all(
     recordings: Sequence[BoardRecording], names: Sequence[str], views: Sequence[View], board: Board
 ) -> BoardViews:
-    """The board in every picture where it is seen whole. Raises UserError where there is none."""
+    """The board in every image where it is seen whole. Raises UserError where there is none."""
 
     def look(c: int, v: int) -> Float64 | None:
-        image = picture(recordings[views[v].recording], names[c], views[v])
+        image = make_image(recordings[views[v].recording], names[c], views[v])
         return None if image is None else find_corners(image, board)
 
     pairs = [(c, v) for v in range(len(views)) for c in range(len(names))]
@@ -103,7 +103,7 @@ def find_all(
     seen = [(c, v, uv) for (c, v), uv in zip(pairs, found, strict=True) if uv is not None]
     if not seen:
         fix = "check --columns and --rows (inner corners), the light, and that the board is seen whole"
-        raise problem("board", f"{board.columns} x {board.rows} corners in some picture", "none", fix)
+        raise problem("board", f"{board.columns} x {board.rows} corners in some image", "none", fix)
     kept, view = np.unique([s[1] for s in seen], return_inverse=True)
     camera, uv = np.array([s[0] for s in seen]), np.stack([s[2] for s in seen])
     return BoardViews(tuple(views[v] for v in kept), Sightings(camera, view, uv, np.ones(uv.shape[:2], bool)))

@@ -27,7 +27,7 @@ _PER_CAMERA = 9  # w, v, focal length, principal point
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """S pictures in which the board was found: by which camera, in which view (a moment that all cameras share)."""
+    """S images in which the board was found: by which camera, in which view (a moment that all cameras share)."""
 
     camera: Int64  # [S]
     view: Int64  # [S]
@@ -51,7 +51,7 @@ class Rig:
     board_t: Float64  # [T, 3]
 
     def residuals(self, s: Sightings, points: Float64) -> Float64:
-        """Where the board's points [N, 3] should be in the pictures, minus where they were found [S, N, 2], px."""
+        """Where the board's points [N, 3] should be in the images, minus where they were found [S, N, 2], px."""
         turned, world = self.turned(s, points)
         x = turned + self.t[s.camera][:, None]
         seen = self.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + self.middle[s.camera][:, None]

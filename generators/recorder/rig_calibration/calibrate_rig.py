@@ -24,8 +24,8 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
     choose_views,
     common_cameras,
     find_all,
+    make_image,
     open_recording,
-    picture,
 )
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Adjusted,
@@ -134,10 +134,10 @@ def calibrate_rig(
         rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
         square_m: Side of a square in metres; it sets the scale of everything.
         views: Moments to look at, in all clips together.
-        window_ticks: Ticks that a picture adds up: more is less noise and more motion blur.
+        window_ticks: Ticks that an image adds up: more is less noise and more motion blur.
         shared_focal: One focal length for all cameras.
-        centered: Principal points stay in the middle of the picture.
-        allow_gaps: Use clips with gaps; pictures with missing ticks are left out.
+        centered: Principal points stay in the middle of the image.
+        allow_gaps: Use clips with gaps; images with missing ticks are left out.
     """
     if not clips:
         raise problem("calibrate-rig", "one or more clips", "none", "record the board with `spike4dgs record`")
@@ -157,7 +157,7 @@ def calibrate_rig(
     write_json(out / "report.json", report)
     _draw(recordings, seen, found, out / "corners.png")
     _print(report)
-    print(f"calibration, report and picture: {out}")
+    print(f"calibration, report and image: {out}")
     return 0
 
 
@@ -212,7 +212,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _draw(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCalibration, path: Path) -> None:
-    """Each camera's picture in the view that most cameras saw, with its corners; small, the corners of all views."""
+    """Each camera's image in the view that most cameras saw, with its corners; small, the corners of all views."""
     from matplotlib.figure import Figure
 
     s = found.sightings
@@ -225,7 +225,7 @@ def _draw(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCa
         if c >= len(found.cameras):
             continue
         name = found.cameras[c].id
-        image = picture(recordings[seen.views[best].recording], name, seen.views[best])
+        image = make_image(recordings[seen.views[best].recording], name, seen.views[best])
         if image is not None:
             axes.imshow(image, cmap="gray", extent=(0, image.shape[1], image.shape[0], 0))
         mine = s.of(s.camera == c)

@@ -82,7 +82,7 @@ def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
         for s in (-1, 1)
     ]
     return (
-        Part(skin, Material(_body_picture(plumage, rng))),
+        Part(skin, Material(_body_image(plumage, rng))),
         Part(beak, Material((0.75, 0.42, 0.04), 0.2)),
         Part(merge(eyes), Material((0.01, 0.01, 0.012), 0.06)),
         Part(merge(glints), Material((0.9, 0.9, 0.9))),
@@ -150,20 +150,20 @@ def tail_points(beat: Beat, t_s: float) -> np.ndarray:
     return np.stack([x, y, z], -1).reshape(-1, 3)
 
 
-def _body_picture(plumage: Plumage, rng: np.random.Generator) -> np.ndarray:
+def _body_image(plumage: Plumage, rng: np.random.Generator) -> np.ndarray:
     """u runs from tail to head (columns), v around it from the back (rows, 0 and 1 are the back)."""
     h, w = 128, 256
     v, u = np.mgrid[:h, :w] / np.array([h, w]).reshape(2, 1, 1)
     belly = np.clip((np.abs(v - 0.5) < 0.21 + 0.05 * np.sin(9 * u)) * 1.0, 0, 1)
     belly *= (u < 0.90) & (u > 0.08)
-    picture = mix(belly, plumage.back, plumage.breast)
+    image = mix(belly, plumage.back, plumage.breast)
     mask = (np.abs(np.abs(v - 0.5) - 0.27) < 0.045) & (u > 0.74) & (u < 0.97)
-    picture[mask] = (0.03, 0.03, 0.04)
+    image[mask] = (0.03, 0.03, 0.04)
     cheek = (np.abs(np.abs(v - 0.5) - 0.19) < 0.035) & (u > 0.70) & (u < 0.92)
-    picture[cheek] = plumage.bar
+    image[cheek] = plumage.bar
     scales = 0.80 + 0.30 * (np.sin(2 * np.pi * 26 * u + 2 * np.sin(2 * np.pi * 12 * v)) > 0.2)
     grain = 0.85 + 0.3 * fractal((h, w), rng, 12, 1)
-    return np.asarray((picture * (scales * grain)[..., None]).astype(np.float32))
+    return np.asarray((image * (scales * grain)[..., None]).astype(np.float32))
 
 
 def _feathers(plumage: Plumage, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -178,4 +178,4 @@ def _feathers(plumage: Plumage, count: int, rng: np.random.Generator) -> np.ndar
         c.line([(x, 0.38), (x, 0.98)], 0.018, plumage.bar, 0.8)
         c.line([(x + 1.5 / count, 0.40), (x + 1.5 / count, 1.0)], 0.035, (0.02, 0.02, 0.03), 0.9)
         c.ellipse(x, 0.16, 0.09, 0.06, tuple(1.3 * v for v in plumage.back), 0.7)
-    return np.asarray(c.picture * (0.82 + 0.30 * fractal((h, w), rng, 8, 1))[..., None])
+    return np.asarray(c.image * (0.82 + 0.30 * fractal((h, w), rng, 8, 1))[..., None])

@@ -50,7 +50,7 @@ def _posters(rng: np.random.Generator) -> dict[str, Part]:
         c.text(words, 0.21, 0.14, 0.065, INK[k])
         for j in range(5):
             c.rectangle(0.04, 0.215 + 0.015 * j, 0.04 + rng.uniform(0.15, 0.33), 0.222 + 0.015 * j, (0.08, 0.08, 0.1))
-        parts[f"poster{k}"] = Part(quad((x, 0.795, 0.26), (0.44, 0, 0), (0, 0, 0.31)), Material(c.picture))
+        parts[f"poster{k}"] = Part(quad((x, 0.795, 0.26), (0.44, 0, 0), (0, 0, 0.31)), Material(c.image))
     return parts
 
 
@@ -64,9 +64,7 @@ def _desk_things(rng: np.random.Generator) -> dict[str, Part]:
         spine.rectangle(0, 0.06, 0.25, 0.09, (0.80, 0.75, 0.6))
         spine.rectangle(0, 0.91, 0.25, 0.94, (0.80, 0.75, 0.6))
         spine.text(title, 0.125, 0.5, 0.12, (0.85, 0.82, 0.72), turn_deg=90)
-        books[f"book{k}"] = Part(
-            box((thick, 0.16, tall), (x + thick / 2, 0.60, tall / 2)), Material(spine.picture, 0.2)
-        )
+        books[f"book{k}"] = Part(box((thick, 0.16, tall), (x + thick / 2, 0.60, tall / 2)), Material(spine.image, 0.2))
         x += thick + 0.003
     mug = revolve(np.array([(0.0, 0.006), (0.045, 0.006), (0.047, 0.1), (0.05, 0.1), (0.05, 0.0), (0.0, 0.0)]), 40)
     a = np.linspace(-1.3, 1.3, 12)
@@ -102,8 +100,8 @@ def _desk_things(rng: np.random.Generator) -> dict[str, Part]:
             Material(beach, 0.12),
         ),
         "stack": Part(merge(stack), Material(wood((48, 96), rng, 3), 0.3)),
-        "sheet": Part(quad((-0.50, -0.36, 0.001), (0.29, 0.06, 0), (-0.04, 0.20, 0)), Material(sheet.picture)),
-        "ruler": Part(quad((0.50, -0.36, 0.002), (0.30, 0.10, 0), (-0.008, 0.024, 0)), Material(ruler.picture, 0.2)),
+        "sheet": Part(quad((-0.50, -0.36, 0.001), (0.29, 0.06, 0), (-0.04, 0.20, 0)), Material(sheet.image)),
+        "ruler": Part(quad((0.50, -0.36, 0.002), (0.30, 0.10, 0), (-0.008, 0.024, 0)), Material(ruler.image, 0.2)),
         "die": Part(
             box((0.05, 0.05, 0.05), (0, 0, 0.025)).moved(translation(0.36, -0.52, 0) @ rotation("z", 0.5)),
             Material(_die()),
@@ -115,4 +113,4 @@ def _die() -> np.ndarray:
     c = Canvas(plain((48, 48), (0.80, 0.78, 0.72)), 48)
     for x, y in ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75)):
         c.ellipse(x, y, 0.1, 0.1, (0.5, 0.05, 0.05))
-    return c.picture
+    return c.image

@@ -144,15 +144,15 @@ def _torso(clothes: Clothes, jacket: np.ndarray) -> tuple[Part, ...]:
     )
     a = np.linspace(0, 2 * np.pi, 28, endpoint=False)
     rings = np.stack([np.stack([d * np.cos(a), w * np.sin(a), 0 * a + z], 1) for z, d, w in profile])
-    picture = np.repeat(jacket, 2, 0)
-    c = Canvas(picture, 128)
+    image = np.repeat(jacket, 2, 0)
+    c = Canvas(image, 128)
     c.rectangle(0.0, 0.0, 1.0, 0.28, tuple(0.5 * v for v in clothes.trousers))  # the belt line and below
     if clothes.number:
         for x in (0.5, 0.0, 1.0):
             c.ellipse(x, 0.66, 0.10, 0.20, (0.82, 0.82, 0.80))
             c.text(clothes.number, x, 0.66, 0.20, (0.02, 0.02, 0.02), 90)
     skin = loft(rings)
-    parts = [Part(skin, Material(c.picture))]
+    parts = [Part(skin, Material(c.image))]
     if clothes.bag is not None:
         pack = [
             ellipsoid((0.10, 0.155, 0.20), (-0.19, 0, 0.26), 20),

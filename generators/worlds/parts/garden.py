@@ -29,7 +29,7 @@ def garden(rng: np.random.Generator) -> dict[str, Part]:
         "wall": Part(wall, Material(bricks)),
         "ledge": Part(ledge, Material(paving((64, 64), rng, (32, 64), (0.50, 0.48, 0.44), (0.66, 0.64, 0.60)))),
         "lawn": Part(lawn, Material((0.10, 0.16, 0.05))),
-        "sign": Part(quad((0.02, WALL_Y - 0.01, 0.34), (0.60, 0, 0), (0, 0, 0.275)), Material(sign.picture)),
+        "sign": Part(quad((0.02, WALL_Y - 0.01, 0.34), (0.60, 0, 0), (0, 0, 0.275)), Material(sign.image)),
         **_plants(rng),
         **_things(rng),
     }

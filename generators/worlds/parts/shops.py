@@ -35,11 +35,11 @@ def shops(rng: np.random.Generator) -> dict[str, Part]:
     frames, sills, glass, awnings = [], [], [], []
     for k, (left, right, low, high) in enumerate(walls):
         brick = (6, 14) if k != 1 else (16, 36)
-        picture = paving((512, 512), rng, brick, low, high, (0.5, 0.48, 0.45), spread=0.22)
+        image = paving((512, 512), rng, brick, low, high, (0.5, 0.48, 0.45), spread=0.22)
         wall = quad(
             ((left + right) / 2, FRONT_Y, 4.0), (right - left, 0, 0), (0, 0, 8.0), ((right - left) / 6.5, 8.0 / 6.5)
         )
-        parts[f"wall{k}"] = Part(wall, Material(picture))
+        parts[f"wall{k}"] = Part(wall, Material(image))
         bays = np.linspace(left, right, 3)
         for j, x in enumerate((bays[:-1] + bays[1:]) / 2):
             width = (right - left) / 2 - 1.5
@@ -55,7 +55,7 @@ def shops(rng: np.random.Generator) -> dict[str, Part]:
             )
             board.text(names[k][j], 384 / 220, 24 / 110, 0.26, (0.85, 0.78, 0.50))
             sign = box((3.4, 0.10, 0.44), (x - 0.2, FRONT_Y - 0.06, 3.08))
-            parts[f"board{k}{j}"] = Part(sign, Material(board.picture))
+            parts[f"board{k}{j}"] = Part(sign, Material(board.image))
         parts[f"plinth{k}"] = Part(
             box((right - left, 0.1, 0.45), ((left + right) / 2, FRONT_Y - 0.04, 0.36), 0.4),
             Material(paving((128, 256), rng, (64, 128), (0.25, 0.24, 0.23), (0.40, 0.38, 0.36), gap=2)),
@@ -117,13 +117,13 @@ def _display(rng: np.random.Generator) -> np.ndarray:
             x += w + rng.uniform(0.02, 0.12)
         c.rectangle(0, shelf, 3.6, shelf + 0.04, (0.35, 0.27, 0.18))
     c.polygon([(2.2, 0), (2.7, 0), (1.7, 1.6), (1.2, 1.6)], (0.4, 0.42, 0.45), 0.25)
-    return c.picture
+    return c.image
 
 
 def _pane(rng: np.random.Generator) -> np.ndarray:
     """A first-floor window with curtains."""
     c = Canvas(mix(np.linspace(0, 1, 96)[:, None] * np.ones((1, 66)), (0.12, 0.15, 0.19), (0.03, 0.03, 0.04)), 60)
     folds = cloth((96, 18), rng, [(0.62, 0.58, 0.50), (0.48, 0.44, 0.38)], 3)
-    c.picture[:, :18] = folds
-    c.picture[:, -18:] = folds[:, ::-1]
-    return c.picture
+    c.image[:, :18] = folds
+    c.image[:, -18:] = folds[:, ::-1]
+    return c.image

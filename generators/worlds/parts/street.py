@@ -90,7 +90,7 @@ def _ground(rng: np.random.Generator) -> dict[str, Part]:
     pad = quad((-2.6, ROAD_Y[0] - 0.68, PAVEMENT_Z + 0.005), (2.4, 0, 0), (0, 0.8, 0), (6, 2))
     far_pad = quad((-2.6, ROAD_Y[1] + 0.68, PAVEMENT_Z + 0.005), (2.4, 0, 0), (0, 0.8, 0), (6, 2))
     return {
-        "road": Part(road, Material(_road_picture(rng))),
+        "road": Part(road, Material(_road_image(rng))),
         "pavements": Part(merge(walks), pavers),
         "kerbs": Part(merge(kerbs), granite),
         "tactile": Part(merge([pad, far_pad]), Material(tactile)),
@@ -98,7 +98,7 @@ def _ground(rng: np.random.Generator) -> dict[str, Part]:
     }
 
 
-def _road_picture(rng: np.random.Generator) -> np.ndarray:
+def _road_image(rng: np.random.Generator) -> np.ndarray:
     """Asphalt with everything that is painted on it or let into it."""
     x0, x1 = ROAD_X
     depth = ROAD_Y[1] - ROAD_Y[0]
@@ -128,8 +128,8 @@ def _road_picture(rng: np.random.Generator) -> np.ndarray:
         c.rectangle(*at(x, 5.36), x - x0 + 0.7, ROAD_Y[1] - 5.0, (0.03, 0.03, 0.03))
         for k in np.arange(0.04, 0.7, 0.1):
             c.rectangle(*at(x + k, 5.34), x - x0 + k + 0.05, ROAD_Y[1] - 5.02, (0.30, 0.28, 0.26))
-    wear = fractal(c.picture.shape[:2], rng, 24, 2)[..., None]
-    return c.picture * (0.80 + 0.30 * wear)
+    wear = fractal(c.image.shape[:2], rng, 24, 2)[..., None]
+    return c.image * (0.80 + 0.30 * wear)
 
 
 def _road_marks(c: Canvas, at: Any) -> None:

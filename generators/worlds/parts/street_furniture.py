@@ -83,7 +83,7 @@ def furniture(rng: np.random.Generator) -> dict[str, Part]:
                 np.concatenate([uv, [[0.5, 0.5]]]),
                 False,
             )
-        boards[f"sign{k}"] = Part(face.moved(translation(x, 5.87, 2.35) @ turn), Material(c.picture))
+        boards[f"sign{k}"] = Part(face.moved(translation(x, 5.87, 2.35) @ turn), Material(c.image))
     slats = [box((1.7, 0.09, 0.04), (-2.0 + 9.4, 7.4 + dy, z + 0.45)) for dy in (-0.2, -0.09, 0.02, 0.13)]
     slats += [box((1.7, 0.04, 0.09), (7.4, 7.62, z + h)) for h in (0.62, 0.75, 0.88)]
     legs = [box((0.06, 0.45, 0.45), (7.4 + dx, 7.4, z + 0.22)) for dx in (-0.7, 0.7)]
@@ -119,7 +119,7 @@ def furniture(rng: np.random.Generator) -> dict[str, Part]:
         "bench_legs": Part(merge(legs), Material(DARK)),
         "hydrant": Part(hydrant.at(2.9, 5.95, z), Material((0.65, 0.08, 0.05), 0.15)),
         "bin": Part(bin_.at(-1.1, 7.6, z), Material((0.06, 0.22, 0.12), 0.2)),
-        "letter_box": Part(box((0.5, 0.4, 0.8), (-3.9, 7.9, z + 0.8)), Material(letter.picture)),
+        "letter_box": Part(box((0.5, 0.4, 0.8), (-3.9, 7.9, z + 0.8)), Material(letter.image)),
         "bollards": Part(merge(bollards), Material(stripes)),
         "flower_boxes": Part(
             merge(boxes), Material(paving((96, 96), rng, (12, 96), (0.30, 0.18, 0.10), (0.48, 0.30, 0.18)))

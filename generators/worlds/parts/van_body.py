@@ -80,7 +80,7 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
         Part(merge(tails), Material((0.60, 0.04, 0.03), 0.1)),
         Part(merge([*rails, *cross]), Material((0.10, 0.10, 0.11), 0.2)),
         Part(merge(ladder), Material((0.70, 0.70, 0.68), 0.25)),
-        Part(merge(plates), Material(plate.picture)),
+        Part(merge(plates), Material(plate.image)),
         Part(merge([tyre.at(*w) for w in wheel_positions()]), Material((0.03, 0.03, 0.032))),
     )
 
@@ -156,7 +156,7 @@ def _paint(livery: Livery, rng: np.random.Generator) -> np.ndarray:
     for chart, is_front in (("front", True), ("back", False)):
         _paint_end(c, chart, livery, is_front)
     _paint_top(c, livery)
-    return c.picture
+    return c.image
 
 
 def _paint_side(c: Canvas, chart: str, livery: Livery) -> None:

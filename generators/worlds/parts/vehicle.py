@@ -76,12 +76,12 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
     return (
         Part(shell, Material(_paint_body(livery, rng), 0.12)),
         Part(glasshouse, Material(_paint_cabin(livery), 0.08)),
-        Part(merge([tyre.moved(translation(*w)) for w in wheel_positions()]), Material(_tyre_picture())),
+        Part(merge([tyre.moved(translation(*w)) for w in wheel_positions()]), Material(_tyre_image())),
         Part(merge([floor, *trims]), Material(DARK)),
         Part(merge(lamps), Material((0.85, 0.85, 0.82), 0.08)),
         Part(merge(tails), Material((0.6, 0.03, 0.03), 0.08)),
         Part(merge([*mirrors, aerial]), Material(livery.second, 0.12)),
-        Part(merge(plates), Material(plate.picture)),
+        Part(merge(plates), Material(plate.image)),
     )
 
 
@@ -182,10 +182,10 @@ def _tyre_profile() -> np.ndarray:
 
 
 def _canvas(colour: Colour, rng: np.random.Generator | None = None) -> Canvas:
-    picture = plain(_ATLAS.shape, colour)
+    image = plain(_ATLAS.shape, colour)
     if rng is not None:
-        picture *= (0.92 + 0.14 * fractal(_ATLAS.shape, rng, 64, 4))[..., None]
-    return Canvas(picture, _ATLAS.texels_per_m)
+        image *= (0.92 + 0.14 * fractal(_ATLAS.shape, rng, 64, 4))[..., None]
+    return Canvas(image, _ATLAS.texels_per_m)
 
 
 def _side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
@@ -228,7 +228,7 @@ def _paint_body(livery: Livery, rng: np.random.Generator) -> np.ndarray:
     for chart, grille in (("front", True), ("back", False)):
         x, y = _ATLAS.place(chart, np.array([(0, 0, 0.42)]))[0]
         c.rectangle(x - 0.62, y - 0.07, x + 0.62, y + 0.07, DARK if grille else livery.second)
-    return c.picture
+    return c.image
 
 
 def _paint_bonnet(c: Canvas, livery: Livery, white: Colour) -> None:
@@ -272,10 +272,10 @@ def _paint_cabin(livery: Livery) -> np.ndarray:
     c.ellipse(x, y, 0.33, 0.33, DARK)
     c.ellipse(x, y, 0.31, 0.31, (0.86, 0.86, 0.83))
     c.text(livery.number, x, y, 0.32, (0.02, 0.02, 0.02))
-    return c.picture
+    return c.image
 
 
-def _tyre_picture() -> np.ndarray:
+def _tyre_image() -> np.ndarray:
     """Rows run across the profile (sidewall, tread, sidewall); the same all around."""
     rows = np.full((64, 4), 0.03, np.float32)
     rows[::7] = 0.012

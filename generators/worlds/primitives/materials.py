@@ -18,7 +18,7 @@ class Material:
     """A surface's reflection.
 
     Attributes:
-        albedo: linear RGB in 0..1, one colour or a picture [H, W, 3] whose top row is v = 0.
+        albedo: linear RGB in 0..1, one colour or an image [H, W, 3] whose top row is v = 0.
         gloss: None for a matte surface, else the roughness of a clear coat over the albedo (0.05 polished, 0.3 satin).
         metal: the albedo is the mirror colour of rough metal instead; needs `gloss`.
     """
@@ -39,13 +39,13 @@ class Material:
 
 
 def _texture(albedo: Colour | np.ndarray) -> dict[str, Any]:
-    """A constant colour or a repeating picture, kept inside what real surfaces reflect."""
+    """A constant colour or a repeating image, kept inside what real surfaces reflect."""
     import mitsuba as mi
 
     if not isinstance(albedo, np.ndarray):
         return {"type": "rgb", "value": [float(np.clip(c, 0.0, 0.95)) for c in albedo]}
-    picture = np.ascontiguousarray(np.clip(albedo, 0.01, 0.95), np.float32)
-    return {"type": "bitmap", "bitmap": mi.Bitmap(picture), "filter_type": "bilinear", "wrap_mode": "repeat"}
+    image = np.ascontiguousarray(np.clip(albedo, 0.01, 0.95), np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
 def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:

@@ -1,4 +1,4 @@
-"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the picture.
+"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the image.
 
 Every surface is shaded on both sides, so winding only has to be consistent within one mesh.
 """
@@ -71,7 +71,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 def quad(
     center: Sequence[float], right: Sequence[float], up: Sequence[float], uv_size: Sequence[float] = (1, 1)
 ) -> Mesh:
-    """A parallelogram: `right` and `up` are its full edge vectors; a picture on it stands upright along `up`."""
+    """A parallelogram: `right` and `up` are its full edge vectors; an image on it stands upright along `up`."""
     c, r, u = (np.asarray(a, np.float64) for a in (center, right, up))
     corners = np.array([c - r / 2 - u / 2, c + r / 2 - u / 2, c + r / 2 + u / 2, c - r / 2 + u / 2])
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float64) * np.asarray(uv_size, np.float64)
@@ -81,9 +81,9 @@ def quad(
 def box(
     size: Sequence[float], center: Sequence[float] = (0, 0, 0), uv_per_m: float | None = None, bottom: bool = True
 ) -> Mesh:
-    """A box whose faces each carry the whole picture upright, or `uv_per_m` repeats per metre."""
+    """A box whose faces each carry the whole image upright, or `uv_per_m` repeats per metre."""
     sx, sy, sz = size
-    # (outward direction, picture's right edge, picture's up edge): right x up = outward, so text reads from outside
+    # (outward direction, image's right edge, image's up edge): right x up = outward, so text reads from outside
     faces = [
         ((0, -1, 0), (sx, 0, 0), (0, 0, sz)),
         ((0, 1, 0), (-sx, 0, 0), (0, 0, sz)),
@@ -150,7 +150,7 @@ def tube(path: Sequence[Sequence[float]], radius: float | Sequence[float], sides
 
 
 def disc(radius: float, height: float = 0.0, segments: int = 96) -> Mesh:
-    """A horizontal disc facing up; the picture's inscribed circle lies on it, its top towards +Y."""
+    """A horizontal disc facing up; the image's inscribed circle lies on it, its top towards +Y."""
     a = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     ring = np.stack([radius * np.cos(a), radius * np.sin(a), np.full(segments, height)], 1)
     cap = fan(ring)
@@ -180,15 +180,15 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(length > 1e-12, normal / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 
 
-# ---------------------------------------------------------------- box-projected pictures
+# ---------------------------------------------------------------- box-projected images
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """Five flat pictures in one texture, projected on a body along -y, +y, z, +x and -x.
+    """Five flat images in one texture, projected on a body along -y, +y, z, +x and -x.
 
     `length`, `width`, `height` are the body's extents in metres: x in +-length/2, y in +-width/2, z in 0..height.
-    The pictures lie below each other: near side, far side, top, then front and back next to each other.
+    The images lie below each other: near side, far side, top, then front and back next to each other.
     """
 
     length: float

@@ -1,4 +1,4 @@
-"""Procedural pictures [H, W, 3] float32, linear RGB reflectance, row 0 at the top."""
+"""Procedural images [H, W, 3] float32, linear RGB reflectance, row 0 at the top."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ def mix(amount: np.ndarray, low: Colour, high: Colour) -> np.ndarray:
 
 def asphalt(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Road surface: worn patches, grain and single light and dark stones."""
-    picture = mix(fractal(shape, rng, 160, 4), (0.085, 0.085, 0.09), (0.19, 0.185, 0.18))
+    image = mix(fractal(shape, rng, 160, 4), (0.085, 0.085, 0.09), (0.19, 0.185, 0.18))
     grain = rng.random(shape, dtype=np.float32)
-    picture *= (0.75 + 0.5 * grain)[..., None]
+    image *= (0.75 + 0.5 * grain)[..., None]
     stones = rng.random(shape, dtype=np.float32)
-    picture[stones > 0.975] = (0.36, 0.35, 0.33)
-    picture[stones < 0.02] *= 0.4
-    return picture
+    image[stones > 0.975] = (0.36, 0.35, 0.33)
+    image[stones < 0.02] *= 0.4
+    return image
 
 
 def paving(
@@ -81,13 +81,13 @@ def paving(
     row = y // stone[0]
     x = x + (row % 2) * (stone[1] // 2)
     tone = rng.uniform(1 - spread, 1 + spread, (height // stone[0] + 1, width // stone[1] + 2)).astype(np.float32)
-    picture = mix(fractal(shape, rng, 64, 2), low, high) * tone[row, x // stone[1]][..., None]
-    picture[(y % stone[0] < gap) | (x % stone[1] < gap)] = joint
-    return picture
+    image = mix(fractal(shape, rng, 64, 2), low, high) * tone[row, x // stone[1]][..., None]
+    image[(y % stone[0] < gap) | (x % stone[1] < gap)] = joint
+    return image
 
 
 def wood(shape: tuple[int, int], rng: np.random.Generator, planks: int = 6) -> np.ndarray:
-    """Planks along the picture's rows with grain, knots and dark joints."""
+    """Planks along the image's rows with grain, knots and dark joints."""
     height, width = shape
     plank = np.arange(height) * planks // height
     stretch = fractal((height, max(width // 8, 2)), rng, height / 4, 2)
@@ -95,19 +95,19 @@ def wood(shape: tuple[int, int], rng: np.random.Generator, planks: int = 6) -> n
     shift = rng.uniform(0, 10, planks)[plank][:, None]
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * (grain * 7 + shift + np.arange(width) / width * 0.7))
     amount = 0.55 * rings.astype(np.float32) + 0.25 * grain + 0.2 * value_noise(shape, 2, rng)
-    picture = mix(amount, (0.23, 0.12, 0.055), (0.52, 0.33, 0.18))
-    picture *= rng.uniform(0.78, 1.2, planks).astype(np.float32)[plank][:, None, None]
+    image = mix(amount, (0.23, 0.12, 0.055), (0.52, 0.33, 0.18))
+    image *= rng.uniform(0.78, 1.2, planks).astype(np.float32)[plank][:, None, None]
     joint = np.flatnonzero(np.diff(plank))
-    picture[joint] *= 0.25
-    picture[joint + 1] *= 0.45
-    return picture
+    image[joint] *= 0.25
+    image[joint + 1] *= 0.45
+    return image
 
 
 def cloth(shape: tuple[int, int], rng: np.random.Generator, colours: Sequence[Colour], stripe: int) -> np.ndarray:
     """Vertical stripes of `stripe` pixels with a woven grain."""
     index = np.arange(shape[1]) // stripe % len(colours)
-    picture = np.broadcast_to(np.asarray(colours, np.float32)[index], (*shape, 3))
-    return picture * (0.75 + 0.4 * fractal(shape, rng, 24, 2))[..., None]
+    image = np.broadcast_to(np.asarray(colours, np.float32)[index], (*shape, 3))
+    return image * (0.75 + 0.4 * fractal(shape, rng, 24, 2))[..., None]
 
 
 # ---------------------------------------------------------------- drawing
@@ -123,15 +123,15 @@ def _font(pixels: int) -> ImageFont.FreeTypeFont:
 
 
 class Canvas:
-    """Draws on a picture in metres: x to the right, y down, the origin in the top left corner.
+    """Draws on an image in metres: x to the right, y down, the origin in the top left corner.
 
     Shapes are drawn four times finer and averaged, and blended in linear light.
     """
 
     FINE = 4
 
-    def __init__(self, picture: np.ndarray, texels_per_m: float) -> None:
-        self.picture = np.array(picture, np.float32)  # [H, W, 3]
+    def __init__(self, image: np.ndarray, texels_per_m: float) -> None:
+        self.image = np.array(image, np.float32)  # [H, W, 3]
         self.scale = float(texels_per_m)
 
     def polygon(self, points: Sequence[Sequence[float]] | np.ndarray, colour: Colour, opacity: float = 1.0) -> None:
@@ -195,11 +195,11 @@ class Canvas:
         h, w = fine.shape[0] // self.FINE, fine.shape[1] // self.FINE
         cover = fine.reshape(h, self.FINE, w, self.FINE).mean((1, 3)) * np.float32(opacity)
         y0, x0 = max(lo[1], 0), max(lo[0], 0)
-        y1, x1 = min(lo[1] + h, self.picture.shape[0]), min(lo[0] + w, self.picture.shape[1])
+        y1, x1 = min(lo[1] + h, self.image.shape[0]), min(lo[0] + w, self.image.shape[1])
         if y1 <= y0 or x1 <= x0:
             return
         cover = cover[y0 - lo[1] : y1 - lo[1], x0 - lo[0] : x1 - lo[0], None]
-        area = self.picture[y0:y1, x0:x1]
+        area = self.image[y0:y1, x0:x1]
         area += cover * (np.asarray(colour, np.float32) - area)
 
 

@@ -50,7 +50,7 @@ def plot_curves(path: Path, losses: Sequence[Row], scores: Sequence[Row]) -> Non
 
     figure = Figure(figsize=(13, 7), layout="constrained")
     panels = (
-        (losses, ("image_l1",), "L1 of pictures (radiance)", True),
+        (losses, ("image_l1",), "L1 of images (radiance)", True),
         (losses, ("points",), "loss of points", False),
         (scores, ("psnr_db", "tfp_psnr_db", "psnr_dynamic_db", "tfp_psnr_dynamic_db"), "PSNR, hidden (dB)", False),
         (scores, ("point_error", "point_error_median", "point_error_confident"), "error of points, hidden", True),

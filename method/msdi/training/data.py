@@ -1,4 +1,4 @@
-"""What MSDI learns from: batches of windows of spikes with their pictures, points and cameras, drawn from bursts.
+"""What MSDI learns from: batches of windows of spikes with their images, points and cameras, drawn from bursts.
 
 Everything that can vary without another rendering is drawn anew at every use: which views, in which order (the first
 one's frame is that of the points), the sensors' noise, phases and maps, the brightness, the direction of time, and
@@ -38,7 +38,7 @@ class Batch:
 
 
 class Bursts:
-    """The bursts of several files, which share one sensor, numbered within groups of one picture size.
+    """The bursts of several files, which share one sensor, numbered within groups of one image size.
 
     Raises UserError for no files, and for files of several radiance gains.
     """
@@ -60,7 +60,7 @@ class Bursts:
         return sum(map(len, self._groups.values()))
 
     def draw(self, samples: int, views: int, ticks: int, rng: np.random.Generator) -> Batch:
-        """A batch of randomly chosen and varied bursts, all of one picture size."""
+        """A batch of randomly chosen and varied bursts, all of one image size."""
         groups = list(self._groups.values())
         shares = np.array([len(g) for g in groups]) / len(self)
         group = groups[int(rng.choice(len(groups), p=shares))]
@@ -112,8 +112,8 @@ def check_ticks(ticks: int) -> None:
 def chosen(burst: Burst, views: NDArray[np.int64]) -> Burst:
     """Some views of a burst, in this order."""
     b = burst
-    pictures = b.keys[:, views], b.depth[views], b.moving[views]
-    return Burst(*pictures, w2c=b.w2c[views], K=b.K[views], gain=b.gain[views], dark=b.dark[views])
+    images = b.keys[:, views], b.depth[views], b.moving[views]
+    return Burst(*images, w2c=b.w2c[views], K=b.K[views], gain=b.gain[views], dark=b.dark[views])
 
 
 def varied(burst: Burst, rng: np.random.Generator) -> Burst:
@@ -132,8 +132,8 @@ def mirrored(burst: Burst) -> Burst:
     width = burst.depth.shape[-1]
     K = burst.K.copy()
     K[:, 0, 2] = width - K[:, 0, 2]
-    pictures = {name: getattr(burst, name)[..., ::-1] for name in ("keys", "depth", "moving", "gain", "dark")}
-    return replace(burst, K=K, w2c=_MIRROR @ burst.w2c @ _MIRROR, **pictures)
+    images = {name: getattr(burst, name)[..., ::-1] for name in ("keys", "depth", "moving", "gain", "dark")}
+    return replace(burst, K=K, w2c=_MIRROR @ burst.w2c @ _MIRROR, **images)
 
 
 def points_of(depth: Float32, K: Float64, w2c: Float64) -> Float32:

@@ -1,8 +1,8 @@
-"""How good MSDI is on data that it was not trained on: pictures, points, confidence and poses, each against the truth.
+"""How good MSDI is on data that it was not trained on: images, points, confidence and poses, each against the truth.
 
 Names and units of `Scores.measured`:
 
-- `psnr_db`, `psnr_dynamic_db`: of the pictures, mean over views; `raw_...`: of those without knowledge of the sensors;
+- `psnr_db`, `psnr_dynamic_db`: of the images, mean over views; `raw_...`: of those without knowledge of the sensors;
   `tfp_...`: of the mean of the same window's spikes, as they are; `tfp_flat_...`: corrected for the sensors.
 - `point_error`, `point_error_median`: |X / z - Xgt / zgt| of all pixels that see something, z the mean distance of a
   sample's points; so 0.1 is a tenth of the scene's size. `point_error_confident`: of the half that is most certain.
@@ -60,7 +60,7 @@ def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
             )
             found = network(spikes, intrinsics, Sensors(sensitivity, dark))
             raw = network.images(spikes.flatten(0, 1)).unflatten(0, spikes.shape[:2])
-            pictures += _pictures(found.images, raw, batch)
+            pictures += _images(found.images, raw, batch)
             points.append(_point_errors(found, batch))
             poses += _pose_errors(found, batch)
     network.train(was_training)
@@ -95,7 +95,7 @@ def tfp(spikes: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(spikes[..., :-1, :, :].mean(axis=-3), np.float32)
 
 
-def _pictures(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float]]:
+def _images(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float]]:
     """Scores of each view."""
     mean = tfp(batch.spikes)
     flat = (mean - batch.dark) / batch.sensitivity
@@ -104,8 +104,8 @@ def _pictures(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float
     for b, v in np.ndindex(batch.rate.shape[:2]):
         row = {}
         for prefix, rates in made.items():
-            truth, picture = batch.rate[b, v] / batch.gain, rates[b, v] / batch.gain
-            pair = ImagePair(truth, picture, batch.moving[b, v], f"sample {b}, view {v}")
+            truth, image = batch.rate[b, v] / batch.gain, rates[b, v] / batch.gain
+            pair = ImagePair(truth, image, batch.moving[b, v], f"sample {b}, view {v}")
             for name in ("psnr", "psnr_dynamic"):
                 if (value := METRICS[name].measure(pair)) is not None:
                     row[f"{prefix}{name}_db"] = value

@@ -11,12 +11,12 @@ from spike4dgs.method.msdi.training.settings import TrainingSettings
 from spike4dgs.method.msdi.weights import VARIABLE, Card
 
 _ROWS = {  # name in `evaluate` -> what the card says
-    "psnr_db": "pictures, sensors known: PSNR (dB)",
-    "raw_psnr_db": "pictures, sensors unknown: PSNR (dB)",
+    "psnr_db": "images, sensors known: PSNR (dB)",
+    "raw_psnr_db": "images, sensors unknown: PSNR (dB)",
     "tfp_psnr_db": "the mean of the same spikes (tfp): PSNR (dB)",
     "tfp_flat_psnr_db": "tfp, corrected for the sensors: PSNR (dB)",
-    "psnr_dynamic_db": "pictures, sensors known, moving region: PSNR (dB)",
-    "raw_psnr_dynamic_db": "pictures, sensors unknown, moving region: PSNR (dB)",
+    "psnr_dynamic_db": "images, sensors known, moving region: PSNR (dB)",
+    "raw_psnr_dynamic_db": "images, sensors unknown, moving region: PSNR (dB)",
     "tfp_psnr_dynamic_db": "tfp, moving region: PSNR (dB)",
     "tfp_flat_psnr_dynamic_db": "tfp, corrected, moving region: PSNR (dB)",
     "point_error": "points: mean error, in mean distances of a sample",
@@ -43,7 +43,7 @@ def model_card(card: Card, settings: TrainingSettings, sha256: str) -> str:
     command += f" --rate {settings.rate:g} --seed {card.seed}"
     return f"""# Model card: MSDI, configuration `{card.config}`
 
-From {config.ticks} ticks of spikes of two cameras or more: a picture of each, the point that each pixel sees in the
+From {config.ticks} ticks of spikes of two cameras or more: an image of each, the point that each pixel sees in the
 first camera's frame, with a confidence, and by PnP the cameras' poses. Weights of step {card.steps}, as half floats,
 sha256 `{sha256}`; `{VARIABLE}=FILE` uses other weights of the same format.
 
@@ -64,7 +64,7 @@ expected against true errors, `curves.png` the training.
   and direction of time, and half of the time in a mirror.
 - Loss: L1 of radiance for extractor and generator, DUSt3R's confidence-weighted regression of points for the rest.
 - {card.steps} steps of {settings.views} views in all, 2 to {settings.most_views} of a sample; Adam at {settings.rate:g}
-  ({settings.picture_rate:g} for extractor and generator) after {settings.warm_up} steps of warm-up, falling to 0 with
+  ({settings.image_rate:g} for extractor and generator) after {settings.warm_up} steps of warm-up, falling to 0 with
   the cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
   {settings.unknown_share:.0%} of the steps the intrinsics are not told, in {settings.raw_share:.0%} the sensors.
 - Commit {harness()["commit"] or "unknown"}. Commands:

@@ -17,7 +17,7 @@ class TrainingSettings:
     views: int = 8  # of a step: samples times views of a sample
     most_views: int = 8  # of a sample; at least two
     rate: float = PUBLISHED["rate"]  # Adam's, after the warm-up; it falls to nothing with the cosine
-    picture_rate: float = 1e-3  # the same of extractor and generator, which are small
+    image_rate: float = 1e-3  # the same of extractor and generator, which are small
     warm_up: int = 500  # steps
     unknown_share: float = 0.2  # of the steps do not tell the intrinsics
     raw_share: float = 0.2  # of the steps do not tell the sensors
@@ -25,5 +25,5 @@ class TrainingSettings:
 
     def rates(self, step: int) -> dict[str, float]:
         """Adam's learning rates of the two groups at a step."""
-        peaks = {"pictures": self.picture_rate, "points": self.rate}
+        peaks = {"images": self.image_rate, "points": self.rate}
         return {name: WarmCosine(peak, self.warm_up, self.steps).at(step) for name, peak in peaks.items()}

@@ -1,9 +1,9 @@
-"""Spikes made on the fly from a burst's pictures: the sensor of the simulated cameras, for a window of ticks.
+"""Spikes made on the fly from a burst's images: the sensor of the simulated cameras, for a window of ticks.
 
 In every tick a pixel gains gain * (spikes per tick that its radiance asks for) + dark, in thresholds, at most what a
 spike can take; at charge 1 it fires and loses 1 + g / sqrt(photons), g standard normal; what is left is kept. A pixel's
-charge before the window is uniform. The scenes' simulator (integer charge, cubic curve between pictures) is the exact
-twin; here charge is float64 and radiance linear between pictures, in which no tick spans two pieces.
+charge before the window is uniform. The scenes' simulator (integer charge, cubic curve between images) is the exact
+twin; here charge is float64 and radiance linear between images, in which no tick spans two pieces.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def fire(pixels: Pixels, ticks: int, charge: Float32, rng: np.random.Generator) 
 def _integrate(
     rates: Any, gain: Any, dark: Any, charge: Any, deviates: Any, starts: Any, most: float, first: int, spikes: Any
 ) -> None:
-    """Fill spikes [T, N] of ticks first, first + 1, ... after the first of the pictures rates [k, N]."""
+    """Fill spikes [T, N] of ticks first, first + 1, ... after the first of the images rates [k, N]."""
     count, n = rates.shape
     spacing = 2 * REACH // (count - 1)
     for p in range(n):

@@ -1,6 +1,6 @@
 """Train MSDI on training bursts: `train-msdi`.
 
-Loss: L1 of the pictures in radiance, which teaches extractor and generator, and DUSt3R's confidence-weighted regression
+Loss: L1 of the images in radiance, which teaches extractor and generator, and DUSt3R's confidence-weighted regression
 of points (`losses`), which teaches everything behind them. Each step has a
 fixed number of views: few samples of many views, or many of few.
 
@@ -66,7 +66,7 @@ class Training:
         pictures: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
         own = {id(p) for p in pictures}
         points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
-        self.adam = make_adam({"pictures": pictures, "points": points}, (0.9, 0.999))
+        self.adam = make_adam({"images": pictures, "points": points}, (0.9, 0.999))
         self.step = 0
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
 

@@ -89,7 +89,7 @@ def test_few_points_are_replaced_by_a_plane_sweep_with_the_estimated_cameras(mon
         assert (len(start.points) > 500) == (count < module.MIN_POINTS)
 
 
-def test_points_of_corrected_pictures_come_from_a_plane_sweep_at_the_estimated_poses() -> None:
+def test_points_of_corrected_images_come_from_a_plane_sweep_at_the_estimated_poses() -> None:
     scene = WORLD.training
     start = colmap_flat(scene, 0)
     summary = pose_errors(start.cameras, scene.cameras).summary()
@@ -120,14 +120,14 @@ class UnevenWorld(ToyWorld):
         return Recordings(*streams, 0.7)
 
 
-def test_features_are_sought_in_pictures_without_the_pixels_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_are_sought_in_images_without_the_pixels_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
     world, even = (kind(width=120, height=76, n_ticks=96, travel=0.0, seed=1) for kind in (UnevenWorld, ToyWorld))
     scene = replace(world.training, recordings=tuple(world.recordings(c) for c in world.training.cameras))
     seen: list[NDArray[np.float32]] = []
 
-    def watched(scene: TrainingScene, pictures: NDArray[np.float32], seed: int, *, calibrated: bool) -> Mapping:
-        seen.append(pictures)
-        return map_views(scene, pictures, seed, calibrated=calibrated)
+    def watched(scene: TrainingScene, images: NDArray[np.float32], seed: int, *, calibrated: bool) -> Mapping:
+        seen.append(images)
+        return map_views(scene, images, seed, calibrated=calibrated)
 
     monkeypatch.setattr(module, "map_views", watched)
     assert len(colmap_flat(scene, 0).cameras) == 8

@@ -72,20 +72,20 @@ def test_rotation_equals_a_loop_over_pairs_and_depends_on_differences_of_places(
 def test_network_gives_points_and_confidence_per_pixel_also_for_odd_counts_of_patches() -> None:
     network = tiny()
     for size in ((48, 80), (32, 64)):
-        pictures = torch.randn(2, 3, *size)
-        tokens = network.encode(pictures)
+        images = torch.randn(2, 3, *size)
+        tokens = network.encode(images)
         assert tokens.shape == (2, size[0] * size[1] // 256, 32)
-        for points, confidence in network.decode(tokens[:1], tokens[1:], pictures[:1]):
+        for points, confidence in network.decode(tokens[:1], tokens[1:], images[:1]):
             assert points.shape == (1, *size, 3) and confidence.shape == (1, *size)
             assert torch.isfinite(points).all() and (confidence > 1).all()
 
 
-def test_both_decoders_see_the_other_picture_and_have_weights_of_their_own() -> None:
-    network, pictures = tiny(), torch.randn(3, 3, 32, 48)
-    tokens = network.encode(pictures)
-    (a1, _), (b1, _) = network.decode(tokens[:1], tokens[1:2], pictures[:1])
-    (a2, _), (b2, _) = network.decode(tokens[:1], tokens[2:], pictures[:1])
-    (swapped, _), _ = network.decode(tokens[1:2], tokens[:1], pictures[:1])
+def test_both_decoders_see_the_other_image_and_have_weights_of_their_own() -> None:
+    network, images = tiny(), torch.randn(3, 3, 32, 48)
+    tokens = network.encode(images)
+    (a1, _), (b1, _) = network.decode(tokens[:1], tokens[1:2], images[:1])
+    (a2, _), (b2, _) = network.decode(tokens[:1], tokens[2:], images[:1])
+    (swapped, _), _ = network.decode(tokens[1:2], tokens[:1], images[:1])
     assert not torch.allclose(a1, a2) and not torch.allclose(b1, b2) and not torch.allclose(swapped, b1)
 
 
@@ -107,10 +107,10 @@ def test_weights_load_by_their_published_names(tmp_path: Path) -> None:
     network = tiny(1)
     save_file({k: v.clone() for k, v in published(network.state_dict()).items()}, tmp_path / "model.safetensors")
     loaded = load_dust3r(tmp_path / "model.safetensors", TINY)
-    pictures = torch.randn(2, 3, 32, 48)
-    tokens = network.encode(pictures)
-    assert torch.equal(loaded.encode(pictures), tokens)
-    results = (n.decode(tokens[:1], tokens[1:], pictures) for n in (loaded, network))
+    images = torch.randn(2, 3, 32, 48)
+    tokens = network.encode(images)
+    assert torch.equal(loaded.encode(images), tokens)
+    results = (n.decode(tokens[:1], tokens[1:], images) for n in (loaded, network))
     for a, b in zip(*results, strict=True):
         assert torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
     assert set(canonical({"dpt.act_2_postprocess.0.bias": torch.zeros(1)})) == {"dpt.act_postprocess.1.0.bias"}
@@ -218,13 +218,13 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(
     assert np.corrcoef(start.values[inside], image[v, u])[0, 1] > 0.8
 
 
-def test_pictures_reach_the_network_in_its_range() -> None:
+def test_images_reach_the_network_in_its_range() -> None:
     class Recorder(Dust3r):
         seen: list[Tensor] = []
 
-        def encode(self, pictures: Tensor) -> Tensor:
-            self.seen.append(pictures)
-            return super().encode(pictures)
+        def encode(self, images: Tensor) -> Tensor:
+            self.seen.append(images)
+            return super().encode(images)
 
     shown = np.linspace(0, 1, 2 * 32 * 48, dtype=np.float32).reshape(2, 32, 48)
     pair = predictor(Recorder(TINY).eval(), shown)(1)

@@ -74,7 +74,7 @@ def near_edge(board: np.ndarray) -> np.ndarray:
 
 
 def test_holes_of_the_matched_points_take_the_networks(perfect: Glance) -> None:
-    """A network that is right but for a line through its inverse depths, and matches of one half of the picture."""
+    """A network that is right but for a line through its inverse depths, and matches of one half of the image."""
     camera = SCENE.cameras[0]
     _, truth, board = WORLD.look(camera, 0.5)
     v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
@@ -188,7 +188,7 @@ def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_network_in_use_looks_at_the_middle_of_the_clip(drawn: Path) -> None:
     glance = look(SCENE, calibrated=True)
-    assert glance.factor == 1 and glance.points.shape == (8, 61, 96, 3) and glance.pictures.shape == (8, 61, 96)
+    assert glance.factor == 1 and glance.points.shape == (8, 61, 96, 3) and glance.images.shape == (8, 61, 96)
     assert np.isfinite(glance.points).all() and (glance.confidence > 1).all()
 
 
@@ -202,7 +202,7 @@ def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path)
         assert np.array_equal(a, b) != calibrated
 
 
-def test_pictures_are_the_networks_and_know_the_camera(drawn: Path) -> None:
+def test_images_are_the_networks_and_know_the_camera(drawn: Path) -> None:
     stream, maker = SCENE.streams[0], IMAGES["msdi"]
     plain = maker(stream, [40], GAIN)
     even = Calibration(np.ones((61, 96), np.float32), np.zeros((61, 96), np.float32), GAIN)

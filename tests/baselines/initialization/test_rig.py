@@ -20,7 +20,7 @@ WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
 
 
 def still(world: ToyWorld) -> tuple[np.ndarray, np.ndarray]:
-    """Noise-free pictures and depths of all cameras at the middle of the clip."""
+    """Noise-free images and depths of all cameras at the middle of the clip."""
     seen = [world.look(c, 0.5) for c in world.cameras]
     return np.stack([s[0] for s in seen]).astype(np.float32), np.stack([s[1] for s in seen])
 
@@ -48,37 +48,37 @@ def test_lifted_pixels_project_back_to_their_centres():
 
 
 def test_sweep_finds_the_depth_of_textured_surfaces():
-    pictures, depths = still(WORLD)
-    found = sweep(WORLD.cameras, pictures, 4, full_range(WORLD.cameras))
+    images, depths = still(WORLD)
+    found = sweep(WORLD.cameras, images, 4, full_range(WORLD.cameras))
     error = np.abs(found.inverse * depths[4] - 1)[5:-5, 5:-5]
     assert np.median(error) < 0.02 and np.mean(error < 0.1) > 0.85
 
 
 def test_sweep_of_a_part_equals_the_whole_sweep_inside_it():
-    pictures, _ = still(WORLD)
+    images, _ = still(WORLD)
     planes, mask = full_range(WORLD.cameras), np.zeros((60, 96), bool)
     mask[20:40, 30:50] = True
-    part, whole = (sweep(WORLD.cameras, pictures, 0, planes, m) for m in (mask, None))
+    part, whole = (sweep(WORLD.cameras, images, 0, planes, m) for m in (mask, None))
     inside = part.score > -1
     assert inside[mask].all() and inside.sum() == 30 * 30
     assert np.allclose(part.inverse[mask], whole.inverse[mask], atol=1e-6)
 
 
 def test_range_holds_the_scene_and_is_much_smaller_than_everything():
-    pictures, depths = still(WORLD)
-    planes = find_range(WORLD.cameras, pictures)
+    images, depths = still(WORLD)
+    planes = find_range(WORLD.cameras, images)
     low, high = np.quantile(1 / depths, [0.01, 0.99])
     assert planes[0] <= low and planes[-1] >= high and len(planes) < 0.7 * len(full_range(WORLD.cameras))
 
 
 def test_views_agree_on_true_depths_and_not_on_chance():
-    pictures, depths = still(WORLD)
+    images, depths = still(WORLD)
     planes = full_range(WORLD.cameras)
-    maps = [sweep(WORLD.cameras, pictures, i, planes) for i in range(9)]
+    maps = [sweep(WORLD.cameras, images, i, planes) for i in range(9)]
     kept = agreed(WORLD.cameras, maps, 4)
     wrong = np.abs(maps[4].inverse * depths[4] - 1) > 0.1
     assert kept.mean() > 0.6 and wrong[kept].mean() < 0.5 * wrong.mean()
-    noise = np.random.default_rng(0).random(pictures.shape).astype(np.float32)
+    noise = np.random.default_rng(0).random(images.shape).astype(np.float32)
     noise = np.stack([cv2.GaussianBlur(n, (0, 0), 1.0) for n in noise])
     chance = [sweep(WORLD.cameras, noise, i, planes) for i in range(9)]
     assert agreed(WORLD.cameras, chance, 4).mean() < 0.1
@@ -107,7 +107,7 @@ def test_rig_points_lie_on_the_surfaces_of_the_middle_of_the_clip(start):
     assert np.corrcoef(start.values[inside], image[v, u])[0, 1] > 0.8
 
 
-def test_rig_covers_the_picture(start):
+def test_rig_covers_the_image(start):
     uv, _ = middle_camera(start.cameras).project(start.points.astype(np.float64))
     seen = np.histogram2d(uv[:, 0], uv[:, 1], bins=(24, 15), range=((0, 96), (0, 60)))[0]
     assert (seen > 0).mean() > 0.99

@@ -58,7 +58,7 @@ def slow(spikes, tick):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 5), st.integers(1, 19), st.integers(1, 90), st.booleans(), st.integers(0, 2**31))
-def test_pictures_are_those_of_the_definition(height, width, n, bottom_up, seed):
+def test_images_are_those_of_the_definition(height, width, n, bottom_up, seed):
     rng = np.random.default_rng(seed)
     rates = rng.random((height, width)) * np.where(np.arange(n) < n // 2, 1.0, rng.random())[:, None, None]
     spikes = fire(rates, rng.random((height, width))) ^ (rng.random((n, height, width)) < 0.02)

@@ -1,4 +1,4 @@
-"""Spk2ImgNet's windows, training data, training, weight files, and its place among the picture makers."""
+"""Spk2ImgNet's windows, training data, training, weight files, and its place among the image makers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_windows_beyond_the_clip_are_mirrored(n: int) -> None:
 
 
 def dawn(height: int = 20, width: int = 31) -> Example:
-    """A picture that is dark until tick 50; then some pixels fire at every tick. The truth is that pattern."""
+    """An image that is dark until tick 50; then some pixels fire at every tick. The truth is that pattern."""
     lit = np.random.default_rng(5).random((height, width)) < 0.4
     spikes = np.zeros((100, height, width), np.uint8)
     spikes[50:] = lit
@@ -172,7 +172,7 @@ def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene
         second.resume(tmp_path / "c.safetensors", "another key")
 
 
-def test_command_to_weights_to_pictures(
+def test_command_to_weights_to_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one, two = write_small_scene(tmp_path / "one", seed=1), write_small_scene(tmp_path / "two", seed=2)
@@ -191,13 +191,13 @@ def test_command_to_weights_to_pictures(
 
     monkeypatch.setenv(weights.VARIABLE, str(path))
     stream = scene.stream("cam_03")
-    pictures = IMAGES["spk2img"](stream, [0, 40, 79], GAIN)
-    assert pictures.shape == (3, HEIGHT, WIDTH) and pictures.dtype == np.float32
+    images = IMAGES["spk2img"](stream, [0, 40, 79], GAIN)
+    assert images.shape == (3, HEIGHT, WIDTH) and images.dtype == np.float32
     network = load_network(path, "cpu")
     with torch.inference_mode():
         expected = network(torch.from_numpy(window(stream, 40)[None].astype(np.float32))).rate[0].clamp(min=0)
-    np.testing.assert_allclose(pictures[1], expected.numpy() / GAIN, atol=1e-5)
-    assert (pictures >= 0).all()
+    np.testing.assert_allclose(images[1], expected.numpy() / GAIN, atol=1e-5)
+    assert (images >= 0).all()
 
 
 def test_hidden_scenes_are_not_trained_on(small_scene: Path, tmp_path: Path) -> None:

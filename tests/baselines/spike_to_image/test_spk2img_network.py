@@ -60,7 +60,7 @@ def random_case(groups: int, height: int, width: int, reach: float, dtype: torch
     ("groups", "height", "width", "reach"), [(1, 4, 5, 0.5), (2, 5, 3, 3.0), (3, 1, 4, 1.0), (2, 3, 1, 20.0)]
 )
 def test_deformable_convolution_equals_the_loop(groups: int, height: int, width: int, reach: float) -> None:
-    """Small offsets, ones beyond the picture, and pictures one pixel high or wide."""
+    """Small offsets, ones beyond the image, and images one pixel high or wide."""
     case = random_case(groups, height, width, reach, torch.float64)
     expected = slow_deformable_conv(*case)
     np.testing.assert_allclose(deformable_conv(*case).numpy(), expected, rtol=1e-9, atol=1e-9)
@@ -68,8 +68,8 @@ def test_deformable_convolution_equals_the_loop(groups: int, height: int, width:
     np.testing.assert_allclose(single, expected, atol=2e-5 * (1 + reach))
 
 
-def test_whole_pixel_offsets_and_the_edges_of_the_picture() -> None:
-    """Offsets of exactly -1, 0, 1, 2 hit pixel centres and leave the picture."""
+def test_whole_pixel_offsets_and_the_edges_of_the_image() -> None:
+    """Offsets of exactly -1, 0, 1, 2 hit pixel centres and leave the image."""
     x, offsets, masks, weight, bias = random_case(2, 4, 6, 1.0, torch.float64)
     offsets = offsets.round().clamp(-1, 2)
     expected = slow_deformable_conv(x, offsets, masks, weight, bias)
@@ -164,7 +164,7 @@ def seen(value: Tensor, spikes: Tensor) -> list[int]:
 
 
 def test_receptive_field_in_time() -> None:
-    """The picture depends on all 41 ticks; the branches' estimates on the middle 13, 11, 9, 7 of their block alone."""
+    """The image depends on all 41 ticks; the branches' estimates on the middle 13, 11, 9, 7 of their block alone."""
     spikes = torch.rand(1, 41, 12, 16, dtype=torch.float64, requires_grad=True)
     found = awake()(spikes)
     assert found.rate.shape == (1, 12, 16) and found.estimates.shape == (1, 5, 4, 12, 16)
@@ -183,8 +183,8 @@ def test_features_of_a_block_depend_on_its_ticks_alone() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 12), (10, 11), (7, 5), (2, 3)])
-def test_any_size_gives_what_its_mirrored_picture_gives(height: int, width: int) -> None:
-    """The network on a padded picture, cut by hand; numpy does the padding."""
+def test_any_size_gives_what_its_mirrored_image_gives(height: int, width: int) -> None:
+    """The network on a padded image, cut by hand; numpy does the padding."""
     network = awake()
     spikes = torch.rand(2, 41, height, width, dtype=torch.float64)
     above, left = -height % 4 // 2, -width % 4 // 2
@@ -198,7 +198,7 @@ def test_any_size_gives_what_its_mirrored_picture_gives(height: int, width: int)
     torch.testing.assert_close(found.estimates, whole.estimates[..., above : above + height, left : left + width])
 
 
-def test_pictures_of_a_batch_do_not_mix() -> None:
+def test_images_of_a_batch_do_not_mix() -> None:
     network = awake()
     spikes = torch.rand(3, 41, 8, 8, dtype=torch.float64)
     with torch.inference_mode():

@@ -128,7 +128,7 @@ def test_it_lags_behind_a_change_of_light_and_arrives() -> None:
 
 
 def test_on_steady_noise_free_light_it_stands_between_intervals_and_counts() -> None:
-    """Errors of a picture of many grays: below TFI's. A window of 40 ticks beats both where nothing moves."""
+    """Errors of an image of many grays: below TFI's. A window of 40 ticks beats both where nothing moves."""
     light = np.random.default_rng(0).uniform(0.03, 0.6, (30, 40))
     charge = np.random.default_rng(1).random((30, 40)) + light * np.arange(301)[:, None, None]
     stream = stream_of(np.diff(np.floor(charge), axis=0).astype(np.uint8))

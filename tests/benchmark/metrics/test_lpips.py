@@ -17,7 +17,7 @@ from spike4dgs.benchmark.weights import VARIABLE, WeightFile
 NETS = ("alex", "vgg", "squeeze")
 
 
-def picture(seed: int, height: int = 48, width: int = 64) -> NDArray[np.uint8]:
+def make_image(seed: int, height: int = 48, width: int = 64) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
 
 
@@ -69,7 +69,7 @@ def plain_distance(net: str, trunk: torch.nn.Sequential, a: NDArray, b: NDArray)
 def test_equals_the_formula_in_float64(net: str) -> None:
     torch.manual_seed(3)
     trunk = empty_trunk(net).eval()
-    a, b = picture(1), picture(2)
+    a, b = make_image(1), make_image(2)
     expected = plain_distance(net, trunk, a, b)
     assert make_network(net, trunk).distance(a, b) == pytest.approx(expected, rel=1e-4)
     assert make_network(net, trunk).distance(a, a) == 0.0
@@ -89,17 +89,17 @@ def test_weights_come_from_the_users_file(tmp_path: Path, monkeypatch: pytest.Mo
     size, sha256 = path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest()
     monkeypatch.setitem(TRUNKS, "squeeze", WeightFile(path.name, size, sha256, "a test", "nowhere"))
     monkeypatch.setenv(VARIABLE, str(tmp_path))
-    a, b = picture(1), picture(2)
+    a, b = make_image(1), make_image(2)
     assert lpips("squeeze", a, b) == make_network("squeeze", trunk).distance(a, b)
 
 
 @pytest.mark.parametrize(
     ("a", "b"),
     [
-        (picture(0), picture(0, 48, 65)),
-        (picture(0) / 255, picture(0)),
-        (picture(0)[..., None], picture(0)[..., None]),
-        (picture(0, 31, 64), picture(0, 31, 64)),
+        (make_image(0), make_image(0, 48, 65)),
+        (make_image(0) / 255, make_image(0)),
+        (make_image(0)[..., None], make_image(0)[..., None]),
+        (make_image(0, 31, 64), make_image(0, 31, 64)),
     ],
 )
 def test_other_images_are_refused(a: NDArray, b: NDArray) -> None:
@@ -110,4 +110,4 @@ def test_other_images_are_refused(a: NDArray, b: NDArray) -> None:
 
 def test_the_smallest_image_suits_all_trunks() -> None:
     for net in NETS:
-        assert make_network(net, empty_trunk(net)).distance(picture(0, 32, 32), picture(1, 32, 32)) > 0
+        assert make_network(net, empty_trunk(net)).distance(make_image(0, 32, 32), make_image(1, 32, 32)) > 0

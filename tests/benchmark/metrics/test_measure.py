@@ -71,7 +71,7 @@ def test_values_outside_the_range_are_clipped_before_encoding() -> None:
 def test_an_even_image_has_no_score_without_reference(level: float) -> None:
     found = values_of(np.full((200, 256), level))
     assert found.values["brisque"] is None and found.values["niqe"] is None
-    assert found.refused["niqe"].startswith("expected a picture of something, found the level ")
+    assert found.refused["niqe"].startswith("expected an image of something, found the level ")
     assert "exr" not in found.refused["brisque"]
 
 
@@ -104,13 +104,13 @@ def test_temporal_error_is_the_mean_difference_of_the_rates() -> None:
     assert halved[1:] == [pytest.approx(v / 2) for v in found[1:]]
 
 
-def test_a_constant_error_has_no_temporal_error_and_a_still_picture_has_the_truths_rate() -> None:
+def test_a_constant_error_has_no_temporal_error_and_a_still_image_has_the_truths_rate() -> None:
     assert [m.values["temporal_error"] for m in sequence(0.2, 0.3, 0.5)][1:] == [pytest.approx(0, abs=1e-12)] * 2
     still = [m.values["temporal_error"] for m in sequence(0.3, 0.3, 0.3)]
     assert still[1:] == [pytest.approx(0.05), pytest.approx(0.1)]
 
 
-def test_even_pictures_have_no_temporal_error() -> None:
+def test_even_images_have_no_temporal_error() -> None:
     black = np.zeros((16, 20))
     found = sequence(0.3, black, 0.65)
     assert [m.values["temporal_error"] for m in found] == [None, None, None]
@@ -187,7 +187,7 @@ def test_a_black_prediction_gets_reasons_and_no_good_values(scene: Scene, tmp_pa
     cell = record["scenes"][scene.id]
     for metric in ("brisque", "niqe", "temporal_error"):
         assert cell["metrics"][metric] is None
-        assert "expected a picture of something, found the level 0 of 255 everywhere" in cell["notes"][metric]
+        assert "expected an image of something, found the level 0 of 255 everywhere" in cell["notes"][metric]
     assert cell["metrics"]["flip"] > 0.5 and cell["metrics"]["psnr"] < 10
 
 

@@ -137,7 +137,7 @@ def test_refined_rows_take_no_rank_from_others(small_scene: Path, tmp_path: Path
     records = run(tmp_path / "out", [small_scene], *methods)
     table = build_table(published(1), records, {scene: "car" for scene in records[0]["scenes"]})
     found = {row["method"]: row["mean"]["psnr"]["rank"] for row in table["rows"]}
-    assert found == {"tfi+4dgs": 1, "tfi+4dgs.refined": None, "tfp+4dgs": 1}, "the same pictures share a rank"
+    assert found == {"tfi+4dgs": 1, "tfi+4dgs.refined": None, "tfp+4dgs": 1}, "the same images share a rank"
     last = {**records[2], "mean": {**records[2]["mean"], "psnr": records[2]["mean"]["psnr"] - 1}}
     rows = build_table(published(1), [*records[:2], last], {scene: "car" for scene in last["scenes"]})["rows"]
     assert rows[2]["mean"]["psnr"]["rank"] == 2

@@ -1,4 +1,4 @@
-"""A method of another package is found, fitted, scored and ranked; another program's pictures are scored and ranked."""
+"""A method of another package is found, fitted, scored and ranked; another program's images are scored and ranked."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_it_is_fitted_scored_and_ranked_beside_others(installed: Path, scene: Sc
 
 
 def test_the_example_reconstructs_something(installed: Path) -> None:
-    """Where parallax is large, two pictures warped onto the best plane beat the nearest camera's picture."""
+    """Where parallax is large, two images warped onto the best plane beat the nearest camera's image."""
     world = ToyWorld()
     values = {}
     for name in ("plane-blend", "nearest-view"):
@@ -108,8 +108,8 @@ def test_the_warp_follows_the_cameras(installed: Path) -> None:
     np.testing.assert_allclose(centre, [40.3, 22.8], atol=0.1)
 
 
-def test_pictures_of_another_program_are_scored_and_ranked(scene: Scene, tmp_path: Path) -> None:
-    predictions = predictions_of_the_script(scene, tmp_path / "pictures")
+def test_images_of_another_program_are_scored_and_ranked(scene: Scene, tmp_path: Path) -> None:
+    predictions = predictions_of_the_script(scene, tmp_path / "images")
     result, folder = tmp_path / "result.json", tmp_path / "board"
     assert main(["score", str(predictions), str(scene.root), "--out", str(result)]) == 0
     files = ["--predictions", str(predictions), "--scenes", str(scene.root)]
@@ -119,7 +119,7 @@ def test_pictures_of_another_program_are_scored_and_ranked(scene: Scene, tmp_pat
 
 
 def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, tmp_path: Path) -> None:
-    predictions = predictions_of_the_script(scene, tmp_path / "pictures")
+    predictions = predictions_of_the_script(scene, tmp_path / "images")
     for target in scene.targets:
         window = (max(0, target.tick - 20), min(scene.n_ticks, target.tick + 20))
         counts = [scene.stream(camera).counts(*window) for camera in scene.train]

@@ -228,7 +228,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_run_benchmark_leaves_results_pictures_and_entries(
+def test_run_benchmark_leaves_results_images_and_entries(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"

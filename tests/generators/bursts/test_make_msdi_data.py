@@ -96,7 +96,7 @@ def twin(pixels: Pixels, ticks: int, charge: np.ndarray) -> np.ndarray:
     level, out = charge.astype(np.float64), []
     at = np.linspace(-REACH, REACH, len(pixels.rates))
     for tick in range(-(ticks // 2), ticks // 2 + 1):
-        # the mean of straight lines over a tick, by the trapezoid of its ends: no picture lies inside a tick
+        # the mean of straight lines over a tick, by the trapezoid of its ends: no image lies inside a tick
         ends = [np.apply_along_axis(lambda r, x=x: np.interp(x, at, r), 0, pixels.rates) for x in (tick, tick + 1)]
         level += np.clip(pixels.gain * np.mean(ends, axis=0) + pixels.dark, 0, 1)
         fired = level >= 1
@@ -199,7 +199,7 @@ def test_a_mirrored_burst_is_a_rig_in_a_mirrored_world() -> None:
 
 
 def test_variation_keeps_the_instant() -> None:
-    """Whatever is varied, the middle picture is the true one but for brightness and mirror, and maps stay maps."""
+    """Whatever is varied, the middle image is the true one but for brightness and mirror, and maps stay maps."""
     burst, rng = toy_burst(ToyWorld(width=32, height=20), 0.5), np.random.default_rng(0)
     kinds = set()
     for _ in range(40):

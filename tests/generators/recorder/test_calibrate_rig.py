@@ -55,7 +55,7 @@ CAMERAS = array(WIDTH, HEIGHT)
 
 
 def projected(camera, s, board=BOARD):
-    """Corners of the board in a picture, and whether the picture has all of them."""
+    """Corners of the board in an image, and whether the image has all of them."""
     R, t = MOTION.pose(s)
     uv, z = camera.project(board.corners @ R.T + t)
     assert (z > 0).all()
@@ -85,7 +85,7 @@ def test_a_drawn_board_is_the_mean_of_its_samples():
     image = np.where((a < -1) | (a >= 6) | (b < -1) | (b >= 5), WALL, image)
     expected = image.reshape(40, 4, 60, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(draw_board(camera, board, R, t), expected, atol=1e-6)
-    assert {WALL, WHITE, DARK} <= set(np.round(expected, 6).ravel())  # all of it is in the picture
+    assert {WALL, WHITE, DARK} <= set(np.round(expected, 6).ravel())  # all of it is in the image
 
 
 def test_a_board_that_is_partly_behind_the_camera_is_drawn_where_it_is_seen():
@@ -265,7 +265,7 @@ def stream(n_ticks=50, width=16, gaps=()):
     return SpikeStream(pack(np.ones((n_ticks, 8, width))), width, 8, 2e4, gaps=gaps)
 
 
-def test_views_are_spread_over_the_clips_and_pictures_with_lost_ticks_are_none():
+def test_views_are_spread_over_the_clips_and_images_with_lost_ticks_are_none():
     gap = Gap("b", 30, 5, "overflow")
     recordings = [
         BoardRecording("one", {"a": stream(), "b": stream(gaps=(gap,))}, {}),
@@ -291,7 +291,7 @@ def test_clips_of_different_arrays_are_refused():
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """Four of the nine cameras, 0.3 s: the board is so fast that its picture blurs over a pixel."""
+    """Four of the nine cameras, 0.3 s: the board is so fast that its image blurs over a pixel."""
     return write_board_clip(tmp_path_factory.mktemp("board") / "clip", CAMERAS[::2][:4], BOARD, MOTION, 6000, seed=1)
 
 

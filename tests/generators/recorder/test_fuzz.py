@@ -133,7 +133,7 @@ def check(layout: Layout, sent: Sent, rng: np.random.Generator) -> None:
     counter = TickCounter(layout, "cam_00", origin)
     known = {"plain": 0, "tagged-rows": layout.width // 4 + 2, "line-tagged": layout.width // 16 + 2}[layout.name]
     runs, ticks = replay(counter, sent, rng), list[int]()
-    # Before the first tag that no dark picture imitates nothing vouches for the pixels.
+    # Before the first tag that no dark image imitates nothing vouches for the pixels.
     if runs and layout.has_tags() and origin is None:  # the first whole frame is tick 0
         lead = int(np.nonzero((sent.frames[:, known:] == runs[0].frames[0, known:]).all(axis=1))[0][0])
         assert runs[0].first_tick == 0 and lead <= min(sent.whole, default=lead)

@@ -1,4 +1,4 @@
-"""What a capture shows: rates while it runs, and a sheet of pictures after it."""
+"""What a capture shows: rates while it runs, and a sheet of images after it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.generators.recorder.emulation.array import scene_profile
-from spike4dgs.generators.recorder.preview import WINDOW_TICKS, Watch, middle_picture, write_sheet
+from spike4dgs.generators.recorder.preview import WINDOW_TICKS, Watch, middle_image, write_sheet
 from spike4dgs.generators.recorder.rates import Rate
 
 
@@ -48,19 +48,19 @@ def test_live_the_table_has_the_newest_rates_of_all_cameras(small_scene):
     assert rows["cam_03"] == []
 
 
-def test_the_picture_is_the_mean_of_the_window_nearest_the_middle_without_a_gap():
+def test_the_image_is_the_mean_of_the_window_nearest_the_middle_without_a_gap():
     whole = stream()
-    start, image = middle_picture(whole)
+    start, image = middle_image(whole)
     assert start == (400 - WINDOW_TICKS) // 2
     np.testing.assert_allclose(image, whole.window(start, start + WINDOW_TICKS).mean(axis=0), atol=1e-6)
     gap = Gap("cam", 190, 30, "overflow")  # [190, 220): the window before it is nearer the middle than the one after
-    assert middle_picture(stream(gaps=[gap]))[0] == 190 - WINDOW_TICKS
-    assert middle_picture(stream(gaps=[Gap("cam", 100, 110, "stall")]))[0] == 210
-    assert middle_picture(stream(gaps=[Gap("cam", i, 1, "torn frame") for i in range(10, 400, 30)])) is None
-    assert middle_picture(stream(n_ticks=20))[0] == 0
+    assert middle_image(stream(gaps=[gap]))[0] == 190 - WINDOW_TICKS
+    assert middle_image(stream(gaps=[Gap("cam", 100, 110, "stall")]))[0] == 210
+    assert middle_image(stream(gaps=[Gap("cam", i, 1, "torn frame") for i in range(10, 400, 30)])) is None
+    assert middle_image(stream(n_ticks=20))[0] == 0
 
 
-def test_the_sheet_has_a_picture_of_each_camera_but_of_those_without_data(tmp_path):
+def test_the_sheet_has_a_image_of_each_camera_but_of_those_without_data(tmp_path):
     lost = Gap("cam_02", 0, 400, "unplugged")
     streams = {"cam_02": stream(gaps=[lost]), "cam_00": stream(), "cam_01": stream(seed=1)}
     write_sheet(tmp_path / "sheet.png", streams)
@@ -71,4 +71,4 @@ def test_the_sheet_has_a_picture_of_each_camera_but_of_those_without_data(tmp_pa
     cells = [gray[y : y + height // 6, x : x + width // 3] for y, x in corners]
     spread = [float(np.std(cell)) for cell in cells]
     assert min(spread[:2]) > 0.05 and spread[2] < 0.01
-    write_sheet(tmp_path / "dark.png", {"cam_02": stream(gaps=[lost])})  # no picture at all
+    write_sheet(tmp_path / "dark.png", {"cam_02": stream(gaps=[lost])})  # no image at all

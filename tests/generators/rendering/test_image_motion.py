@@ -9,7 +9,7 @@ from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.hexplane import plane_tv, time_smoothness, time_sparsity
 from spike4dgs.method.motion.table import MOTIONS, Extent, HexPlane4DGS
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.table import SUPERVISIONS
@@ -36,7 +36,7 @@ def gaussians(n: int = 40) -> Gaussians:
 def trainer(settings: TrainSettings) -> Trainer:
     times = (10, 50, 90)
     looks = [[WORLD.look(c, t / 100)[0] for c in WORLD.cameras] for t in times]
-    footage = Footage(
+    footage = TrainingImages(
         Views.from_cameras(WORLD.cameras), times, torch.from_numpy(np.array(looks, np.float32)), n_ticks=100
     )
     motion = MOTIONS["hexplane"](EXTENT, settings, seeded(0, -1))
@@ -101,7 +101,7 @@ def test_training_changes_what_it_should_at_each_stage() -> None:
     assert not torch.equal(after["planes.time.0"], before["planes.time.0"])
 
 
-def test_pictures_are_never_negative() -> None:
+def test_images_are_never_negative() -> None:
     g = gaussians()
     g.colors[:] = -1.0
     static = MOTIONS["static"](EXTENT, SETTINGS, seeded(0, 0))

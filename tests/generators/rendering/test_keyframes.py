@@ -24,7 +24,7 @@ def sparse(given: np.ndarray, images: np.ndarray, kind: str = "") -> dict[str, n
     return arrays
 
 
-def pictures(seed=0, n=5):
+def make_images(seed=0, n=5):
     """What stands still, n random images, and which of their pixels are given at fine ticks."""
     rng = np.random.default_rng(seed)
     still = Still(*rng.random((2, *SHAPE, 3), dtype=np.float32))
@@ -37,7 +37,7 @@ def pictures(seed=0, n=5):
 
 @pytest.fixture
 def store(tmp_path):
-    still, images, fast = pictures()
+    still, images, fast = make_images()
     store = KeyStore(tmp_path / "keys")
     store.set_still(still)
     for tick, image in zip(PLAN.ticks, images, strict=True):
@@ -46,7 +46,7 @@ def store(tmp_path):
 
 
 def test_coarse_keys_come_back_bit_for_bit(store):
-    still, images, _ = pictures()
+    still, images, _ = make_images()
     again = KeyStore(store.folder)
     assert again.has_still and again.missing(PLAN) == []
     assert np.array_equal(again.still().background, still.background) and np.array_equal(
@@ -62,7 +62,7 @@ def test_coarse_keys_come_back_bit_for_bit(store):
 
 
 def test_between_coarse_keys_pixels_are_given_or_on_the_simulators_curve(store):
-    _, images, fast = pictures()
+    _, images, fast = make_images()
     for view in range(2):
         clip = store.view(view, PLAN)
         for k in (1, 3):
@@ -114,7 +114,7 @@ def test_missing_keys_are_those_without_a_file(store):
 
 
 def test_equal_keys_give_equal_bytes(store, tmp_path):
-    still, images, _ = pictures()
+    still, images, _ = make_images()
     other = KeyStore(tmp_path / "other")
     other.set_still(still)
     other.put(10, sparse(images[2] != gray(still.background), images[2]))
@@ -122,8 +122,8 @@ def test_equal_keys_give_equal_bytes(store, tmp_path):
         assert (other.folder / name).read_bytes() == (store.folder / name).read_bytes()
 
 
-def test_damage_and_bad_pictures_are_named(store):
-    still, images, fast = pictures()
+def test_damage_and_bad_images_are_named(store):
+    still, images, fast = make_images()
     with pytest.raises(UserError, match="000099.npz: expected a key frame, found no such file"):
         store.given(99, 0)
     path = store.folder / "000010.npz"

@@ -1,4 +1,4 @@
-"""Which Mitsuba variant is used, and that the scalar one gives the same pictures."""
+"""Which Mitsuba variant is used, and that the scalar one gives the same images."""
 
 from __future__ import annotations
 
@@ -78,18 +78,18 @@ def test_the_override_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch):
     mitsuba_variant.pick_variant.cache_clear()
 
 
-def test_scalar_and_vectorised_pictures_agree_within_noise(tmp_path: Path):
+def test_scalar_and_vectorised_images_agree_within_noise(tmp_path: Path):
     if load_mitsuba().variant() != FAST:
         pytest.skip(f"{FAST} does not work here (no usable libLLVM)")
-    pictures = {}
+    images = {}
     for variant in (SAFE, FAST):
         child = python(_RENDER, str(tmp_path / f"{variant}.npz"), **{OVERRIDE: variant})
         assert child.returncode == 0, child.stderr
         assert not (child.stdout + child.stderr).strip()  # quiet: no warnings about samplers
         with np.load(tmp_path / f"{variant}.npz") as data:
-            pictures[variant] = dict(data)
-    slow, fast = pictures[SAFE], pictures[FAST]
-    for p in pictures.values():
+            images[variant] = dict(data)
+    slow, fast = images[SAFE], images[FAST]
+    for p in images.values():
         assert np.array_equal(p["key"], p["again"])
         assert np.array_equal(p["key"][~p["changed"]], p["background"][~p["changed"]])
         assert np.array_equal(p["key"][p["mask"]], p["crn"][p["mask"]])

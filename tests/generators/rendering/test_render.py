@@ -112,7 +112,7 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     assert abs(first.mean() - other.mean()) < 0.01
 
 
-def test_colour_is_the_same_picture(r):
+def test_colour_is_the_same_image(r):
     gray = r
     colour = MultiViewRenderer(r.world, gray.cameras[1:], seed=0, spp=SPP, background_spp=256, color=True)
     rgb = colour.keys(T_S)

@@ -33,7 +33,7 @@ def test_a_renderer_goes_on_from_the_background_of_another(r):
 
 
 def test_fine_keys_give_what_is_too_fast_and_the_rest_is_close(r, tmp_path):
-    """Dense keys from a plan against pictures rendered at every tick: small errors, and none where keys are given."""
+    """Dense keys from a plan against images rendered at every tick: small errors, and none where keys are given."""
     plan = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1))
     store = KeyStore(tmp_path)
     store.set_still(r.still)

@@ -91,7 +91,7 @@ FACTS = {
 }
 
 
-def test_the_command_writes_maps_and_pictures_and_scores_them(tmp_path, capsys):
+def test_the_command_writes_maps_and_images_and_scores_them(tmp_path, capsys):
     scene = scene_with_recordings(tmp_path / "scene", FACTS)
     assert calibration.calibrate(scene, out=tmp_path / "out") == 0
     lines = {line.split()[1]: line.split() for line in capsys.readouterr().out.splitlines() if "cam_" in line}

@@ -58,7 +58,7 @@ def test_the_tip_lags_behind_the_root_and_the_wing_bends(beat):
 
 
 @pytest.mark.parametrize("variant", [0, 1, 2, 3])
-def test_the_bird_flies_to_the_right_above_the_deck_inside_the_picture(variant):
+def test_the_bird_flies_to_the_right_above_the_deck_inside_the_image(variant):
     world = WORLDS["bird"].build(0, variant, 0.1)
     assert 12 <= world.notes["wing_beats_per_s"] <= 20
     assert world.notes["speed_m_s"] >= 7.5 * world.notes["length_m"]

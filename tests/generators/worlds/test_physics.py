@@ -253,7 +253,7 @@ def test_the_same_arguments_give_the_same_bits(name):
     np.testing.assert_array_equal(first.quaternions, again.quaternions)
 
 
-# ---------------------------------------------------------------- what the pictures show
+# ---------------------------------------------------------------- what the images show
 
 
 def test_the_wall_bursts_in_the_same_way_in_clips_of_any_length():

@@ -1,4 +1,4 @@
-"""The worlds as plain data: geometry, motion, reproducibility. No picture is rendered here; a few rays are cast."""
+"""The worlds as plain data: geometry, motion, reproducibility. No image is rendered here; a few rays are cast."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_the_array_is_named_row_by_row_from_the_top_left():
 
 
 def sensor_rays(camera: Camera, sent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions [N, 3] of Mitsuba's own rays through the positions `sent` [N, 2] in the picture, 0..1."""
+    """Origins and directions [N, 3] of Mitsuba's own rays through the positions `sent` [N, 2] in the image, 0..1."""
     mi = load_mitsuba()
     sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, 1)
     if mi.variant().startswith("scalar"):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
-from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.density import GradientStatistics, refine
 from spike4dgs.method.gaussians.optimizer import MOMENTS, Decay, apply_edit, export_state, make_adam, set_rates
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate, share
 from spike4dgs.method.settings import TrainSettings
@@ -34,8 +34,8 @@ def camera(x: float) -> Camera:
     return look_at("c", np.array([x, -3.0, 0.4]), np.zeros(3), up, focal=90.0, width=64, height=48)
 
 
-def pressure(values: list[float]) -> Pressure:
-    return Pressure(torch.tensor(values), torch.ones(len(values)))
+def statistics(values: list[float]) -> GradientStatistics:
+    return GradientStatistics(torch.tensor(values), torch.ones(len(values)))
 
 
 def mask(n: int, *rows: int) -> Tensor:
@@ -59,7 +59,7 @@ EDITS = {
     "prune": lambda g: prune(g, torch.arange(12) % 3 != 0),
     "densify": lambda g: densify(g, mask(12, 1, 4, 5), mask(12, 0, 5, 11), torch.Generator().manual_seed(3)),
     "relocate": lambda g: relocate(g, mask(12, 2, 9), torch.Generator().manual_seed(1)),
-    "refine": lambda g: refine(g, pressure([HIGH, 0] * 6), SETTINGS, 1.0, 100, torch.Generator())[0],
+    "refine": lambda g: refine(g, statistics([HIGH, 0] * 6), SETTINGS, 1.0, 100, torch.Generator())[0],
 }
 
 
@@ -144,7 +144,7 @@ def test_shared_opacity_and_scale_follow_the_published_sums(opacity: float, copi
     assert shrink == pytest.approx(opacity / total, rel=1e-6)
 
 
-def test_relocation_changes_the_picture_far_less_than_plain_copies_would() -> None:
+def test_relocation_changes_the_image_far_less_than_plain_copies_would() -> None:
     g = cloud(40, seed=2)
     g = Gaussians(g.means, g.log_scales + 3, g.quats, g.logits, g.colors)
     dead = torch.arange(40) % 4 == 0
@@ -155,11 +155,11 @@ def test_relocation_changes_the_picture_far_less_than_plain_copies_would() -> No
     for name, value in copied.tensors().items():
         value[dead] = g.tensors()[name][~dead][hosts]
 
-    def picture(gaussians: Gaussians) -> Tensor:
+    def make_image(gaussians: Gaussians) -> Tensor:
         return render(gaussians.splats(), Views.from_cameras([camera(0.1)]), backend="reference").image
 
-    before = picture(g)
-    change, uncorrected = (before - picture(relocated)).abs(), (before - picture(copied)).abs()
+    before = make_image(g)
+    change, uncorrected = (before - make_image(relocated)).abs(), (before - make_image(copied)).abs()
     assert before.max() > 0.5 and change.max() < 0.06
     assert change.mean() < 0.02 * before.mean() and change.mean() < 0.2 * uncorrected.mean()
 
@@ -168,7 +168,7 @@ def test_refinement_grows_where_the_gradient_is_high_and_removes_the_faint() -> 
     g = cloud(6)
     g.logits[3] = -9.0
     g.log_scales[1, 2] = math.log(2 * SETTINGS.split_scale * 3.0)  # large for a scene of this size
-    (edit,) = refine(g, pressure([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
+    (edit,) = refine(g, statistics([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
     assert edit.source.tolist() == [0, 2, 4, 5, -1, -1, -1]
     assert torch.equal(edit.gaussians.means[4], g.means[0])
 
@@ -176,7 +176,7 @@ def test_refinement_grows_where_the_gradient_is_high_and_removes_the_faint() -> 
 @pytest.mark.parametrize("limit", [6, 7, 8, 11, 12, 50])
 def test_refinement_keeps_to_the_limit_and_prefers_high_gradients(limit: int) -> None:
     g = cloud(6)
-    (edit,) = refine(g, pressure([(i + 1) * HIGH for i in range(6)]), SETTINGS, 1.0, limit, torch.Generator())
+    (edit,) = refine(g, statistics([(i + 1) * HIGH for i in range(6)]), SETTINGS, 1.0, limit, torch.Generator())
     more = min(limit, 12) - 6
     assert len(edit.gaussians) == 6 + more
     assert torch.equal(edit.gaussians.means[6:].sort(0).values, g.means[6 - more :].sort(0).values)
@@ -185,7 +185,7 @@ def test_refinement_keeps_to_the_limit_and_prefers_high_gradients(limit: int) ->
 def test_refinement_at_the_limit_moves_the_dead() -> None:
     g = cloud(8)
     g.logits[2] = -9.0
-    (edit,) = refine(g, pressure([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
+    (edit,) = refine(g, statistics([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
     assert len(edit.gaussians) == 8 and edit.source[2] == -1
     assert edit.gaussians.logits.sigmoid().min() > SETTINGS.min_opacity
 
@@ -194,7 +194,7 @@ def test_pressure_is_that_of_each_view_alone_in_half_images() -> None:
     g = cloud(6)
     g = Gaussians(g.means, g.log_scales + 3, g.quats, g.logits, g.colors).trainable()
     g.means.data[5] = torch.tensor([0.0, -9.0, 0.0])  # behind both cameras
-    cameras, gathered = [camera(-0.2), camera(0.2)], Pressure.zero(6, torch.device("cpu"))
+    cameras, gathered = [camera(-0.2), camera(0.2)], GradientStatistics.zero(6, torch.device("cpu"))
     for _ in range(2):
         out = render(g.splats(), Views.from_cameras(cameras), backend="cpu")
         out.image.square().mean().backward()

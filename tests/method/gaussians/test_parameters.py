@@ -128,7 +128,7 @@ def test_shared_gaussians_keep_opacity_and_line_integral(opacity, copies):
     assert stacked == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
 
 
-def test_relocation_keeps_the_number_and_nearly_the_picture():
+def test_relocation_keeps_the_number_and_nearly_the_image():
     g = some(40, seed=3)
     g.means.mul_(0.3)
     g.log_scales.sub_(1.0)

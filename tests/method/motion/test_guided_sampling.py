@@ -9,7 +9,7 @@ from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.guided_sampling import BAD_PIXELS, PATCH, along_rays, bad_pixels, guide
 from spike4dgs.method.motion.spacetime import SpacetimeLite
 from spike4dgs.method.motion.table import MOTIONS, Extent
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.trainer import seeded
@@ -17,7 +17,7 @@ from spike4dgs.method.trainer import seeded
 HEIGHT, WIDTH = 80, 96
 
 
-def pictures() -> tuple[torch.Tensor, torch.Tensor]:
+def images() -> tuple[torch.Tensor, torch.Tensor]:
     """A render that is right but for two patches, one of them at the border."""
     rng = torch.Generator().manual_seed(0)
     picture = 0.5 + 0.01 * torch.rand(HEIGHT, WIDTH, generator=rng)
@@ -28,18 +28,18 @@ def pictures() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_pixels_of_bad_patches_are_sampled_and_the_border_is_not() -> None:
-    image, picture = pictures()
+    image, picture = images()
     chosen = np.zeros((HEIGHT, WIDTH), bool)
     chosen.flat[bad_pixels(image, picture).numpy()] = True
     expected = np.zeros_like(chosen)
     expected[32:48, 48:64] = True
-    expected[8:16, 10:16] = True  # what a tenth of the picture leaves of the other patch
+    expected[8:16, 10:16] = True  # what a tenth of the image leaves of the other patch
     expected[::2, ::2] = False
     assert (chosen == expected).all()
 
 
 def test_exposure_does_not_make_pixels_bad() -> None:
-    image, picture = pictures()
+    image, picture = images()
     assert torch.equal(bad_pixels(image * 3, picture), bad_pixels(image, picture))
 
 
@@ -88,11 +88,11 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     truth[0, 3, 32:48, 32:64] = torch.rand(16, 32, generator=torch.Generator().manual_seed(1))
     assert isinstance(motion, SpacetimeLite)
     g = motion.timed(plain, torch.full((len(plain),), 0.5), 1e6)
-    new = guide(motion, g, Footage(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    new = guide(motion, g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert [t for _, t in new] == [0.9, 0.1]
     uv, _ = cameras[1].project(new[0][0].means.double().numpy())
     assert (uv > 32).all() and (uv < 64).all()
-    more = motion.guide(g, Footage(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    more = motion.guide(g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert len(more) == len(g) + sum(len(x) for x, _ in new)
     assert torch.equal(more.means[: len(g)], g.means) and set(more.extra["times"][len(g) :].tolist()) == {
         torch.tensor(t).item() for t in (0.9, 0.1)

@@ -185,7 +185,7 @@ def extent(n_ticks: int, width: int) -> Extent:
     return Extent(-torch.ones(3), torch.ones(3), 1.0, n_ticks, width)
 
 
-def test_resolution_follows_clip_length_and_picture_size():
+def test_resolution_follows_clip_length_and_image_size():
     s = TrainSettings()
     short, long = hexplane_shape(extent(400, 200), s), hexplane_shape(extent(2000, 400), s)
     assert long.times == pytest.approx(5 * short.times, rel=0.1)

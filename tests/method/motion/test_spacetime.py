@@ -13,14 +13,14 @@ from small_scenes import array_cameras
 from torch import Tensor
 from toy_world import ToyWorld
 
-from spike4dgs.method.gaussians.density import Pressure, refine
+from spike4dgs.method.gaussians.density import GradientStatistics, refine
 from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
 from spike4dgs.method.motion.spacetime import Spacetime, SpacetimeLite, move_to
 from spike4dgs.method.motion.spacetime_decoder import Decoder, rays
 from spike4dgs.method.motion.table import MOTIONS, Extent
 from spike4dgs.method.observations.lookup import look_up, moving, project
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.splat.reference import rotation_matrices
@@ -142,8 +142,8 @@ def test_moments_of_extra_parameters_follow_an_edit() -> None:
 def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> None:
     g = cloud(12)
     g.logits[:] = 0.0
-    pressure = Pressure(torch.tensor([1.0, 0.0] * 6), torch.ones(12))
-    (edit,) = refine(g, pressure, SETTINGS, 100.0, 50, torch.Generator().manual_seed(0))
+    statistics = GradientStatistics(torch.tensor([1.0, 0.0] * 6), torch.ones(12))
+    (edit,) = refine(g, statistics, SETTINGS, 100.0, 50, torch.Generator().manual_seed(0))
     born = motion().born(edit, torch.Generator().manual_seed(1))
     old, new = born.gaussians.rows(torch.arange(12)), born.gaussians.rows(torch.arange(12, 18))
     assert edit.added == born.added == 6 and all(torch.equal(v, g.tensors()[k]) for k, v in old.tensors().items())
@@ -191,11 +191,11 @@ def test_decoder_is_two_pointwise_layers_beside_the_albedo() -> None:
         np.testing.assert_allclose(out[view, v, u], albedo + w2[0] @ np.maximum(w1 @ x, 0), rtol=1e-4, atol=1e-5)
 
 
-def footage(count: int = 9) -> Footage:
+def make_training_images(count: int = 9) -> TrainingImages:
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks - 1, count))
     looks = [[WORLD.look(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
-    pictures = torch.from_numpy(np.array(looks, np.float32))
-    return Footage(Views.from_cameras(WORLD.cameras), ticks, pictures, WORLD.n_ticks)
+    images = torch.from_numpy(np.array(looks, np.float32))
+    return TrainingImages(Views.from_cameras(WORLD.cameras), ticks, images, WORLD.n_ticks)
 
 
 def surface() -> tuple[Tensor, np.ndarray]:
@@ -209,7 +209,7 @@ def surface() -> tuple[Tensor, np.ndarray]:
 
 def test_points_are_seen_where_the_cameras_see_them() -> None:
     points, _ = surface()
-    rows, inside = project(points, footage(1).views)
+    rows, inside = project(points, make_training_images(1).views)
     for i, camera in enumerate(WORLD.cameras):
         uv, z = camera.project(points.double().numpy())
         within = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
@@ -220,7 +220,7 @@ def test_points_are_seen_where_the_cameras_see_them() -> None:
 
 def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times() -> None:
     points, board = surface()
-    f = footage()
+    f = make_training_images()
     change = moving(points, f).numpy()
     shift = change > SETTINGS.moving_change
     assert shift[board].mean() > 0.5 > 3 * shift[~board].mean()  # the board uncovers some of what is behind it
@@ -237,12 +237,12 @@ def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times
     i = int(torch.nonzero(short)[0])
     t = timed.extra["times"][i : i + 1]
     nearest = int(np.abs(np.array(f.ticks) / f.n_ticks - float(t)).argmin())
-    seen = [p.flatten()[r[i_]] for p, r, i_ in zip(f.pictures[nearest], *_at(timed.means[i : i + 1], f), strict=True)]
+    seen = [p.flatten()[r[i_]] for p, r, i_ in zip(f.images[nearest], *_at(timed.means[i : i + 1], f), strict=True)]
     assert timed.colors[i, 0] in seen
     assert torch.equal(look_up(timed.means[i : i + 1], t, f), timed.colors[i])
 
 
-def _at(point: Tensor, f: Footage) -> tuple[Tensor, list[int]]:
+def _at(point: Tensor, f: TrainingImages) -> tuple[Tensor, list[int]]:
     return project(point, f.views)[0], [0] * len(f.views)
 
 

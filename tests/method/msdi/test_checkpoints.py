@@ -145,13 +145,13 @@ def test_dust3rs_encoder_gives_the_same_tokens_here(tmp_path: Path) -> None:
     save_file({k: v.clone() for k, v in published.state_dict().items()}, tmp_path / "model.safetensors")
     network = fresh(EMBED)
     load_pretrained(network, tmp_path / "model.safetensors")
-    pictures = torch.randn(2, 3, 32, 48)
-    features = torch.cat([pictures, torch.randn(2, EMBED.features - 3, 32, 48)], dim=1)
+    images = torch.randn(2, 3, 32, 48)
+    features = torch.cat([images, torch.randn(2, EMBED.features - 3, 32, 48)], dim=1)
     with torch.no_grad():
         network.encoder.mix.weight.copy_(torch.eye(3, EMBED.features)[:, :, None, None])
         torch.nn.init.zeros_(network.encoder.mix.bias)  # type: ignore[arg-type]
         tokens = network.encoder(features, torch.ones(2, 3, 32, 48))
-        assert torch.allclose(tokens, published.encode(pictures), atol=1e-5)
+        assert torch.allclose(tokens, published.encode(images), atol=1e-5)
 
 
 def test_other_files_are_refused_and_nothing_is_unpickled(tmp_path: Path) -> None:

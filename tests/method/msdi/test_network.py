@@ -106,7 +106,7 @@ def test_generator_is_three_layers_on_single_pixels() -> None:
 
 
 @pytest.mark.parametrize("sees", [True, False])
-def test_picture_depends_on_the_pixels_own_spikes_only_where_it_may(sees: bool) -> None:
+def test_image_depends_on_the_pixels_own_spikes_only_where_it_may(sees: bool) -> None:
     network = tiny(generator_sees_pixel=sees)
     x = torch.rand(1, 9, 13, 18, requires_grad=True)
     for v, u in ((0, 0), (12, 17), (6, 8)):
@@ -132,7 +132,7 @@ def test_any_size_comes_out_whole(size: tuple[int, int], patch: int) -> None:
     assert torch.allclose(out.images[0], cut, atol=1e-6)
 
 
-def test_half_features_change_a_picture_by_less_than_a_hundredth() -> None:
+def test_half_features_change_a_image_by_less_than_a_hundredth() -> None:
     x = spikes(2, 9, 24, 40)
     with torch.no_grad():
         exact, half = tiny().images(x), tiny().images(x, half=True)
@@ -162,7 +162,7 @@ def test_views_see_each_other_and_samples_do_not() -> None:
         changed = network(other)
         alone = network(x[1:])
     assert (both.points[0] - changed.points[0]).abs().amax(dim=(1, 2, 3)).min() > 1e-5  # all views of the sample
-    assert torch.equal(both.images[0, :2], changed.images[0, :2])  # pictures are each view's own
+    assert torch.equal(both.images[0, :2], changed.images[0, :2])  # images are each view's own
     assert torch.allclose(both.points[1], changed.points[1]) and torch.allclose(
         both.points[1:], alone.points, atol=1e-5
     )

@@ -21,12 +21,12 @@ TIMES = np.linspace(0, 1, 7)
 
 @cache
 def clip() -> tuple[torch.Tensor, torch.Tensor]:
-    """Noisy pictures [T, C, H, W] of the toy world, and where the board is at any of the times [C, H, W]."""
+    """Noisy images [T, C, H, W] of the toy world, and where the board is at any of the times [C, H, W]."""
     looks = [[WORLD.look(c, t) for c in WORLD.cameras] for t in TIMES]
-    pictures = np.array([[image for image, _, _ in row] for row in looks])
-    pictures += np.random.default_rng(0).normal(0, 0.015, pictures.shape)
+    images = np.array([[image for image, _, _ in row] for row in looks])
+    images += np.random.default_rng(0).normal(0, 0.015, images.shape)
     swept = np.array([[board for _, _, board in row] for row in looks]).any(0)
-    return torch.tensor(pictures, dtype=torch.float32), torch.from_numpy(swept)
+    return torch.tensor(images, dtype=torch.float32), torch.from_numpy(swept)
 
 
 def flat(noise: float, seed: int = 0) -> torch.Tensor:
@@ -34,11 +34,11 @@ def flat(noise: float, seed: int = 0) -> torch.Tensor:
     return torch.tensor(0.5 + noise * rng.normal(size=(9, 2, 30, 50)), dtype=torch.float32)
 
 
-def test_deviation_is_that_of_pictures_averaged_over_3x3_pixels() -> None:
-    pictures = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
-    padded = np.pad(pictures.double().numpy(), ((0, 0), (0, 0), (1, 1), (1, 1)))
+def test_deviation_is_that_of_images_averaged_over_3x3_pixels() -> None:
+    images = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
+    padded = np.pad(images.double().numpy(), ((0, 0), (0, 0), (1, 1), (1, 1)))
     smooth = sum(padded[..., y : y + 8, x : x + 9] for y in range(3) for x in range(3)) / 9
-    np.testing.assert_allclose(temporal_deviation(pictures), smooth.std(axis=0), atol=1e-12)
+    np.testing.assert_allclose(temporal_deviation(images), smooth.std(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005, 0.02, 0.04])
@@ -47,30 +47,30 @@ def test_noise_alone_does_not_move(noise: float) -> None:
 
 
 def test_mask_holds_where_the_board_has_been_and_little_else() -> None:
-    pictures, swept = clip()
-    masks = foreground_masks(pictures)
+    images, swept = clip()
+    masks = foreground_masks(images)
     assert (masks & swept).sum() > 0.95 * swept.sum()
     around = torch.nn.functional.max_pool2d(swept[:, None].float(), 5, 1, 2)[:, 0] > 0
     assert not (masks & ~around).any()  # blur and growth, one pixel each
 
 
 def test_inside_of_a_uniform_thing_is_filled() -> None:
-    pictures = flat(0.005)
-    for t in range(len(pictures)):
-        pictures[t, :, 3 + t : 19 + t, 10 + t : 36 + t] = 0.9  # 8x18 pixels never change
-    assert foreground_masks(pictures)[:, 12:19, 19:36].all()
+    images = flat(0.005)
+    for t in range(len(images)):
+        images[t, :, 3 + t : 19 + t, 10 + t : 36 + t] = 0.9  # 8x18 pixels never change
+    assert foreground_masks(images)[:, 12:19, 19:36].all()
 
 
-def test_a_thing_that_leaves_the_picture_is_not_cut_at_its_edge() -> None:
-    pictures = flat(0.0)
-    for t in range(len(pictures)):
-        pictures[t, :, 10:20, : 2 + 2 * t] = 0.9
-    assert foreground_masks(pictures)[:, 10:20, 2:17].all()
+def test_a_thing_that_leaves_the_image_is_not_cut_at_its_edge() -> None:
+    images = flat(0.0)
+    for t in range(len(images)):
+        images[t, :, 10:20, : 2 + 2 * t] = 0.9
+    assert foreground_masks(images)[:, 10:20, 2:17].all()
 
 
 def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
-    pictures, _ = clip()
-    masks = foreground_masks(pictures)
+    images, _ = clip()
+    masks = foreground_masks(images)
     camera = WORLD.held_out
     _, depth, board = WORLD.look(camera, 0.5)
     v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
@@ -90,7 +90,7 @@ def test_points_behind_all_cameras_or_out_of_their_sight_neither_move_nor_stray(
 
 
 def test_window_shows_the_same_pixels_through_the_same_lines_of_sight() -> None:
-    pictures, swept = clip()
+    images, swept = clip()
     views = Views.from_cameras(WORLD.cameras)
     window = moving_window(views, swept, 3)
     width, height = window.views.width, window.views.height
@@ -102,10 +102,10 @@ def test_window_shows_the_same_pixels_through_the_same_lines_of_sight() -> None:
         there, _ = camera.project(np.array([[0.1, 0.0, 0.5]]))
         here, _ = cut.project(np.array([[0.1, 0.0, 0.5]]))
         np.testing.assert_allclose(here, there - [x, y], atol=1e-9)
-        assert torch.equal(window.cut(pictures)[2, c], pictures[2, c, y : y + height, x : x + width])
+        assert torch.equal(window.cut(images)[2, c], images[2, c, y : y + height, x : x + width])
 
 
-def test_window_without_motion_is_the_whole_picture_and_a_margin_ends_at_its_edge() -> None:
+def test_window_without_motion_is_the_whole_image_and_a_margin_ends_at_its_edge() -> None:
     views = Views.from_cameras(WORLD.cameras[:2])
     masks = torch.zeros(2, WORLD.height, WORLD.width, dtype=torch.bool)
     assert moving_window(views, masks, 4).views is views

@@ -12,7 +12,7 @@ from toy_world import GAIN, ToyWorld
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Progress
 from spike4dgs.method.fit import FitJob, Start, measure
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.radiance_field import PUBLISHED, RADIANCE_FIELD, RadianceFieldSettings, fit_radiance_field
 from spike4dgs.method.radiance_field.fit import Fitter
 from spike4dgs.method.radiance_field.march import camera_rays
@@ -59,7 +59,7 @@ def job(settings=SMALL, progress: Progress = silent, checkpoint: Path | None = N
     points = np.concatenate([plane(c)[1][::5] for c in scene.cameras])
     points += np.random.default_rng(0).normal(size=points.shape) * [0, 0.02, 0]
     start = Start(scene.cameras, points.astype(np.float32), np.full(len(points), 0.5, np.float32))
-    footage = Footage(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(pictures), 80)
+    footage = TrainingImages(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(pictures), 80)
     extent = measure(start, scene)
     return FitJob(scene, start, footage, extent, settings, "cpu", seed, progress, checkpoint, "this")
 
@@ -95,7 +95,7 @@ def test_nothing_moves_where_no_pixel_changes() -> None:
 
 
 @torch.no_grad()
-def test_skipping_what_is_empty_changes_the_picture_by_less_than_a_hundredth() -> None:
+def test_skipping_what_is_empty_changes_the_image_by_less_than_a_hundredth() -> None:
     model = fitted(0.0)
     grid = model.field.occupancy
     assert float(grid.occupied.float().mean()) < 0.5
@@ -191,4 +191,4 @@ def test_budgets_scale_the_steps_and_published_values_are_settings() -> None:
 
 def test_spikes_of_the_stream_are_what_a_rate_is_compared_with() -> None:
     fitter = Fitter(job())
-    assert torch.allclose(fitter.recorded[0].view(8, 25, 40), GAIN * job().footage.pictures[0])
+    assert torch.allclose(fitter.recorded[0].view(8, 25, 40), GAIN * job().training_images.images[0])

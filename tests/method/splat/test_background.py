@@ -1,4 +1,4 @@
-"""Gaussians before a backdrop against the same Gaussians rendered all at once: equal bits, equal gradients."""
+"""Gaussians before a background against the same Gaussians rendered all at once: equal bits, equal gradients."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.splat.background import Backdrop
+from spike4dgs.method.splat.background import Background
 
 
 def rows(splats: Splats, index: Tensor) -> Splats:
@@ -19,13 +19,13 @@ def rows(splats: Splats, index: Tensor) -> Splats:
 
 
 def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int]) -> None:
-    """Compare pictures and gradients of splats[moving] before the others."""
+    """Compare images and gradients of splats[moving] before the others."""
     few = Views(v.w2c[chosen], v.K[chosen], v.width, v.height)
     order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
     everything = [t.requires_grad_() for t in (*rows(splats, order).geometry, rows(splats, order).colors)]
     own = [t.requires_grad_() for t in (*rows(splats, moving).geometry, rows(splats, moving).colors)]
     expected = render(Splats(*everything), few, backend="cpu")
-    found = Backdrop(rows(splats, ~moving), v).render(Splats(*own), chosen)
+    found = Background(rows(splats, ~moving), v).render(Splats(*own), chosen)
     assert torch.equal(found.image, expected.image) and torch.equal(found.alpha, expected.alpha)
     n = int((~moving).sum())
     assert torch.equal(found.radii, expected.radii[:, n:])
@@ -40,7 +40,7 @@ def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int]) -> No
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 300), st.sampled_from([0.0, 0.02, 0.3, 1.0]), st.sampled_from([1, 2, 3]), st.integers(0, 2**31))
-def test_pictures_and_gradients_are_those_of_all_at_once(n: int, share: float, channels: int, seed: int) -> None:
+def test_images_and_gradients_are_those_of_all_at_once(n: int, share: float, channels: int, seed: int) -> None:
     moving = torch.rand(n, generator=torch.Generator().manual_seed(seed)) < share
     both_ways(random_splats(n, channels, seed=seed), views(3), moving, [2, 0])
 
@@ -55,7 +55,7 @@ def test_hard_scenes(scene) -> None:  # type: ignore[no-untyped-def]
 def test_it_can_be_drawn_with_again() -> None:
     splats, v = random_splats(100, seed=5), views(2)
     still = torch.arange(100) < 60
-    backdrop = Backdrop(rows(splats, still), v)
+    backdrop = Background(rows(splats, still), v)
     first = [backdrop.render(rows(random_splats(30, seed=s), torch.arange(30)), [0, 1]).image for s in (1, 2, 1)]
     assert torch.equal(first[0], first[2]) and not torch.equal(first[0], first[1])
     assert len(backdrop) == 60
@@ -63,7 +63,7 @@ def test_it_can_be_drawn_with_again() -> None:
 
 def test_values_that_are_not_finite_are_refused() -> None:
     splats, v = rows(random_splats(20, seed=3), torch.arange(20)), views(1)
-    backdrop = Backdrop(splats, v)
+    backdrop = Background(splats, v)
     for name in ("means", "colors"):
         bad = {n: getattr(splats, n).clone() for n in ("means", "quats", "scales", "opacities", "colors")}
         bad[name][3, 0] = float("nan")

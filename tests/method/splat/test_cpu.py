@@ -1,4 +1,4 @@
-"""The CPU kernels against the float64 reference: pictures, gradients, determinism, errors."""
+"""The CPU kernels against the float64 reference: images, gradients, determinism, errors."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_random_scenes(seed: int, n: int, log_size: float, logit: float, antiali
     compare(s, views(1), antialiased=antialiased)
 
 
-def test_short_vectors_give_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_vectors_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """8 lanes (AVX2, NEON, SSE) as well as this machine's choice."""
     monkeypatch.setattr(cpu, "host_lanes", lambda: 8)
     compare(random_splats(150, seed=21), views())

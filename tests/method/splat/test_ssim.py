@@ -50,7 +50,7 @@ def test_hard_images_stay_finite_and_close(a: torch.Tensor, b: torch.Tensor) -> 
     assert fast.grad is not None and slow.grad is not None
     assert torch.isfinite(fast.grad).all()
     assert abs(value.item() - expected.item()) < 2e-4
-    # Gradients of ordinary pictures this size have norms around 0.03; where the truth is 0, float32 leaves 1e-5.
+    # Gradients of ordinary images this size have norms around 0.03; where the truth is 0, float32 leaves 1e-5.
     assert (fast.grad - slow.grad).norm() <= 2e-2 * slow.grad.norm() + 1e-5
 
 

@@ -58,7 +58,7 @@ def sample(tick: int, step: int = 0, views: tuple[int, ...] = (0, 2)) -> Sample:
 
 
 @pytest.mark.parametrize("tick", [3, 60, 118])
-def test_the_right_picture_fires_about_what_was_recorded(tick: int) -> None:
+def test_the_right_image_fires_about_what_was_recorded(tick: int) -> None:
     loss, cameras = scene_loss(), WORLD.training.cameras
 
     def truth(t: float) -> torch.Tensor:
@@ -94,15 +94,15 @@ def _flat(rate: float, seed: int) -> SimpleNamespace:
 
 def test_noise_embedding_scales_and_lifts_its_own_view_only() -> None:
     loss = scene_loss(replace(SETTINGS, noise_weight=0.0))
-    picture = torch.full((2, 20, 32), 0.5)
+    image = torch.full((2, 20, 32), 0.5)
     with torch.no_grad():
         loss.noise[1] = 5.0  # a view that is not in the sample
-    before = float(loss(lambda t: picture, sample(60)).detach())
+    before = float(loss(lambda t: image, sample(60)).detach())
     with torch.no_grad():
         loss.noise[[0, 2], 0], loss.noise[[0, 2], 1] = float(np.log(2.0)), 0.1
-    after = float(loss(lambda t: (picture - 0.1) / 2, sample(60)).detach())
+    after = float(loss(lambda t: (image - 0.1) / 2, sample(60)).detach())
     assert after == pytest.approx(before, rel=1e-3)
-    loss(lambda t: picture, sample(60)).backward()
+    loss(lambda t: image, sample(60)).backward()
     assert loss.noise.grad is not None and loss.noise.grad[[0, 2]].abs().sum() > 0 and not loss.noise.grad[1].any()
 
 
@@ -124,6 +124,6 @@ def scene_with(weight: float, other: SpikeRender) -> torch.Tensor:
 
 
 def test_one_step_one_loss() -> None:
-    loss, picture = scene_loss(), torch.full((2, 20, 32), 0.4)
-    values = [float(loss(lambda t: picture, sample(60, step)).detach()) for step in (7, 7, 8)]
+    loss, image = scene_loss(), torch.full((2, 20, 32), 0.4)
+    values = [float(loss(lambda t: image, sample(60, step)).detach()) for step in (7, 7, 8)]
     assert values[0] == values[1] != values[2]

@@ -26,8 +26,8 @@ SETTINGS = TrainSettings()
 VIEWS = (0, 2)
 
 
-def sample(tick: int, step: int = 0, pictures: torch.Tensor | None = None) -> Sample:
-    return Sample(tick / 120, tick, VIEWS, torch.zeros(2, 20, 32) if pictures is None else pictures, step)
+def sample(tick: int, step: int = 0, images: torch.Tensor | None = None) -> Sample:
+    return Sample(tick / 120, tick, VIEWS, torch.zeros(2, 20, 32) if images is None else images, step)
 
 
 def make(name: str, scene: TrainingScene = WORLD.training, **changes: float) -> Supervision:
@@ -200,7 +200,7 @@ def test_phi_is_trained_and_kept_and_maps_are_not() -> None:
 
 
 @pytest.mark.parametrize("name", ["spike", "pixel+spike", "spss"])
-def test_the_right_picture_is_better_than_others(name: str) -> None:
+def test_the_right_image_is_better_than_others(name: str) -> None:
     loss = make(name)
 
     def mean(change: float) -> float:
@@ -279,7 +279,7 @@ def test_windows_hold_their_ticks_wherever_they_are() -> None:
         np.testing.assert_array_equal(counts.numpy(), spikes)
 
 
-def test_a_pixel_whose_picture_is_no_number_teaches_nothing() -> None:
+def test_a_pixel_whose_image_is_no_number_teaches_nothing() -> None:
     picture = truth(0.6) + 0.1
     picture[0, 3, 4] = torch.nan
     picture[1, 5, 6] = torch.inf

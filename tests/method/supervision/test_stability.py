@@ -13,7 +13,7 @@ from toy_world import GAIN, RATE_HZ, ToyWorld
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import Start, film, measure
+from spike4dgs.method.fit import Start, make_training_images, measure
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.settings import TrainSettings
@@ -94,13 +94,13 @@ IMAGES = {"black": 0.0, "gray": 0.4, "white": 1.0, "glare": 1e4, "faint": 1e-12}
 
 
 def check(loss: Supervision, scene: TrainingScene, picture: float = 0.3) -> None:
-    """Loss and gradients are finite for every tick and rendered picture, and parameters stay so in training."""
+    """Loss and gradients are finite for every tick and rendered image, and parameters stay so in training."""
     for value in IMAGES.values():
         for tick in {0, scene.n_ticks // 2, scene.n_ticks - 1}:
-            pictures = torch.full((2, HEIGHT, WIDTH), picture)
-            pictures[0, 0, 0] = torch.nan
+            images = torch.full((2, HEIGHT, WIDTH), picture)
+            images[0, 0, 0] = torch.nan
             image = torch.full((2, HEIGHT, WIDTH), value, requires_grad=True)
-            now = Sample(tick / scene.n_ticks, tick, (1, 2), pictures, tick)
+            now = Sample(tick / scene.n_ticks, tick, (1, 2), images, tick)
             result = loss(lambda t, i=image: i, now)
             loss.zero_grad(set_to_none=True)
             result.backward()
@@ -156,16 +156,16 @@ def test_training_keeps_every_parameter_a_number(name: str, make_scene: Callable
     points = rng.uniform([-0.8, -0.2, 0.2], [0.8, 0.6, 1.2], (60, 3)).astype(np.float32)
     start = Start(CAMERAS, points, rng.random(60).astype(np.float32))
 
-    def pictures(stream: SpikeStream, ticks: object, gain: float) -> np.ndarray:
+    def images(stream: SpikeStream, ticks: object, gain: float) -> np.ndarray:
         image = stream.counts(0, scene.n_ticks) / np.float32(scene.n_ticks * gain)
         image[0, :3] = np.nan
         return np.repeat(image[None], len(list(ticks)), 0).astype(np.float32)  # type: ignore[call-overload]
 
     extent = measure(start, scene)
     motion = MOTIONS["static"](extent, s, seeded(0, -1))
-    footage = film(scene, start.cameras, pictures, s, "cpu")
+    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
     gaussians = from_points(points, start.values, opacity=0.5)
-    trainer = Trainer(footage, gaussians, motion, SUPERVISIONS[name](s, scene), s, scale=extent.scale, seed=0)
+    trainer = Trainer(training_images, gaussians, motion, SUPERVISIONS[name](s, scene), s, scale=extent.scale, seed=0)
     losses = [float(trainer.train_step()) for _ in range(6)]
     assert np.isfinite(losses).all()
     assert all(v.isfinite().all() for k, v in trainer.state().tensors.items() if not k.startswith("pressure"))

@@ -16,7 +16,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, Start, measure
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.observations.foreground import foreground_masks
-from spike4dgs.method.observations.training_images import Footage
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.tracking.fit import (
@@ -43,12 +43,12 @@ def silent(done: int, total: int, note: str = "") -> None:
 
 
 @cache
-def shown() -> tuple[Footage, Start]:
-    """Exact pictures of the board at `TIMES` times, and noisy points on the surfaces as they are at the middle one."""
+def shown() -> tuple[TrainingImages, Start]:
+    """Exact images of the board at `TIMES` times, and noisy points on the surfaces as they are at the middle one."""
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks, TIMES))
     frames = np.array([[WORLD.look(c, t / WORLD.n_ticks)[0] for c in CAMERAS] for t in ticks], np.float32)
     start = Start(CAMERAS, *WORLD.surfaces(CAMERAS[::3], 0.005))
-    return Footage(Views.from_cameras(CAMERAS), ticks, torch.from_numpy(frames), WORLD.n_ticks), start
+    return TrainingImages(Views.from_cameras(CAMERAS), ticks, torch.from_numpy(frames), WORLD.n_ticks), start
 
 
 def job(
@@ -56,7 +56,7 @@ def job(
 ) -> FitJob:
     footage, start = shown()
     if still:
-        footage = replace(footage, pictures=footage.pictures[2:3].expand(TIMES, -1, -1, -1).contiguous())
+        footage = replace(footage, pictures=footage.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
     scene = TrainingScene("toy", "toy", CAMERAS, (), 20000.0, WORLD.n_ticks, 0.6)
     settings = replace(TrackingSettings(), **changes)
     return FitJob(scene, start, footage, measure(start, scene), settings, "cpu", 0, progress, checkpoint, "this")
@@ -118,18 +118,18 @@ def test_background_stands_still_or_hardly_moves() -> None:
     assert (soft.tracks.means[0, moving:] != soft.tracks.means[2, moving:]).any()
 
 
-def test_only_the_window_is_drawn_and_the_gradient_is_that_of_the_whole_picture() -> None:
+def test_only_the_window_is_drawn_and_the_gradient_is_that_of_the_whole_image() -> None:
     gradients = []
     for margin in (8, 1000):
         j = job(**TINY, margin_px=margin, ssim_weight=0.0)
         g = from_points(j.start.points, j.start.values, opacity=0.5)
-        tracker = Tracker(j, g, foreground_masks(j.footage.pictures))
+        tracker = Tracker(j, g, foreground_masks(j.training_images.images))
         tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
         old = tracker.tracks.at(2)
         leaves = {k: v.clone().requires_grad_() for k, v in old.items()}
         tracker.loss(3, old)(leaves, [0, 3, 5]).backward()
         gradients.append([leaves[k].grad[: tracker.count] for k in ("means", "quats", "colors")])
-    assert Tracker(job(**TINY), g, foreground_masks(j.footage.pictures)).share < 0.8
+    assert Tracker(job(**TINY), g, foreground_masks(j.training_images.images)).share < 0.8
     for a, b in zip(*gradients, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 
@@ -137,7 +137,7 @@ def test_only_the_window_is_drawn_and_the_gradient_is_that_of_the_whole_picture(
 def test_what_flies_off_to_where_nothing_moves_stays_where_it_was() -> None:
     j = job(**TINY)
     g = from_points(j.start.points, j.start.values, opacity=0.5)
-    tracker = Tracker(j, g, foreground_masks(j.footage.pictures))
+    tracker = Tracker(j, g, foreground_masks(j.training_images.images))
     tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
     tracks = tracker.tracks
     tracks.means[1, 7] -= torch.tensor([0.0, 0.0, 0.45])  # from there its velocity takes it far above the board
@@ -193,7 +193,7 @@ def test_progress_counts_all_steps_to_the_end() -> None:
     assert [done for done, _ in seen] == sorted(done for done, _ in seen) and seen[-1][0] == 11
 
 
-def test_a_scene_in_which_nothing_moves_is_one_picture(tmp_path: Path) -> None:
+def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
     model = fit_tracking(job(tmp_path / "fit.safetensors", still=True, **TINY))
     images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
     assert len(model.tracks.free) == 0 and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
@@ -244,7 +244,7 @@ def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
     assert model.size_bytes == 4 * (6 * 12 + 3 * (4 * 7 + 5))
 
 
-def test_a_recipe_runs_it_from_spikes_to_pictures() -> None:
+def test_a_recipe_runs_it_from_spikes_to_images() -> None:
     def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
         return np.stack([stream.counts(t - 10, t + 10) / (20 * gain) for t in ticks]).astype(np.float32)
 

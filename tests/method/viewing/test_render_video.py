@@ -174,12 +174,12 @@ def test_bad_options_are_one_line(
 
 
 @pytest.mark.parametrize("name", ["spacetime", "tracking"])
-def test_an_exact_patch_is_part_of_the_exact_picture(name: str) -> None:
+def test_an_exact_patch_is_part_of_the_exact_image(name: str) -> None:
     made, camera, t_us = model(name), WORLD.held_out, 0.3 * DURATION_US
     views = Views.from_cameras([camera])
     with torch.no_grad():
         image = rasterise(made.splats(t_us), views, backend="reference").image
-        whole = made.picture(image, views)[0].clamp(min=0).numpy()
+        whole = made.image(image, views)[0].clamp(min=0).numpy()
     found = exact_patch(made, camera, t_us, (7, 5), (20, 13))
     np.testing.assert_allclose(found, whole[5:18, 7:27], atol=1e-6)
 

@@ -42,24 +42,24 @@ def stage(with_scene: bool = True) -> Stage:
     return Stage(saved, WORLD.training if with_scene else None)
 
 
-def test_the_three_pictures() -> None:
+def test_the_three_images() -> None:
     shown, camera, t_us = stage(), TRAINED[1], 0.5 * DURATION_US
     rendered = model("spacetime-lite").render(camera, t_us)
-    np.testing.assert_array_equal(shown.picture("rendered", camera, t_us)[..., 0], encode_srgb(rendered))
+    np.testing.assert_array_equal(shown.image("rendered", camera, t_us)[..., 0], encode_srgb(rendered))
     truth = WORLD.look(camera, 0.5)[0]
     rate = shown.spike_rate(camera.id, t_us)
     assert np.abs(rate - truth).mean() < 0.03, "40 ticks tell a radiance to 1/24, and the board moves"
-    np.testing.assert_array_equal(shown.picture("spike rate", camera, t_us)[..., 2], encode_srgb(rate))
+    np.testing.assert_array_equal(shown.image("spike rate", camera, t_us)[..., 2], encode_srgb(rate))
     error = np.minimum(np.abs(np.clip(rendered, 0, 1) - np.clip(rate, 0, 1)), ERROR_MAX)
     colors = error_colors()[np.rint(error / ERROR_MAX * 255).astype(int)]
-    assert np.abs(shown.picture("error", camera, t_us).astype(int) - colors).max() <= 3
+    assert np.abs(shown.image("error", camera, t_us).astype(int) - colors).max() <= 3
     assert error_colors()[0].sum() < 10 and error_colors()[-1].sum() > 600, "from black to nearly white"
 
 
 def test_without_the_scene_there_is_only_the_model() -> None:
     assert stage(False).modes == ("rendered",) and stage().modes == MODES
     with pytest.raises(UserError, match="none: no scene is given"):
-        stage(False).picture("error", TRAINED[0], 0.0)
+        stage(False).image("error", TRAINED[0], 0.0)
     with pytest.raises(UserError, match="expected a training camera of the scene .*found 'free'"):
         stage().spike_rate("free", 0.0)
 
@@ -77,10 +77,10 @@ def test_another_scene_is_refused(small_scene: Path) -> None:
         open_stage(SavedModel(model("static"), about), small_scene)
     fitting = provenance(scene="pattern-0", n_ticks=80, cameras=array_cameras()[:3])
     opened = open_stage(SavedModel(model("static"), fitting), small_scene)
-    assert opened.scene is not None and opened.picture("spike rate", opened.scene.cameras[2], 1e9).shape == (24, 40, 3)
+    assert opened.scene is not None and opened.image("spike rate", opened.scene.cameras[2], 1e9).shape == (24, 40, 3)
 
 
-def test_a_free_camera_at_a_training_cameras_place_sees_its_picture() -> None:
+def test_a_free_camera_at_a_training_cameras_place_sees_its_image() -> None:
     camera = TRAINED[0]
     aspect = camera.width / camera.height
     _, fov = matching(TRAINED, camera.id, aspect)
@@ -93,14 +93,12 @@ def test_a_free_camera_at_a_training_cameras_place_sees_its_picture() -> None:
 
 
 @pytest.mark.parametrize(("aspect", "shape"), [(1.0, (40, 40)), (40 / 24, (24, 40)), (3.0, (24, 72))])
-def test_a_picture_is_padded_to_the_window(aspect: float, shape: tuple[int, int]) -> None:
-    picture = np.full((24, 40, 3), 200, np.uint8)
-    found = padded(picture, aspect)
-    assert (
-        found.shape == (*shape, 3) and (found == 200).sum() == picture.size and set(np.unique(found)) <= {200, BORDER}
-    )
+def test_a_image_is_padded_to_the_window(aspect: float, shape: tuple[int, int]) -> None:
+    image = np.full((24, 40, 3), 200, np.uint8)
+    found = padded(image, aspect)
+    assert found.shape == (*shape, 3) and (found == 200).sum() == image.size and set(np.unique(found)) <= {200, BORDER}
     camera, fov = matching(TRAINED, TRAINED[0].id, aspect)
-    assert 2 * camera.fy * np.tan(fov / 2) == pytest.approx(shape[0]), "the window's angle is the padded picture's"
+    assert 2 * camera.fy * np.tan(fov / 2) == pytest.approx(shape[0]), "the window's angle is the padded image's"
 
 
 def test_without_viser_the_command_says_what_to_install(
@@ -127,18 +125,18 @@ def viewer() -> Iterator[Viewer]:
     assert not loop.is_alive()
 
 
-def difference(page: Page, picture: UInt8) -> float:
-    """Mean difference, of 255, of the page from a gray picture that fills it: in the middle, beside the controls and
+def difference(page: Page, image: UInt8) -> float:
+    """Mean difference, of 255, of the page from a gray image that fills it: in the middle, beside the controls and
     viser's own notes."""
     shot = page.screenshot().astype(float)
-    wanted = cv2.resize(picture[:, :, 0], shot.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    wanted = cv2.resize(image[:, :, 0], shot.shape[::-1], interpolation=cv2.INTER_LINEAR)
     free = slice(int(0.36 * shot.shape[1]), int(0.64 * shot.shape[1]))
     return float(np.abs(shot[:, free] - wanted[:, free]).mean())
 
 
-def shows(page: Page, picture: UInt8, other: UInt8) -> bool:
-    """Whether the page shows the one picture and not the other: it comes in a quality of its own, and coarser first."""
-    return difference(page, picture) < difference(page, other) / 2
+def shows(page: Page, image: UInt8, other: UInt8) -> bool:
+    """Whether the page shows the one image and not the other: it comes in a quality of its own, and coarser first."""
+    return difference(page, image) < difference(page, other) / 2
 
 
 @pytest.mark.slow
@@ -146,24 +144,24 @@ def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp
     with browser(tmp_path) as page:
         page.call("Page.navigate", url=viewer.url)
         wait_for("slider", lambda: page.value("!!document.querySelector('[role=slider]')"))
-        wait_for("sharp picture", lambda: viewer.pictures >= 2)
+        wait_for("sharp image", lambda: viewer.images >= 2)
         # The window opens at the middle camera, as wide as the browser.
         camera = still(TRAINED)(0.0)
         _, fov = matching(TRAINED, camera.id, WIDTH / HEIGHT)
         free = free_camera(camera.R.T, camera.center, fov, WIDTH / HEIGHT, 4 * camera.width * camera.height)
-        first, last = (viewer.stage.picture("rendered", free, t) for t in (0.0, viewer.time.max))
+        first, last = (viewer.stage.image("rendered", free, t) for t in (0.0, viewer.time.max))
         assert np.abs(first.astype(float) - last).mean() > 4, "a test of nothing"
-        wait_for("picture at the start", lambda: shows(page, first, last))
+        wait_for("image at the start", lambda: shows(page, first, last))
         page.value("document.querySelector('[role=slider]').focus()")
         page.press("End")
-        wait_for("picture at the end", lambda: shows(page, last, first))
+        wait_for("image at the end", lambda: shows(page, last, first))
         assert viewer.time.value == viewer.time.max
         assert "frames/s" in viewer.speed.value
 
-        # Spikes are shown where a camera stood: the nearest one is chosen, and the picture keeps its shape.
+        # Spikes are shown where a camera stood: the nearest one is chosen, and the image keeps its shape.
         viewer.mode.value = "spike rate"
         wait_for("camera", lambda: viewer.camera.value == camera.id)
-        rate = padded(viewer.stage.picture("spike rate", camera, viewer.time.max), WIDTH / HEIGHT)
+        rate = padded(viewer.stage.image("spike rate", camera, viewer.time.max), WIDTH / HEIGHT)
         wait_for("spike rate", lambda: difference(page, rate) < 4)
         viewer.camera.value = FREE
         wait_for("rendered again", lambda: viewer.mode.value == "rendered" and shows(page, last, first))

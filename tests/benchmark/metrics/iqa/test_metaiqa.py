@@ -19,7 +19,7 @@ from spike4dgs.benchmark.weights import METAIQA, VARIABLE
 State = dict[str, torch.Tensor]
 
 
-def picture(seed: int = 0, height: int = 60, width: int = 90) -> NDArray[np.uint8]:
+def make_image(seed: int = 0, height: int = 60, width: int = 90) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
 
 
@@ -74,7 +74,7 @@ def plain_score(state: State, image: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize("seed", [1])
 def test_equals_the_network_written_out_in_float64(seed: int) -> None:
-    state, image = random_state(seed), picture(seed)
+    state, image = random_state(seed), make_image(seed)
     network = load_into(metaiqa_network(), state, "x")
     assert predict(network, image) == pytest.approx(plain_score(state, image), abs=1e-4)
 
@@ -101,16 +101,16 @@ def test_weights_come_from_the_users_file_and_are_named_by_their_hash(
     path = tmp_path / METAIQA.name
     torch.save(state, path)
     monkeypatch.setenv(VARIABLE, str(path))
-    assert metaiqa(picture()) == predict(load_into(metaiqa_network(), state, "x"), picture())
+    assert metaiqa(make_image()) == predict(load_into(metaiqa_network(), state, "x"), make_image())
     assert select_metrics(("metaiqa",)).weights["metaiqa"] == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((60, 90), np.uint8), "expected a picture of something, found one value everywhere"),
-        (picture() / 255, "expected an 8-bit gray image, found float64"),
-        (picture()[..., None], r"found uint8 \(60, 90, 1\)"),
+        (np.zeros((60, 90), np.uint8), "expected an image of something, found one value everywhere"),
+        (make_image() / 255, "expected an 8-bit gray image, found float64"),
+        (make_image()[..., None], r"found uint8 \(60, 90, 1\)"),
     ],
 )
 def test_other_images_are_refused(image: NDArray, message: str) -> None:

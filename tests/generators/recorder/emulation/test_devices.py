@@ -78,7 +78,7 @@ def test_reads_of_any_size_bring_the_stream_less_what_is_lost(
 
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows", "line-tagged"])
 @pytest.mark.parametrize(("rows", "mirrored"), [("bottom-up", False), ("top-down", False), ("top-down", True)])
-def test_a_camera_sends_its_picture_as_its_profile_says(two: Scene, layout: str, rows: str, mirrored: bool) -> None:
+def test_a_camera_sends_its_image_as_its_profile_says(two: Scene, layout: str, rows: str, mirrored: bool) -> None:
     profile = profile_of(two, layout=layout)
     source = two.stream("cam_00").packed
     camera = EmulatedCamera(replace(profile.cameras[0], rows=rows, mirrored=mirrored), profile, source)

@@ -112,7 +112,7 @@ def test_a_frame_of_two_parts_is_torn_wherever_they_meet_after_its_first_row(dis
 
 @pytest.mark.parametrize(("width", "height"), [(16, 4), (13, 5), (8, 1), (1, 9), (400, 250)])
 @pytest.mark.parametrize(("flip", "mirror"), [(False, False), (True, False), (False, True), (True, True)])
-def test_orientation_equals_that_of_unpacked_pictures(width: int, height: int, flip: bool, mirror: bool) -> None:
+def test_orientation_equals_that_of_unpacked_images(width: int, height: int, flip: bool, mirror: bool) -> None:
     packed = packed_ticks(width, height, 2)
     images = np.unpackbits(packed, axis=1, count=width * height, bitorder="little").reshape(-1, height, width)
     images = images[:, :: -1 if flip else 1, :: -1 if mirror else 1]
