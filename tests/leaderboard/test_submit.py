@@ -349,7 +349,7 @@ def test_damaged_entries_are_refused_by_name(done: Path, change: Any, message: s
 
 def test_predictions_of_another_program_are_scored_and_verified(done: Path) -> None:
     """No key, no environment, no times: a folder written with other tools."""
-    from spike4dgs.benchmark.results.score import score
+    from spike4dgs.benchmark.runs.score_command import score
 
     theirs = done / "theirs"
     for scene in ("pattern-0", "pattern-1"):

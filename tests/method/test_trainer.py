@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from toy_fits import PARTS, WORLD, method, pictures, silent, surfaces
+from toy_fits import PARTS, WORLD, images, method, silent, surfaces
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget
@@ -53,7 +53,7 @@ def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel
     extent = measure(start, scene)
     first = from_points(start.points[::3], start.values[::3], opacity=0.5)
     model = MOTIONS[motion](extent, s, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, pictures, s, "cpu")
+    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
     loss = SUPERVISIONS[supervision](s, scene)
     return Trainer(training_images, model.attach(first, training_images), model, loss, s, scale=extent.scale, seed=3)
 

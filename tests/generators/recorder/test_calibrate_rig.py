@@ -37,7 +37,7 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
     View,
     choose_views,
     common_cameras,
-    picture,
+    make_image,
 )
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Freedom,
@@ -273,10 +273,10 @@ def test_views_are_spread_over_the_clips_and_images_with_lost_ticks_are_none():
     ]
     views = choose_views(recordings, 6, 10)
     assert views == [View(0, 0, 10), View(0, 20, 30), View(0, 40, 50), View(1, 0, 10), View(1, 5, 15), View(1, 10, 20)]
-    assert picture(recordings[0], "b", View(0, 20, 30)).min() == 1.0
-    assert picture(recordings[0], "b", View(0, 21, 31)) is None
-    assert picture(recordings[0], "b", View(0, 34, 44)) is None
-    assert picture(recordings[0], "a", View(0, 34, 44)) is not None
+    assert make_image(recordings[0], "b", View(0, 20, 30)).min() == 1.0
+    assert make_image(recordings[0], "b", View(0, 21, 31)) is None
+    assert make_image(recordings[0], "b", View(0, 34, 44)) is None
+    assert make_image(recordings[0], "a", View(0, 34, 44)) is not None
     with pytest.raises(UserError, match="two: expected a window of 1 to 20 ticks"):
         choose_views(recordings, 6, 30)
 

@@ -56,7 +56,7 @@ def job(
 ) -> FitJob:
     footage, start = shown()
     if still:
-        footage = replace(footage, pictures=footage.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
+        footage = replace(footage, images=footage.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
     scene = TrainingScene("toy", "toy", CAMERAS, (), 20000.0, WORLD.n_ticks, 0.6)
     settings = replace(TrackingSettings(), **changes)
     return FitJob(scene, start, footage, measure(start, scene), settings, "cpu", 0, progress, checkpoint, "this")
