@@ -8,7 +8,6 @@ such as a time of day or a duration, enters the scene.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import time
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json, writing
+from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -268,16 +268,9 @@ class Maker:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Keep a second process off the same scene. The system lifts the lock when the process ends, however it ends."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        f = open(path, "w")
-    with f:
-        try:
-            fcntl.flock(f, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise problem(path.stem, "a scene that nobody else makes", "a run in progress", "wait for it") from None
+    """Keep a second process off the same scene, and remove the lock file where the scene is done."""
+    with locked(path, path.stem, "a scene that nobody else makes"):
         yield
-    path.unlink(missing_ok=True)  # reached only where the scene is done
+    path.unlink(missing_ok=True)
     if not any(path.parent.iterdir()):
         path.parent.rmdir()

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
 
 Image = NDArray[np.floating]
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-WINDOW = 11  # pixels; the side of SSIM's Gaussian window (sigma 1.5, cut off at 3.5 sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class ImagePair:
             self.truth,
             self.prediction,
             gaussian_weights=True,
-            sigma=1.5,
+            sigma=SSIM_SIGMA,
             use_sample_covariance=False,
             data_range=1,
             full=True,
@@ -81,8 +81,8 @@ def check_images(truth: Image, prediction: Image, moving: Mask, where: str) -> N
     """Raise UserError unless the arrays are finite float images of one size, at least SSIM's window, and a mask."""
     if prediction.ndim != 2 or prediction.shape != truth.shape:
         raise problem(where, f"a gray image of shape {truth.shape}", f"shape {prediction.shape}", "render that size")
-    if min(truth.shape) < WINDOW:
-        raise problem(where, f"at least {WINDOW}x{WINDOW} pixels", f"{truth.shape}", "use a larger image")
+    if min(truth.shape) < SSIM_WINDOW:
+        raise problem(where, f"at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels", f"{truth.shape}", "use a larger image")
     for name, image in (("truth", truth), ("prediction", prediction)):
         if not np.issubdtype(image.dtype, np.floating):
             raise problem(where, f"a {name} in floating point", str(image.dtype), "store linear radiance, 1.0 = white")

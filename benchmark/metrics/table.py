@@ -1,13 +1,13 @@
 """The metric table, which the scorer, the command line, the leaderboard and the docs read.
 
-Two kinds of input, and the table says which a metric takes:
+A metric takes one of two kinds of input:
 
 - `linear`: gray linear radiance in the dataset's known unit (1.0 = white), clipped to [0, 1]: no gamma, no scaling.
 - `srgb8`: the same image sRGB-encoded with 8 bits, as people see it: for perceptual and no-reference metrics.
 
-The `*_aligned` metrics see the prediction times one least-squares gain per scene, which forgives a method that does not
-know the exposure. The `*_dynamic` ones look only at the moving region that the dataset marks. Metrics of linear images
-are always computed. Of the others, those are that the machine has weights for, or those that were asked for by name.
+The `*_aligned` metrics multiply the prediction by one least-squares gain per scene, which forgives a method that does
+not know the exposure. The `*_dynamic` metrics use only the moving region that the dataset marks. Metrics of linear
+images are always computed. The others are computed where the machine has their weights, or only those asked for.
 
 JSON has no infinity: identical images, whose PSNR is infinite, count as `MAX_PSNR_DB`, and the record says so.
 """
@@ -25,24 +25,26 @@ import numpy as np
 
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
+from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.weights import METAIQA, WeightFile
 
 MAX_PSNR_DB = 100.0  # half-float images with any error at all stay far below it
 
 
 class Images(Enum):
-    """The images of a scene that have a value. The dataset alone decides that, so they are the same for all methods."""
+    """The images of a scene for which a metric has a value. The dataset decides, so all methods share them."""
 
     EVERY = "images"
     MOVING = "images that have a moving region"
     LATER = "images that have an earlier one of their camera"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One row of the table. `measure` maps an image pair to a value, or to None where the dataset defines none.
+    """One row of the table.
 
-    It raises UserError for a prediction that the metric refuses: no value of the scene then.
+    `measure` returns the value of an image pair, or None where the dataset defines none. It raises UserError for a
+    prediction that the metric refuses; the scene then has no value.
     """
 
     id: str
@@ -57,11 +59,11 @@ class Metric:
     images: Images = Images.EVERY
     weights: WeightFile | None = None  # a file that users bring; None: always computable
     aligned: bool = False  # the prediction is first multiplied by the scene's gain
-    blind: bool = False  # it does not look at the truth, so the truth has a score of its own
-    tolerance: float = 1e-6  # how far the same files' values may lie apart on two machines
+    blind: bool = False  # it does not use the truth, so the truth has a score of its own
+    tolerance: float = 1e-6  # largest difference between two machines' values of the same files
 
     def format(self, value: float | None) -> str:
-        """The value as people read it; a dash for null."""
+        """Return the value as people read it; a dash for null."""
         return "-" if value is None else f"{value:.{self.digits}f}"
 
 
@@ -130,50 +132,51 @@ def _metaiqa(pair: ImagePair) -> float:
 
 _PSNR_CALL = "skimage.metrics.peak_signal_noise_ratio(truth, prediction, data_range=1)"
 _SSIM_CALL = (
-    "skimage.metrics.structural_similarity(truth, prediction, gaussian_weights=True, sigma=1.5, "
+    f"skimage.metrics.structural_similarity(truth, prediction, gaussian_weights=True, sigma={SSIM_SIGMA:g}, "
     "use_sample_covariance=False, data_range=1)"
 )
 _BASE = (
     Metric(
-        "psnr",
-        "PSNR",
-        f"10 log10(1 / MSE) over all pixels; identical images count as {MAX_PSNR_DB:g} dB",
-        True,
-        _PSNR_CALL,
-        _psnr,
-        "dB",
-        2,
+        id="psnr",
+        title="PSNR",
+        definition=f"10 log10(1 / MSE) over all pixels; identical images count as {MAX_PSNR_DB:g} dB",
+        higher_is_better=True,
+        implementation=_PSNR_CALL,
+        measure=_psnr,
+        unit="dB",
+        digits=2,
     ),
     Metric(
-        "ssim",
-        "SSIM",
-        "structural similarity, 11x11 Gaussian window with sigma 1.5, data range 1, mean over the image",
-        True,
-        _SSIM_CALL,
-        _ssim,
-        "",
-        4,
+        id="ssim",
+        title="SSIM",
+        definition=f"structural similarity, {SSIM_WINDOW}x{SSIM_WINDOW} Gaussian window with sigma {SSIM_SIGMA:g}, "
+        "data range 1, mean over the image",
+        higher_is_better=True,
+        implementation=_SSIM_CALL,
+        measure=_ssim,
+        unit="",
+        digits=4,
     ),
     Metric(
-        "psnr_dynamic",
-        "PSNR, moving region",
-        f"10 log10(1 / MSE) over the pixels of the moving region; no error counts as {MAX_PSNR_DB:g} dB",
-        True,
-        "-10 * log10(mean((truth - prediction)[moving] ** 2))",
-        _psnr_dynamic,
-        "dB",
-        2,
+        id="psnr_dynamic",
+        title="PSNR, moving region",
+        definition=f"10 log10(1 / MSE) over the pixels of the moving region; no error counts as {MAX_PSNR_DB:g} dB",
+        higher_is_better=True,
+        implementation="-10 * log10(mean((truth - prediction)[moving] ** 2))",
+        measure=_psnr_dynamic,
+        unit="dB",
+        digits=2,
         images=Images.MOVING,
     ),
     Metric(
-        "ssim_dynamic",
-        "SSIM, moving region",
-        "mean over the moving region of the SSIM map of the whole image",
-        True,
-        _SSIM_CALL.replace("data_range=1)", "data_range=1, full=True)[1][moving].mean()"),
-        _ssim_dynamic,
-        "",
-        4,
+        id="ssim_dynamic",
+        title="SSIM, moving region",
+        definition="mean over the moving region of the SSIM map of the whole image",
+        higher_is_better=True,
+        implementation=_SSIM_CALL.replace("data_range=1)", "data_range=1, full=True)[1][moving].mean()"),
+        measure=_ssim_dynamic,
+        unit="",
+        digits=4,
         images=Images.MOVING,
     ),
 )
@@ -192,14 +195,15 @@ def _aligned(m: Metric) -> Metric:
 
 def _lpips_metric(net: str, title: str) -> Metric:
     return Metric(
-        f"lpips_{net}",
-        f"LPIPS, {title}",
-        f"learned perceptual distance, version 0.1, of {title} features; gray repeated to three channels",
-        False,
-        f"benchmark/metrics/lpips.py; equals lpips 0.1.4, LPIPS(net='{net}'), with the weights {TRUNKS[net].name}",
-        partial(_lpips, net),
-        "",
-        4,
+        id=f"lpips_{net}",
+        title=f"LPIPS, {title}",
+        definition=f"learned perceptual distance, version 0.1, of {title} features; gray repeated to three channels",
+        higher_is_better=False,
+        implementation=f"benchmark/metrics/lpips.py; equals lpips 0.1.4, LPIPS(net='{net}'), "
+        f"with the weights {TRUNKS[net].name}",
+        measure=partial(_lpips, net),
+        unit="",
+        digits=4,
         takes="srgb8",
         weights=TRUNKS[net],
         tolerance=1e-4,  # float32 convolutions, summed in another order by every library
@@ -211,67 +215,69 @@ _PERCEPTUAL = (
     _lpips_metric("vgg", "VGG-16"),
     _lpips_metric("squeeze", "SqueezeNet 1.1"),
     Metric(
-        "flip",
-        "FLIP",
-        "mean visible error when truth and prediction alternate on a screen with 67.02 pixels per degree",
-        False,
-        "benchmark/metrics/flip.py; equals flip-evaluator 1.7, evaluate(truth, prediction, 'LDR'), "
+        id="flip",
+        title="FLIP",
+        definition="mean visible error when truth and prediction alternate on a screen with 67.02 pixels per degree",
+        higher_is_better=False,
+        implementation="benchmark/metrics/flip.py; equals flip-evaluator 1.7, evaluate(truth, prediction, 'LDR'), "
         "gray as three channels",
-        _flip,
-        "",
-        4,
+        measure=_flip,
+        unit="",
+        digits=4,
         takes="srgb8",
     ),
     Metric(
-        "brisque",
-        "BRISQUE",
-        "no-reference score by natural scene statistics and the LIVE release's regression; not bounded",
-        False,
-        "benchmark/metrics/iqa/brisque.py; follows the authors' MATLAB release, not MATLAB's own brisque",
-        _brisque,
-        "",
-        2,
-        takes="srgb8",
-        blind=True,
-        tolerance=1e-4,
-    ),
-    Metric(
-        "niqe",
-        "NIQE",
-        "no-reference distance to the statistics of pristine photographs; not comparable across image sizes",
-        False,
-        "benchmark/metrics/iqa/niqe.py; follows the authors' MATLAB release, not MATLAB's own niqe",
-        _niqe,
-        "",
-        3,
+        id="brisque",
+        title="BRISQUE",
+        definition="no-reference score by natural scene statistics and the LIVE release's regression; not bounded",
+        higher_is_better=False,
+        implementation="benchmark/metrics/iqa/brisque.py; follows the authors' MATLAB release, "
+        "not MATLAB's own brisque",
+        measure=_brisque,
+        unit="",
+        digits=2,
         takes="srgb8",
         blind=True,
         tolerance=1e-4,
     ),
     Metric(
-        "metaiqa",
-        "MetaIQA",
-        "no-reference score in 0..1 of a ResNet-18; depends on the weights, whose hash is in the record",
-        True,
-        f"benchmark/metrics/iqa/metaiqa.py with the user's {METAIQA.name}",
-        _metaiqa,
-        "",
-        4,
+        id="niqe",
+        title="NIQE",
+        definition="no-reference distance to the statistics of pristine photographs; not comparable across image sizes",
+        higher_is_better=False,
+        implementation="benchmark/metrics/iqa/niqe.py; follows the authors' MATLAB release, not MATLAB's own niqe",
+        measure=_niqe,
+        unit="",
+        digits=3,
+        takes="srgb8",
+        blind=True,
+        tolerance=1e-4,
+    ),
+    Metric(
+        id="metaiqa",
+        title="MetaIQA",
+        definition="no-reference score in 0..1 of a ResNet-18; depends on the weights, whose hash is in the record",
+        higher_is_better=True,
+        implementation=f"benchmark/metrics/iqa/metaiqa.py with the user's {METAIQA.name}",
+        measure=_metaiqa,
+        unit="",
+        digits=4,
         takes="srgb8",
         blind=True,
         weights=METAIQA,
         tolerance=1e-4,
     ),
     Metric(
-        "temporal_error",
-        "Temporal error",
-        "mean over pixels of |d prediction/dt - d truth/dt| between consecutive targets of a camera; a prediction "
-        "that never changes scores the mean |d truth/dt|",
-        False,
-        "mean(|(prediction - earlier prediction) - (truth - earlier truth)|) / (milliseconds between them)",
-        _temporal_error,
-        "1/ms",
-        4,
+        id="temporal_error",
+        title="Temporal error",
+        definition="mean over pixels of |d prediction/dt - d truth/dt| between consecutive targets of a camera; "
+        "a prediction that never changes scores the mean |d truth/dt|",
+        higher_is_better=False,
+        implementation="mean(|(prediction - earlier prediction) - (truth - earlier truth)|) / "
+        "(milliseconds between them)",
+        measure=_temporal_error,
+        unit="1/ms",
+        digits=4,
         images=Images.LATER,
     ),
 )

@@ -12,11 +12,9 @@ A run on another split than the default one keeps all this in OUT/SPLIT/, and so
 
 from __future__ import annotations
 
-import fcntl
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +24,8 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.runs.cell import Job, is_done, run_job
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import write_text, writing
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.reports.paper_files import write_paper_table
 from spike4dgs.benchmark.method import Budget, Method, find_methods, make_budget
 from spike4dgs.benchmark.results.refinement import SUFFIX
@@ -73,7 +72,10 @@ def run_matrix(
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
     records = []
-    with _lock(settings.out), RunDisplay(console, len(scenes) * len(methods)) as display:
+    with (
+        locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
+        RunDisplay(console, len(scenes) * len(methods)) as display,
+    ):
         for method in methods:
             jobs = [Job(method, scene, settings.seed, settings.device, settings.budget) for scene in scenes]
             rows = [_run_cell(job, selection, settings.out, display) for job in jobs]
@@ -119,20 +121,6 @@ def _check_inputs(scene: Scene) -> None:
     for t in scene.targets:
         scene.manifest.path(f"images/{t.name}.exr")
         scene.manifest.path(f"masks/{t.name}.png")
-
-
-@contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    """Keep a second run out of the folder. The system lifts the lock when the process ends, however it ends."""
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        lock = open(out / ".lock", "w")
-    with lock as f:
-        try:
-            fcntl.flock(f, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise problem(out, "a folder that no other run uses", "a run in progress", "wait for it") from None
-        yield
 
 
 def run_benchmark(
