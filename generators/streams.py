@@ -12,6 +12,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators import conventional, events
 from spike4dgs.generators.profiles import RATE_HZ, Job
@@ -19,7 +20,7 @@ from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.sensor import calibration
 from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
 
@@ -52,7 +53,7 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
     return Sensor(
         gain=gain_map(*pixels) if job.gain_map else None,
         dark=dark_map(*pixels) if job.dark_map else None,
-        photons=PHOTONS_PER_SPIKE if job.shot_noise else None,
+        photons=SENSOR.photons_per_spike if job.shot_noise else None,
         noise_seed=(job.seed, job.variant, *f"{job.world} {camera.id} photons".encode()),
     )
 
@@ -60,13 +61,13 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
 def sensor_facts(job: Job) -> dict[str, Any]:
     """`sensor` of scene.json."""
     return {
-        "model": "integrate-and-fire/2",
+        "model": SENSOR.name,
         "rows_bottom_up": True,
-        "reset": "subtractive",
-        "most_spikes_per_tick": 1,
+        "reset": SENSOR.reset,
+        "most_spikes_per_tick": SENSOR.most_spikes_per_tick,
         "gain_map": job.gain_map,
         "dark_map": job.dark_map,
-        "photons_per_spike": PHOTONS_PER_SPIKE if job.shot_noise else None,
+        "photons_per_spike": SENSOR.photons_per_spike if job.shot_noise else None,
     }
 
 

@@ -26,8 +26,8 @@ from spike4dgs.benchmark.scene.bursts import (
     stack_bursts,
     write_bursts,
 )
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, RADIANCE_GAIN
 
 if TYPE_CHECKING:
     from spike4dgs.generators.bursts.render import BurstRenderer
@@ -55,7 +55,7 @@ class MakeBursts:
         rigs = max(1, self.rigs // 2) if variant in HIDDEN_VARIANTS else self.rigs
         size = self.width, self.height
         sampling = VIEWS, rigs, self.instants, self.spp
-        return BurstFacts(world, variant, self.seed, *size, *sampling, RADIANCE_GAIN, PHOTONS_PER_SPIKE)
+        return BurstFacts(world, variant, self.seed, *size, *sampling, SENSOR.radiance_gain, SENSOR.photons_per_spike)
 
     def __call__(self, chunk: tuple[str, int]) -> tuple[BurstFacts, Arrays]:
         """The shard's facts and arrays."""

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.speed.timing import module_of, show_table, time_ms
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
 from spike4dgs.benchmark.spikes.stream import UInt8, count_bits, pack
 from spike4dgs.generators.sensor import model as camera
-from spike4dgs.generators.sensor.kernels import THRESHOLD
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Float32, Int32, Keys, Sensor, random_charge
+from spike4dgs.generators.sensor.model import Float32, Int32, Keys, Sensor, random_charge
 from spike4dgs.generators.sensor.reference import fire, tick_means
 
 COLUMNS = ("simulator", "threads", "ms", "Mpx-ticks/s", "x numpy", "x spikezoo", "largest count error", "pixels off, %")
@@ -117,7 +117,7 @@ def _our_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run
     height, width = keys.shape[1:]
     pixels, charge = (height, width, 0, "cam_00"), random_charge(height, width, [0])
     plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
-    noisy = replace(maps, photons=PHOTONS_PER_SPIKE)
+    noisy = replace(maps, photons=SENSOR.photons_per_spike)
 
     def ours(sensor: Sensor, threads: int) -> Callable[[], UInt8]:
         at = ticks.tolist()

@@ -14,8 +14,8 @@ from numba import types
 from numba.extending import intrinsic
 
 from spike4dgs.benchmark.spikes.bits import kernel
+from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 
-THRESHOLD = 2**31  # charge units at which a pixel fires
 BLOCK = 64  # pixels whose spikes make one word
 STRIP = 16  # blocks taken through all intervals of a batch before the next: 128 bytes of a row, two cache lines
 

@@ -45,15 +45,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
 from spike4dgs.benchmark.spikes.stream import UInt8, bytes_per_tick
-from spike4dgs.generators.sensor.kernels import BLOCK, STRIP, THRESHOLD, integrate
+from spike4dgs.generators.sensor.kernels import BLOCK, STRIP, integrate
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
-RADIANCE_GAIN = 0.6  # spikes per tick of a pixel that sees white
-PHOTONS_PER_SPIKE = 5e4  # of a real camera; see `sensor_maps` for the rest of its statistics
 DEVIATE_SD = 21845**0.5  # of `sensor_kernels.deviate`
 MOST_DEVIATION = 510 / DEVIATE_SD
 _BATCH_BYTES = 16 << 20  # of key frames in memory at a time
@@ -71,7 +70,7 @@ class Sensor:
         noise_seed: what its random numbers are a function of.
     """
 
-    radiance_gain: float = RADIANCE_GAIN
+    radiance_gain: float = SENSOR.radiance_gain
     gain: Float32 | None = None
     dark: Float32 | None = None
     photons: float | None = None

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.sensor.kernels import THRESHOLD
+from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD, charge_after_spike, charge_of_tick
 from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_DEVIATION, Float32, Int32, Keys, Sensor
 
 Float64 = NDArray[np.float64]
@@ -54,11 +54,10 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
     for tick, mean in enumerate(means):
-        level = level + np.clip(gain * sensor.radiance_gain * mean + dark, 0.0, 1 + sd * MOST_DEVIATION)
+        level = level + charge_of_tick(gain * sensor.radiance_gain * mean, dark, 1 + sd * MOST_DEVIATION)
         fired = level >= 1.0
         yield fired, level
-        level = level - fired * (1 + sd * deviates(pixels, tick, sensor.noise_key))
-        level = np.minimum(level, 1 - 2**-31)  # a full well
+        level = charge_after_spike(level, fired * (1 + sd * deviates(pixels, tick, sensor.noise_key)))
 
 
 def deviates(pixels: NDArray[np.uint64], tick: int, key: int) -> Float64:

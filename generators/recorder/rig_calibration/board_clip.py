@@ -21,10 +21,11 @@ from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, RADIANCE_GAIN, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 RATE_HZ = 20000
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames, and how far the board moves in that time at most
@@ -164,7 +165,7 @@ def write_board_clip(
         sensor = Sensor(
             gain=gain_map(*size, seed, camera.id),
             dark=dark_map(*size, seed, camera.id),
-            photons=PHOTONS_PER_SPIKE,
+            photons=SENSOR.photons_per_spike,
             noise_seed=tuple(entropy),
         )
         with SpikeWriter(out / stream_name(camera.id), camera.width, camera.height) as writer:
@@ -183,7 +184,7 @@ def write_board_clip(
             test=(),
             rate_hz=float(RATE_HZ),
             n_ticks=n_ticks,
-            radiance_gain=RADIANCE_GAIN,
+            radiance_gain=SENSOR.radiance_gain,
             targets=(),
             sensor={"model": "integrate-and-fire/2", "rows_bottom_up": True},
             source={

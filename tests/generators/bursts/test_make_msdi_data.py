@@ -22,11 +22,12 @@ from spike4dgs.benchmark.scene.bursts import (
 )
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.spikes.bits import unpack
+from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.generators.bursts import make_msdi_data as msdi_data
 from spike4dgs.generators.bursts.make_msdi_data import MakeBursts, make_msdi_data
 from spike4dgs.generators.bursts.rig_jitter import jittered_cameras
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.sensor.model import THRESHOLD, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.worlds import WORLDS
 from spike4dgs.method.msdi.training.data import Bursts, check_ticks, chosen, mirrored, points_of, varied
 from spike4dgs.method.msdi.training.spikes import Pixels, fire, make_spikes

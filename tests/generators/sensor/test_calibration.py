@@ -12,10 +12,11 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 from spike4dgs.generators.sensor import calibration
 from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor
+from spike4dgs.generators.sensor.model import Sensor
 
 WIDTH, HEIGHT = 200, 125
 
@@ -28,13 +29,19 @@ def recordings(folder, sensor):
     return Recordings(flat, dark, calibration.FLAT_RADIANCE)
 
 
+def real_sensor(pixels):
+    """Return a sensor with maps and shot noise."""
+    photons = SENSOR.photons_per_spike
+    return Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=photons, noise_seed=(3,))
+
+
 def rms(found, truth):
     return float(np.sqrt(np.mean((found / truth - 1) ** 2)))
 
 
 def test_maps_are_recovered_from_what_a_scene_ships(tmp_path):
     pixels = HEIGHT, WIDTH, 0, "cam_00"
-    sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+    sensor = real_sensor(pixels)
     made = recordings(tmp_path, sensor)
     flat, dark = made.flat, made.dark
     assert (flat.n_ticks, dark.n_ticks) == (calibration.FLAT_TICKS, calibration.DARK_TICKS)
@@ -77,7 +84,7 @@ def test_recordings_that_do_not_fit_are_refused():
 def scene_with_recordings(root, facts):
     for camera in array_cameras():
         pixels = camera.height, camera.width, 0, camera.id
-        sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=PHOTONS_PER_SPIKE, noise_seed=(3,))
+        sensor = real_sensor(pixels)
         calibration.write_calibration(root / "calibration", camera, sensor, [1, 2])
         if camera.id != "cam_03":  # nobody knows the truth of this one
             write_maps(root / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})

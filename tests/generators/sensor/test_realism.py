@@ -8,9 +8,10 @@ from scipy.ndimage import gaussian_filter
 from small_scenes import shared_file
 
 from spike4dgs.benchmark.scene.calibration import rates
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
-from spike4dgs.generators.sensor.model import PHOTONS_PER_SPIKE, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.statistics import WINDOWS, excess_variance, local_spread, stream_statistics
 
 HEIGHT, WIDTH, TICKS = 250, 400, 500
@@ -20,7 +21,7 @@ GAIN_LOCAL, GAIN_SPREAD, DARK_PERCENTILES, HOT = 0.032, 0.058, (0.0015, 0.0045, 
 WITHIN = 0.15
 
 
-def real_sensor(photons: float | None = PHOTONS_PER_SPIKE) -> Sensor:
+def real_sensor(photons: float | None = SENSOR.photons_per_spike) -> Sensor:
     pixels = HEIGHT, WIDTH, 0, "cam_00"
     return Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=photons, noise_seed=(0,))
 
@@ -97,7 +98,7 @@ def test_still_pixels_of_a_real_recording_and_of_a_simulation_at_their_rates():
     light = (rates(stream) / 0.6).astype(np.float32)
     a = stream_statistics(real, still)
     ours = {n: stream_statistics(record(light, Sensor(photons=n), len(real)), still) for n in (2.5e4, 5e4, 1e5)}
-    b = ours[PHOTONS_PER_SPIKE]
+    b = ours[SENSOR.photons_per_spike]
     assert b.one_interval == pytest.approx(a.one_interval, rel=WITHIN)
     assert b.two_intervals == pytest.approx(a.two_intervals, rel=WITHIN)
     assert b.other_intervals == pytest.approx(a.other_intervals, rel=WITHIN)
