@@ -1,19 +1,32 @@
-"""Weight files that users bring: where they are looked for, and proof that they are the right ones.
+"""Weight files: where they lie, proof that they are the right ones, and their tensors.
 
-Nothing is downloaded. A file is taken from the folder (or is the file) that the environment variable SPIKE4DGS_WEIGHTS
-names, or from the folder in which torch hub keeps what it has downloaded. torch hub does not hash files that it has
-already; here every file is hashed, once per process.
+A part that needs weights states its facts, as a `WeightFile` or a `NamedWeights`, and the rest is done here:
+
+    find_weights(facts)                                  the file, its hash checked
+    read_header(path, ...), read_tensors(path, ...)      its metadata; its tensors
+    load_into(network, tensors, path)                    the network with them, ready to run
+
+Nothing is downloaded, and no code of a file runs. Files are hashed once per process; torch hub does not hash files that
+it has already.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
+
+if TYPE_CHECKING:  # torch takes seconds to import and is needed only where there are weights
+    from torch import Tensor, nn
+
+    NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 VARIABLE = "SPIKE4DGS_WEIGHTS"
 TORCHVISION = "https://download.pytorch.org/models/"
@@ -21,7 +34,11 @@ TORCHVISION = "https://download.pytorch.org/models/"
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A file that a metric needs. Without `sha256` any file of that name is taken, and its hash is recorded."""
+    """A file that users bring, found by its name: in the folder (or beside the file) that the environment variable
+    SPIKE4DGS_WEIGHTS names, else in torch hub's folder.
+
+    Without `sha256` any file of that name is taken, and its hash is recorded.
+    """
 
     name: str
     bytes: int | None
@@ -35,13 +52,58 @@ class WeightFile:
         size = f"{self.bytes} bytes" if self.bytes else "any size"
         return f"{self.name} ({self.purpose}; {size}, sha256 {self.sha256 or 'not fixed'})"
 
+    @property
+    def need(self) -> str:
+        """The reason of a missing value in a record, without paths of this machine."""
+        return f"needs the file {self.description}, which is not on this machine"
+
+    @property
+    def fix(self) -> str:
+        """The advice where the file is missing."""
+        return f"get it from {self.source} and put it there, or set {VARIABLE} to the folder that holds it"
+
+    @property
+    def candidates(self) -> list[Path]:
+        """The paths where the file may lie; the first that exists counts."""
+        given = _given(VARIABLE)
+        folders = [hub_folder()]
+        if given is not None:
+            folders.insert(0, given.parent if given.is_file() else given)
+        return [folder / self.name for folder in folders]
+
+
+@dataclass(frozen=True)
+class NamedWeights:
+    """The one file that an environment variable names, whatever it is called, or else the shipped one, if any."""
+
+    description: str
+    variable: str
+    fix: str  # the advice where the file is missing
+    shipped: Path | None = None
+
+    @property
+    def need(self) -> str:
+        """The reason of a missing value in a record, without paths of this machine."""
+        return f"needs {self.description}: {self.fix}"
+
+    @property
+    def candidates(self) -> list[Path]:
+        """The path where the file lies. The shipped file never takes the place of one that was asked for."""
+        path = _given(self.variable) or self.shipped
+        return [] if path is None else [path]
+
 
 @dataclass(frozen=True)
 class FoundWeights:
-    """A weight file on this machine, hashed."""
+    """A weight file on this machine."""
 
     path: Path
-    sha256: str
+
+    @property
+    def sha256(self) -> str:
+        """The file's hash, computed once as long as size and time of change stay."""
+        status = self.path.stat()
+        return _sha256(self.path, status.st_size, status.st_mtime_ns)
 
 
 ALEXNET = WeightFile(
@@ -83,36 +145,124 @@ class WeightsError(UserError):
 
 
 def hub_folder() -> Path:
-    """torch hub's folder of downloaded weights, by its rules; torch itself need not be imported for it."""
+    """Return torch hub's folder of downloaded weights, by its rules; torch itself need not be imported for it."""
     caches = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
     return Path(os.environ.get("TORCH_HOME") or caches / "torch").expanduser() / "hub" / "checkpoints"
 
 
-def find_weights(file: WeightFile) -> FoundWeights:
-    """Find and hash a weight file.
+def find_weights(file: WeightFile | NamedWeights) -> FoundWeights:
+    """Find a weight file, and check its hash where one is fixed.
 
-    Raises WeightsError that names the file, its size and sha256, the folders that were searched, and where to put it.
+    Raises WeightsError that names the file, where it was looked for, and how to get it.
     """
-    given = Path(os.environ[VARIABLE]).expanduser() if os.environ.get(VARIABLE) else None
-    folders = [hub_folder()]
-    if given is not None:
-        folders.insert(0, given.parent if given.is_file() else given)
-    candidates = [folder / file.name for folder in folders]
-    for path in candidates:
+    paths = file.candidates
+    for path in paths:
         if path.is_file():
-            return FoundWeights(path, _checked(path, file))
-    searched = " and ".join(map(str, folders))
-    fix = f"get it from {file.source} and put it there, or set {VARIABLE} to the folder that holds it"
-    message = problem(file.name, f"{file.description} in {searched}", "no such file", fix)
-    raise WeightsError(str(message), f"needs the file {file.description}, which is not on this machine")
+            return _checked(FoundWeights(path), file)
+    if len(paths) == 1:
+        missing = problem(paths[0], file.description, "no such file", file.fix)
+    elif isinstance(file, WeightFile):
+        folders = " and ".join(str(path.parent) for path in paths)
+        missing = problem(file.name, f"{file.description} in {folders}", "no such file", file.fix)
+    else:
+        missing = problem("weights", file.description, f"{file.variable} not set", file.fix)
+    raise WeightsError(str(missing), file.need)
 
 
-def _checked(path: Path, file: WeightFile) -> str:
-    status = path.stat()
-    found = _sha256(path, status.st_size, status.st_mtime_ns)
-    if file.sha256 not in (None, found):
-        what = f"{status.st_size} bytes with sha256 {found}"
-        message = problem(path, file.description, what, f"replace it by the one from {file.source}")
+def read_header(path: Path, key: str, expected: str, fix: str) -> str:
+    """Return the entry `key` of a safetensors file's metadata. torch is not imported.
+
+    Raises UserError where the file is missing, damaged or another kind of file, and where it has no such entry.
+    """
+    import safetensors
+
+    try:
+        with safetensors.safe_open(path, framework="np") as f:
+            meta: dict[str, str] = f.metadata() or {}
+    except (safetensors.SafetensorError, OSError) as e:
+        raise unreadable(path, expected, e, fix) from None
+    if key not in meta:
+        raise problem(path, f"metadata {key}", ", ".join(meta) or "none", fix)
+    return meta[key]
+
+
+def read_tensors(path: Path, expected: str, fix: str) -> dict[str, Tensor]:
+    """Return the tensors of a safetensors file by name, on the CPU.
+
+    Raises UserError where the file is missing, damaged or another kind of file.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as e:
+        raise unreadable(path, expected, e, fix) from None
+
+
+def read_state(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a state dict (.pth, .pt or .safetensors) by name, on the CPU.
+
+    Only tensors are read: torch's restricted reader runs no code from the file. Raises UserError for anything else.
+    """
+    import torch
+
+    expected, fix = "a file of tensors", "give a state dict (torch.save of model.state_dict(), or safetensors)"
+    if path.suffix == ".safetensors":
+        return read_tensors(path, expected, fix)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError) as e:
+        raise unreadable(path, expected, e, fix) from None
+    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
+        raise problem(path, "a mapping from names to tensors", type(state).__name__, fix)
+    return state
+
+
+def load_into(
+    network: NetworkT,
+    state: Mapping[str, Tensor],
+    where: str | Path,
+    what: str = "tensors of the network",
+    fix: str = "give the file that belongs to this network",
+) -> NetworkT:
+    """Give `network`, which may be on torch's device `meta`, the parameters in `state` as float32; return it frozen.
+
+    `where` and `what` are for the error. Raises UserError where names or shapes differ.
+    """
+    import torch
+
+    own = network.state_dict()
+    # Counters of batch normalisation are not used for inference, and old files lack them.
+    wanted, found = (
+        {name: tuple(t.shape) for name, t in tensors.items() if not name.endswith("num_batches_tracked")}
+        for tensors in (own, state)
+    )
+    if wrong := sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)):
+        first = f"{wrong[0]} {found.get(wrong[0], 'missing')}"
+        raise problem(where, f"the {len(wanted)} {what}", f"{len(wrong)} other tensors, the first {first}", fix)
+    tensors = {name: state[name].to(torch.float32) for name in wanted}
+    # A network on `meta` has no memory to copy to.
+    network.load_state_dict(tensors, strict=False, assign=any(t.is_meta for t in own.values()))
+    return network.requires_grad_(False).eval()
+
+
+def unreadable(path: Path, expected: str, error: Exception, fix: str) -> UserError:
+    """Return the error for a file that a reader of weights gave up on, for the caller to raise."""
+    text = str(error).partition("\n")[0][:120]
+    return problem(path, expected, f"damaged data or another kind of file ({type(error).__name__}: {text})", fix)
+
+
+def _given(variable: str) -> Path | None:
+    """The path in an environment variable, if it is set and not empty."""
+    value = os.environ.get(variable)
+    return Path(value).expanduser() if value else None
+
+
+def _checked(found: FoundWeights, file: WeightFile | NamedWeights) -> FoundWeights:
+    if isinstance(file, WeightFile) and file.sha256 not in (None, found.sha256):
+        what = f"{found.path.stat().st_size} bytes with sha256 {found.sha256}"
+        message = problem(found.path, file.description, what, f"replace it by the one from {file.source}")
         raise WeightsError(str(message), f"needs {file.description}; the file of that name here is another one")
     return found
 

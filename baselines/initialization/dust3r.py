@@ -12,10 +12,8 @@ points (`focal_from_points`). Images are the means of the clip, as for COLMAP.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,15 +27,19 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.benchmark.weights import NamedWeights, find_weights
 from spike4dgs.method.fit import Start
 from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-VARIABLE = "SPIKE4DGS_DUST3R"
-WEIGHTS = "model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence CC BY-NC-SA 4.0)"
+WEIGHTS = NamedWeights(
+    "DUSt3R's weights, model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence "
+    "CC BY-NC-SA 4.0)",
+    variable="SPIKE4DGS_DUST3R",
+    fix="get the file and set SPIKE4DGS_DUST3R to its path",
+)
 LONG_SIDE = 512  # px, the size that the weights were trained at
 RANSAC_PX = 5.0  # of the network's image
 LEAST_CONFIDENCE = 0.5  # quantile below which points of a view are left out
@@ -70,20 +72,10 @@ def dust3r_uncalibrated(scene: TrainingScene, seed: int) -> Start:
 
 def estimate(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Start:
     """Poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
-    network = load_dust3r(find_checkpoint())
+    network = load_dust3r(find_weights(WEIGHTS).path)
     views = [resized(camera, network.shape.patch) for camera in scene.cameras]
     shown = np.stack([_resize(p, v) for p, v in zip(pictures, views, strict=True)])
     return place(predictor(network, shown), views, shown, scene, seed, calibrated=calibrated)
-
-
-def find_checkpoint() -> Path:
-    """The file that `SPIKE4DGS_DUST3R` names. Raises WeightsError, which says what to supply, where there is none."""
-    given = os.environ.get(VARIABLE, "")
-    if given and Path(given).expanduser().is_file():
-        return Path(given).expanduser()
-    found = f"no file {given}" if given else f"{VARIABLE} not set"
-    message = problem("DUSt3R", f"its weights, {WEIGHTS}", found, f"get the file and set {VARIABLE} to its path")
-    raise WeightsError(str(message), f"needs {WEIGHTS}, named by {VARIABLE}")
 
 
 def resized(camera: Camera, patch: int) -> Camera:

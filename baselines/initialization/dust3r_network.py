@@ -17,8 +17,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.msdi.checkpoints import canonical_head, read_state
+from spike4dgs.benchmark.weights import load_into, read_tensors
+from spike4dgs.method.msdi.checkpoints import canonical_head
 from spike4dgs.method.msdi.dpt import Dpt, unpack
 from spike4dgs.method.msdi.transformer import NORM_EPS, Block, Mlp, SelfAttention, attend_placed, grid
 
@@ -147,13 +147,7 @@ def canonical(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def load_dust3r(path: Path, shape: Dust3rShape | None = None) -> Dust3r:
     """Build the network from a file of safetensors. Raises UserError where it is another network's or damaged."""
     fix = "use model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
-    state = canonical(read_state(path, fix))
+    state = canonical(read_tensors(path, "weights in safetensors format", fix))
     with torch.device("meta"):  # 571 M parameters need not be drawn at random first
         network = Dust3r(shape)
-    wanted = {name: tuple(t.shape) for name, t in network.state_dict().items()}
-    found = {name: tuple(t.shape) for name, t in state.items()}
-    if wrong := sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)):
-        what = f"{len(wrong)} other tensors, the first {wrong[0]} {found.get(wrong[0], 'missing')}"
-        raise problem(path, f"the {len(wanted)} tensors of DUSt3R with a ViT-L encoder and DPT heads", what, fix)
-    network.load_state_dict({name: t.float() for name, t in state.items()}, assign=True)
-    return network.eval().requires_grad_(False)
+    return load_into(network, state, path, "tensors of DUSt3R with a ViT-L encoder and DPT heads", fix)

@@ -11,26 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.weights import FoundWeights
 
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What a trained part has in it: runs with other weights are other methods."""
+    """The weights of a trained part: runs with other weights are other methods."""
 
     sha256: str  # of the weight file
     trained_on: tuple[str, ...]  # data sets, such as scenes as ID@REVISION
 
 
-def learned_from(find: Callable[[], Path], read_card: Callable[[Path], Any]) -> Learned | None:
-    """What the weights in use have seen; None where they are missing or damaged, which a fit will say."""
+def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], Any]) -> Learned | None:
+    """Return the hash and the training data of the weights in use; None where they are missing or damaged.
+
+    A fit will say which of the two.
+    """
     try:
-        path = find()
-        return Learned(sha256_file(path), read_card(path).trained_on)
+        found = find()
+        return Learned(found.sha256, read_card(found.path).trained_on)
     except UserError:
         return None
 

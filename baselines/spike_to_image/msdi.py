@@ -10,7 +10,7 @@ from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.msdi.weights import load_network, read_card, weights_path
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network, read_card, weights_path
 
 if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Msdi
@@ -47,6 +47,6 @@ MSDI = ImageMaker(
     definition="MSDI's image generator on the 41 ticks around tick t",
     source="Spike4DGS, eq. 12",
     rate=msdi_image,
-    learned=partial(learned_from, weights_path, read_card),
+    learned=partial(learned_from, WEIGHTS.in_use, read_card),
     corrected=msdi_image,
 )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.images import UInt8
-from spike4dgs.benchmark.weights import ALEXNET, SQUEEZENET, VGG16, WeightFile, find_weights
+from spike4dgs.benchmark.weights import ALEXNET, SQUEEZENET, VGG16, WeightFile, find_weights, load_into, read_state
 
 if TYPE_CHECKING:  # torch takes seconds to import and is needed only where there are weights
     from torch import Tensor, nn
@@ -89,8 +89,6 @@ def empty_trunk(net: str) -> nn.Sequential:
 @cache
 def _load(net: str, path: Path, sha256: str) -> LpipsNetwork:
     """The network with the weights of a file; read again when the file's hash changes."""
-    from spike4dgs.benchmark.metrics.neural_trunks import load_into, read_state
-
     trunk, prefix = empty_trunk(net), "features."
     # The classifier behind the features is in the file too, and not used.
     state = {k.removeprefix(prefix): v for k, v in read_state(path).items() if k.startswith(prefix)}

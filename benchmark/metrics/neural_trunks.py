@@ -7,57 +7,8 @@ float32, evaluation mode.
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Mapping
-from pathlib import Path
-
 import torch
 from torch import Tensor, nn
-
-from spike4dgs.benchmark.errors import problem
-
-State = Mapping[str, Tensor]
-
-
-def read_state(path: Path) -> dict[str, Tensor]:
-    """Read a state dict (.pth, .pt or .safetensors) to the CPU.
-
-    Only tensors are read: torch's restricted reader runs no code from the file. Raises UserError for anything else.
-    """
-    fix = "give a state dict (torch.save of model.state_dict(), or safetensors)"
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            state = load_file(path)
-        else:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError) as e:
-        raise problem(path, "a file of tensors", f"{type(e).__name__} ({str(e)[:120]})", fix) from None
-    except Exception as e:  # safetensors has an error class of its own
-        if type(e).__module__.startswith("safetensors"):
-            raise problem(path, "a file of tensors", str(e)[:120], fix) from None
-        raise
-    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise problem(path, "a mapping from names to tensors", type(state).__name__, fix)
-    return state
-
-
-def load_into(network: nn.Module, state: State, where: str | Path) -> nn.Module:
-    """Load the network's parameters, freeze it, and return it. Raises UserError where names or shapes differ."""
-    own = network.state_dict()
-    # Counters of batch normalisation are not used for inference, and old files lack them.
-    wanted = {k: v for k, v in own.items() if not k.endswith("num_batches_tracked")}
-    fix = "give the file that belongs to this network"
-    if absent := sorted(wanted.keys() - state.keys()):
-        raise problem(where, f"the {len(wanted)} tensors of the network", f"no {', '.join(absent[:3])}", fix)
-    if unknown := sorted(state.keys() - own.keys()):
-        raise problem(where, f"only the {len(wanted)} tensors of the network", f"also {', '.join(unknown[:3])}", fix)
-    for name, tensor in wanted.items():
-        if tensor.shape != state[name].shape:
-            raise problem(where, f"{name} of shape {tuple(tensor.shape)}", str(tuple(state[name].shape)), fix)
-    network.load_state_dict({k: state[k].to(torch.float32) for k in wanted}, strict=False)
-    return network.requires_grad_(False).eval()
 
 
 def _conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0) -> list[nn.Module]:

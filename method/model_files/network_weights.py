@@ -1,49 +1,54 @@
-"""Weight files of the networks that are trained here: half-float safetensors that say what they were trained on."""
+"""Weights of the networks that are trained here: half-float safetensors with a card of what they were trained on.
+
+Each network states its facts as a `WeightKind`. Files are found, checked and read by `benchmark.weights`.
+"""
 
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, sha256_file
-from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.benchmark.weights import FoundWeights, NamedWeights, find_weights, load_into, read_header, read_tensors
 
 if TYPE_CHECKING:
     from torch import nn
+
+    NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 CardT = TypeVar("CardT")
 
 
 @dataclass(frozen=True)
 class WeightKind(Generic[CardT]):
-    """What tells one network's files from another's."""
+    """The facts that tell one network's weight files from another's."""
 
     network: str  # its name in messages
     schema: str  # the only key of the metadata: two would be written in any order
     card: type[CardT]  # dataclass of plain values, and the tuple `trained_on`: where weights come from
     variable: str  # the environment variable that names a file in place of the shipped one
-    command: str  # what trains it
+    shipped: Path
+    command: str  # the command that trains it
 
     @property
     def fix(self) -> str:
-        """What to do about a file that is missing, damaged or foreign."""
+        """The advice about a file that is missing, damaged or foreign."""
         return f"train it with `spike4dgs {self.command}`, or set {self.variable} to a file that this command wrote"
 
+    @property
+    def description(self) -> str:
+        """The phrase for such a file in messages."""
+        return f"weights of {self.network}"
 
-def weights_in_use(kind: WeightKind[Any], shipped: Path) -> Path:
-    """The weight file in use: what the environment variable names, else the one that is shipped.
+    def in_use(self) -> FoundWeights:
+        """Return the file that the environment variable names, else the shipped one.
 
-    Raises WeightsError where there is no such file.
-    """
-    path = Path(os.environ.get(kind.variable) or shipped)
-    if not path.is_file():
-        missing = problem(path, f"weights of {kind.network}", "no such file", kind.fix)
-        raise WeightsError(str(missing), f"no trained weights {path.name}: {kind.fix}")
-    return path
+        Raises WeightsError where there is no such file.
+        """
+        return find_weights(NamedWeights(self.description, self.variable, self.fix, self.shipped))
 
 
 def write_weights(kind: WeightKind[CardT], path: Path, network: nn.Module, card: CardT) -> str:
@@ -64,32 +69,20 @@ def write_weights(kind: WeightKind[CardT], path: Path, network: nn.Module, card:
 
 
 def read_weights_card(kind: WeightKind[CardT], path: Path) -> CardT:
-    """What the file says of itself. Raises UserError for a damaged or foreign file. torch is not imported."""
-    import safetensors
-
+    """Return the file's card. Raises UserError for a damaged or foreign file. torch is not imported."""
+    text = read_header(path, kind.schema, kind.description, kind.fix)
     try:
-        with safetensors.safe_open(path, framework="np") as f:
-            meta = f.metadata() or {}
-        if kind.schema not in meta:
-            raise problem(path, f"metadata {kind.schema}", ", ".join(meta) or "none", kind.fix)
-        fields: dict[str, Any] = json.loads(meta[kind.schema])
+        fields: dict[str, Any] = json.loads(text)
         return kind.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
-    except (safetensors.SafetensorError, OSError, LookupError, TypeError, ValueError) as e:
-        raise problem(path, f"weights of {kind.network}", f"damaged data ({e})", kind.fix) from None
+    except (LookupError, TypeError, ValueError) as e:
+        raise problem(path, kind.description, f"damaged data in its card ({e})", kind.fix) from None
 
 
-def fill_network(kind: WeightKind[Any], path: Path, network: nn.Module, shape: str) -> None:
-    """Give `network`, which may be on torch's device `meta`, the file's parameters as float32 on the CPU.
+def fill_network(kind: WeightKind[Any], path: Path, network: NetworkT, shape: str) -> NetworkT:
+    """Give `network`, which may be on torch's device `meta`, the file's parameters as float32 on the CPU; return it.
 
     It is left ready to run, without gradients. Raises UserError where the file is damaged or its tensors are not those
     of a network of this `shape`, such as "width 8".
     """
-    import safetensors.torch
-
-    try:
-        state = {name: tensor.float() for name, tensor in safetensors.torch.load_file(path).items()}
-        network.load_state_dict(state, assign=True)
-    except (safetensors.SafetensorError, RuntimeError) as e:
-        found = f"damaged data ({str(e).splitlines()[0]})"
-        raise problem(path, f"parameters of {shape}", found, kind.fix) from None
-    network.requires_grad_(False).eval()
+    state = read_tensors(path, kind.description, kind.fix)
+    return load_into(network, state, path, f"parameters of {shape}", kind.fix)

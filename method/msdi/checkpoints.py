@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.msdi.network import Msdi
 
 _FIX = "use model.safetensors of jedyang97/Fast3R_ViT_Large_512 or naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
@@ -69,17 +70,6 @@ def canonical_head(name: str) -> str:
     return name
 
 
-def read_state(path: Path, fix: str) -> dict[str, Tensor]:
-    """The tensors of a safetensors file. Raises UserError with `fix` where it is no such file or damaged."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    try:
-        return load_file(path)
-    except (SafetensorError, OSError) as e:
-        raise problem(path, "weights in safetensors format", str(e)[:120], fix) from None
-
-
 def source_of(names: Mapping[str, Tensor]) -> str | None:
     """Whose state dict this is: "fast3r", "dust3r" or None."""
     if any(name.startswith("decoder.dec_blocks.") for name in names):
@@ -108,7 +98,7 @@ def load_pretrained(network: Msdi, path: Path) -> Transfer:
 
     Raises UserError where the file is neither's, is damaged, or is of other sizes than the network.
     """
-    return transfer(network, read_state(path, _FIX), path)
+    return transfer(network, read_tensors(path, "weights in safetensors format", _FIX), path)
 
 
 def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer:

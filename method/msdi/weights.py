@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.model_files.network_weights import (
-    WeightKind,
-    fill_network,
-    read_weights_card,
-    weights_in_use,
-    write_weights,
-)
+from spike4dgs.method.model_files.network_weights import WeightKind, fill_network, read_weights_card, write_weights
 from spike4dgs.method.msdi.config import CONFIGS
 
 if TYPE_CHECKING:
@@ -26,7 +20,7 @@ SHIPPED = Path(__file__).with_name("msdi-small.safetensors")
 
 @dataclass(frozen=True)
 class Card:
-    """Where weights come from."""
+    """The card in a weight file: where the weights come from."""
 
     config: str  # name of the configuration
     steps: int
@@ -35,15 +29,22 @@ class Card:
     measured: dict[str, float]  # what was measured on data that was not trained on, by name with its unit
 
 
-_KIND = WeightKind("MSDI", "spike4dgs-msdi/1", Card, VARIABLE, "train-msdi")
+WEIGHTS = WeightKind(
+    network="MSDI",
+    schema="spike4dgs-msdi/1",
+    card=Card,
+    variable=VARIABLE,
+    shipped=SHIPPED,
+    command="train-msdi",
+)
 
 
 def weights_path() -> Path:
-    """The weight file in use: what the environment variable SPIKE4DGS_MSDI names, else the one that is shipped.
+    """Return the weight file in use: what the environment variable SPIKE4DGS_MSDI names, else the shipped one.
 
     Raises WeightsError where there is no such file.
     """
-    return weights_in_use(_KIND, SHIPPED)
+    return WEIGHTS.in_use().path
 
 
 def save_weights(path: Path, network: Msdi, card: Card) -> str:
@@ -51,20 +52,20 @@ def save_weights(path: Path, network: Msdi, card: Card) -> str:
 
     Raises UserError where a parameter is not finite as a half float.
     """
-    return write_weights(_KIND, path, network, card)
+    return write_weights(WEIGHTS, path, network, card)
 
 
 def read_card(path: Path) -> Card:
-    """What the file says of itself. Raises UserError for a damaged or foreign file."""
-    card = read_weights_card(_KIND, path)
+    """Return the file's card. Raises UserError for a damaged or foreign file."""
+    card = read_weights_card(WEIGHTS, path)
     if card.config not in CONFIGS:
-        raise problem(path, f"a configuration of {', '.join(CONFIGS)}", repr(card.config), _KIND.fix)
+        raise problem(path, f"a configuration of {', '.join(CONFIGS)}", repr(card.config), WEIGHTS.fix)
     return card
 
 
 @cache
 def load_network(path: Path, device: str) -> Msdi:
-    """The trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
+    """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
     import torch
 
     from spike4dgs.method.msdi.network import Msdi
@@ -72,5 +73,4 @@ def load_network(path: Path, device: str) -> Msdi:
     config = CONFIGS[read_card(path).config]
     with torch.device("meta"):  # parameters need not be drawn at random first
         network = Msdi(config)
-    fill_network(_KIND, path, network, f"configuration {config.name}")
-    return network.to(device)
+    return fill_network(WEIGHTS, path, network, f"configuration {config.name}").to(device)

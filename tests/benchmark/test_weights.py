@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,23 @@ from safetensors.torch import save_file
 
 from spike4dgs.benchmark import weights
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.neural_trunks import alexnet_features, load_into, read_state
+from spike4dgs.benchmark.metrics.neural_trunks import alexnet_features
 from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.weights import ALEXNET, METAIQA, VARIABLE, WeightFile, WeightsError, find_weights, hub_folder
+from spike4dgs.benchmark.weights import (
+    ALEXNET,
+    METAIQA,
+    VARIABLE,
+    NamedWeights,
+    WeightFile,
+    WeightsError,
+    find_weights,
+    hub_folder,
+    load_into,
+    read_header,
+    read_state,
+    read_tensors,
+)
 
 CONTENT = b"weights"
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -84,6 +98,46 @@ def test_another_file_of_the_name_is_refused_and_hashed_anew_after_a_change(empt
     assert find_weights(FILE).sha256 == SHA256
 
 
+def test_a_variable_names_one_file_and_the_shipped_one_never_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OF_A_TEST", raising=False)
+    bare = NamedWeights("weights of a test", "OF_A_TEST", "train them")
+    with pytest.raises(WeightsError, match="expected weights of a test, found OF_A_TEST not set; train them") as e:
+        find_weights(bare)
+    assert e.value.reason == "needs weights of a test: train them"
+    shipped, mine = tmp_path / "shipped.safetensors", tmp_path / "mine.bin"
+    kind = replace(bare, shipped=shipped)
+    with pytest.raises(WeightsError, match=r"shipped\.safetensors: expected weights of a test, found no such file; t"):
+        find_weights(kind)
+    shipped.write_bytes(CONTENT)
+    found = find_weights(kind)
+    assert (found.path, found.sha256) == (shipped, SHA256)
+    monkeypatch.setenv("OF_A_TEST", str(mine))
+    with pytest.raises(
+        WeightsError, match=r"mine\.bin: expected weights of a test, found no such file; train them"
+    ) as e:
+        find_weights(kind)
+    assert str(tmp_path) not in e.value.reason
+    mine.touch()
+    assert find_weights(kind).path == find_weights(bare).path == mine
+
+
+def test_headers_and_tensors_of_safetensors(tmp_path: Path) -> None:
+    path = tmp_path / "s.bin"
+    save_file({"a": torch.arange(3.0)}, path, metadata={"card": "text"})
+    assert read_header(path, "card", "weights", "train them") == "text"
+    assert torch.equal(read_tensors(path, "weights", "train them")["a"], torch.arange(3.0))
+    with pytest.raises(UserError, match=r"s\.bin: expected metadata other, found card; train them"):
+        read_header(path, "other", "weights", "train them")
+    path.write_bytes(b"\x80\x02pickle")
+    for damaged in (path, tmp_path / "absent.safetensors"):
+        with pytest.raises(UserError, match=rf"{damaged.name}: expected weights, found damaged data or another kind"):
+            read_header(damaged, "card", "weights", "train them")
+        with pytest.raises(UserError, match=rf"{damaged.name}: expected weights, found damaged data or another kind"):
+            read_tensors(damaged, "weights", "train them")
+
+
 def test_the_names_of_torch_hubs_files_hold_the_start_of_their_hashes() -> None:
     for file in (weights.ALEXNET, weights.VGG16, weights.SQUEEZENET):
         found = re.search(r"-([0-9a-f]{8})\.pth$", file.name)
@@ -151,9 +205,13 @@ def test_only_the_networks_own_tensors_are_taken() -> None:
     state = dict(network.state_dict())
     loaded = load_into(alexnet_features(), state, "f")
     assert not any(p.requires_grad for p in loaded.parameters()) and not loaded.training
-    with pytest.raises(UserError, match=r"f: expected the 10 tensors of the network, found no 0\.bias"):
+    with torch.device("meta"):
+        bare = alexnet_features()
+    for name, tensor in load_into(bare, {k: v.half() for k, v in state.items()}, "f").state_dict().items():
+        assert torch.equal(tensor, state[name].half().float())
+    with pytest.raises(UserError, match=r"f: expected the 10 tensors of the network, found 1 other .*0\.bias missing"):
         load_into(network, {k: v for k, v in state.items() if k != "0.bias"}, "f")
-    with pytest.raises(UserError, match=r"f: expected only the 10 tensors of the network, found also extra"):
+    with pytest.raises(UserError, match=r"the first extra \(1,\); give the file that belongs to this network"):
         load_into(network, {**state, "extra": torch.zeros(1)}, "f")
-    with pytest.raises(UserError, match=r"f: expected 0\.bias of shape \(64,\), found \(63,\)"):
+    with pytest.raises(UserError, match=r"the first 0\.bias \(63,\)"):
         load_into(network, {**state, "0.bias": torch.zeros(63)}, "f")

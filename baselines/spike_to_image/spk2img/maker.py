@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, learned_from
-from spike4dgs.baselines.spike_to_image.spk2img.weights import load_network, read_card, weights_path
+from spike4dgs.baselines.spike_to_image.spk2img.weights import WEIGHTS, load_network, read_card, weights_path
 from spike4dgs.baselines.spike_to_image.windows import WINDOW, window
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -41,5 +41,5 @@ SPK2IMG = ImageMaker(
     source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike stream, "
     "CVPR 2021",
     rate=spk2img_image,
-    learned=partial(learned_from, weights_path, read_card),
+    learned=partial(learned_from, WEIGHTS.in_use, read_card),
 )

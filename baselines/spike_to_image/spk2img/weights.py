@@ -7,13 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spike4dgs.method.model_files.network_weights import (
-    WeightKind,
-    fill_network,
-    read_weights_card,
-    weights_in_use,
-    write_weights,
-)
+from spike4dgs.method.model_files.network_weights import WeightKind, fill_network, read_weights_card, write_weights
 
 if TYPE_CHECKING:
     from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet
@@ -24,7 +18,7 @@ SHIPPED = Path(__file__).with_name("spk2img-8.safetensors")
 
 @dataclass(frozen=True)
 class Card:
-    """Where weights come from."""
+    """The card in a weight file: where the weights come from."""
 
     width: int
     steps: int
@@ -33,15 +27,22 @@ class Card:
     hidden_psnr_db: dict[str, float]  # scene that was not trained on -> mean over its targets
 
 
-_KIND = WeightKind("Spk2ImgNet", "spike4dgs-spk2img/1", Card, VARIABLE, "train-spk2img")
+WEIGHTS = WeightKind(
+    network="Spk2ImgNet",
+    schema="spike4dgs-spk2img/1",
+    card=Card,
+    variable=VARIABLE,
+    shipped=SHIPPED,
+    command="train-spk2img",
+)
 
 
 def weights_path() -> Path:
-    """The weight file in use: what the environment variable SPIKE4DGS_SPK2IMG names, else the one that is shipped.
+    """Return the weight file in use: what the environment variable SPIKE4DGS_SPK2IMG names, else the shipped one.
 
     Raises WeightsError where there is no such file.
     """
-    return weights_in_use(_KIND, SHIPPED)
+    return WEIGHTS.in_use().path
 
 
 def save_weights(path: Path, network: Spk2ImgNet, card: Card) -> str:
@@ -49,19 +50,18 @@ def save_weights(path: Path, network: Spk2ImgNet, card: Card) -> str:
 
     Raises UserError where a parameter is not finite as a half float.
     """
-    return write_weights(_KIND, path, network, card)
+    return write_weights(WEIGHTS, path, network, card)
 
 
 def read_card(path: Path) -> Card:
-    """What the file says of itself. Raises UserError for a damaged or foreign file."""
-    return read_weights_card(_KIND, path)
+    """Return the file's card. Raises UserError for a damaged or foreign file."""
+    return read_weights_card(WEIGHTS, path)
 
 
 @cache
 def load_network(path: Path, device: str) -> Spk2ImgNet:
-    """The trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
+    """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
     from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet, place
 
     network = Spk2ImgNet(read_card(path).width)
-    fill_network(_KIND, path, network, f"width {network.width}")
-    return place(network, device)
+    return place(fill_network(WEIGHTS, path, network, f"width {network.width}"), device)

@@ -16,7 +16,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.images import UInt8
-from spike4dgs.benchmark.weights import METAIQA, find_weights
+from spike4dgs.benchmark.weights import METAIQA, find_weights, load_into, read_state
 
 if TYPE_CHECKING:
     from torch import nn
@@ -49,8 +49,6 @@ def metaiqa_network() -> nn.Module:
 @cache
 def _load(path: Path, sha256: str) -> nn.Module:
     """The network with the weights of a file; read again when the file's hash changes."""
-    from spike4dgs.benchmark.metrics.neural_trunks import load_into, read_state
-
     return load_into(metaiqa_network(), read_state(path), path)
 
 

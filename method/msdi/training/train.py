@@ -24,9 +24,10 @@ from spike4dgs.benchmark.environment import choose_device, device_type
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
 from spike4dgs.benchmark.scene.bursts import FIRST_TRAINING_VARIANT, BurstFile, open_folder
+from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
-from spike4dgs.method.msdi.checkpoints import read_state, transfer
+from spike4dgs.method.msdi.checkpoints import transfer
 from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.network import Msdi
@@ -184,7 +185,8 @@ def start_from(network: Msdi, path: Path) -> None:
 
     Raises UserError for a damaged file and for the weights of something else.
     """
-    state = read_state(path, "name a file that train-msdi wrote, or one of Fast3R or DUSt3R")
+    fix = "name a file that train-msdi wrote, or one of Fast3R or DUSt3R"
+    state = read_tensors(path, "weights in safetensors format", fix)
     own = network.state_dict()
     if {n: t.shape for n, t in state.items()} == {n: t.shape for n, t in own.items()}:
         network.load_state_dict({name: tensor.float() for name, tensor in state.items()})

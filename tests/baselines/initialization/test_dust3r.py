@@ -133,7 +133,7 @@ def test_without_weights_the_reason_names_the_file(monkeypatch: pytest.MonkeyPat
     with pytest.raises(WeightsError, match="2.28 GB, licence CC BY-NC-SA 4.0.*SPIKE4DGS_DUST3R not set"):
         dust3r(WORLD.training, 0)
     monkeypatch.setenv("SPIKE4DGS_DUST3R", str(tmp_path / "absent"))
-    with pytest.raises(WeightsError, match="found no file"):
+    with pytest.raises(WeightsError, match="found no such file"):
         dust3r(WORLD.training, 0)
 
 

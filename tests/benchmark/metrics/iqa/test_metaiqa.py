@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa, metaiqa_network, predict
-from spike4dgs.benchmark.metrics.neural_trunks import ResNet18, load_into
+from spike4dgs.benchmark.metrics.neural_trunks import ResNet18
 from spike4dgs.benchmark.metrics.selection import select_metrics
-from spike4dgs.benchmark.weights import METAIQA, VARIABLE
+from spike4dgs.benchmark.weights import METAIQA, VARIABLE, load_into
 
 State = dict[str, torch.Tensor]
 
