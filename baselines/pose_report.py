@@ -21,7 +21,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget, Recipe
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
-from spike4dgs.benchmark.reports.figures import make_console
+from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32

@@ -1,7 +1,8 @@
 """The `spike4dgs` command line.
 
-The tables below are the one place where rooms meet: commands are named by import strings and loaded only when they run,
-so `--help` imports nothing heavy and no room imports another for the command line's sake.
+The tables below are the one place where rooms meet. Import strings name the commands, and the functions of other rooms
+that a command calls; both are loaded only when they run, so `--help` imports nothing heavy and no room imports another
+for the command line's sake.
 """
 
 from __future__ import annotations
@@ -20,11 +21,16 @@ from spike4dgs.benchmark.errors import UserError, problem
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand: where its function is, what it does, and a command line that people can copy."""
+    """A subcommand: its function, a summary, and a command line that people can copy.
+
+    A command that calls functions of other rooms `needs` them: its target is then called with them and returns the
+    command's function.
+    """
 
     target: str  # module:function
     summary: str
     example: str
+    needs: tuple[str, ...] = ()  # module:function, in the order of the target's arguments
 
 
 COMMANDS: dict[str, Command] = {
@@ -50,7 +56,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "board-clip": Command(
         "spike4dgs.generators.recorder.rig_calibration.board_clip:board_clip",
-        "simulate a chessboard that moves before an array, to record and to calibrate with",
+        "simulate a chessboard that moves in front of an array, to record and calibrate with",
         "board-clip --out runs/board --seconds 1",
     ),
     "calibrate-rig": Command(
@@ -70,13 +76,14 @@ COMMANDS: dict[str, Command] = {
     ),
     "train-msdi": Command(
         "spike4dgs.method.msdi.training.train:train_msdi",
-        "train the network that finds points, poses and images from spikes",
+        "train the network that estimates points, poses and images from spikes",
         "train-msdi --data data/msdi --out runs/msdi",
     ),
     "run-benchmark": Command(
-        "spike4dgs.benchmark.runs.run:run_benchmark",
+        "spike4dgs.benchmark.runs.run_command:make_run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
+        needs=("spike4dgs.leaderboard.submit:submit", "spike4dgs.baselines.speed_images:images"),
     ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
@@ -100,7 +107,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "view": Command(
         "spike4dgs.method.viewing.viewer:view",
-        "look at a fitted model in the browser",
+        "show a fitted model in the browser",
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "verify": Command(
@@ -148,7 +155,7 @@ SPEED: dict[str, Command] = {
     "ssim": Command("spike4dgs.method.speed:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
     "render": Command(
         "spike4dgs.method.viewing.speed_render:render",
-        "images of saved models, side by side",
+        "render images of saved models, side by side",
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
     "simulate": Command(
@@ -174,13 +181,8 @@ SPEED: dict[str, Command] = {
 
 
 def load(name: str) -> Callable[..., Any]:
-    """The function of a command, such as "submit"."""
-    return _import(COMMANDS[name])
-
-
-def load_speed(name: str) -> Callable[..., Any]:
-    """The function of a speed command, such as "images"; it takes a list of arguments."""
-    return _import(SPEED[name])
+    """Return the function of a command, such as "submit"."""
+    return _load(COMMANDS[name])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -217,7 +219,7 @@ def _dispatch(arguments: list[str]) -> int:
 
     import tyro
 
-    function = _import(command)
+    function = _load(command)
     return int(
         tyro.cli(function, args=rest, prog=f"spike4dgs {name}", description=_description(function, command)) or 0
     )
@@ -227,7 +229,7 @@ def _speed(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview("spike4dgs speed", SPEED))
         return 0
-    return int(_import(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
+    return int(_load(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
 
 
 def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
@@ -238,10 +240,22 @@ def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
     return table[name]
 
 
-def _import(command: Command) -> Callable[..., Any]:
-    module, _, function = command.target.partition(":")
+def _load(command: Command) -> Callable[..., Any]:
+    function = _import(command.target)
+    if not command.needs:
+        return function
+    made: Callable[..., Any] = function(*map(_imported_when_called, command.needs))
+    return made
+
+
+def _import(target: str) -> Callable[..., Any]:
+    module, _, function = target.partition(":")
     found: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return found
+
+
+def _imported_when_called(target: str) -> Callable[..., Any]:
+    return lambda *args, **kwargs: _import(target)(*args, **kwargs)
 
 
 def _overview(prog: str, table: Mapping[str, Command]) -> str:
@@ -252,7 +266,7 @@ def _overview(prog: str, table: Mapping[str, Command]) -> str:
 
 
 def _description(function: Callable[..., Any], command: Command) -> str:
-    """The function's docstring without its section of arguments, which tyro shows itself, and the example."""
+    """Return the function's docstring without its arguments, which tyro lists itself, and the example."""
     text = (inspect.getdoc(function) or command.summary).partition("\nArgs:")[0].strip()
     return f"{text}\n\nExample:\n  spike4dgs {command.example}"
 

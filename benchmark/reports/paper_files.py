@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from spike4dgs.benchmark.metrics.table import Metric
-from spike4dgs.benchmark.reports.figures import write_views
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
+from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.reports.table_files import write_table
 from spike4dgs.benchmark.results.record import Record, dataset_means
 from spike4dgs.benchmark.scene.scene import Scene

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from dummy_methods import CountMethod, run
 from spike4dgs.benchmark import cli
 from spike4dgs.benchmark.cli import COMMANDS, SPEED, Command, main
 from spike4dgs.benchmark.results.record import read_record
-from spike4dgs.benchmark.runs.run import run_benchmark
+from spike4dgs.benchmark.runs.run_command import RunBenchmark
+from spike4dgs.benchmark.runs.score_command import score
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
@@ -63,8 +65,9 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
 
 @pytest.mark.parametrize("command", [*COMMANDS.values(), *SPEED.values()], ids=lambda c: c.target)
 def test_every_command_exists(command: Command) -> None:
-    module, _, function = command.target.partition(":")
-    assert callable(getattr(importlib.import_module(module), function))
+    for target in (command.target, *command.needs):
+        module, _, function = target.partition(":")
+        assert callable(getattr(importlib.import_module(module), function))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -131,13 +134,58 @@ def test_an_interruption_is_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_load_finds_the_functions() -> None:
-    assert cli.load("run-benchmark") is run_benchmark
+    assert cli.load("score") is score
+
+
+def add(a: int, b: int) -> int:
+    """Return the sum."""
+    return a + b
+
+
+def make_double(adder: Callable[[int, int], int]) -> Callable[[int], int]:
+    """Return a command that doubles a number by the adder that it is given."""
+
+    def double(number: int) -> int:
+        return adder(number, number)
+
+    return double
+
+
+def test_a_command_is_given_the_functions_of_other_rooms_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = __name__
+    monkeypatch.setattr(
+        cli, "COMMANDS", {"double": Command(f"{here}:make_double", "", "double", needs=(f"{here}:add",))}
+    )
+    assert cli.load("double")(4) == 8
+
+
+def test_what_a_command_needs_is_imported_only_when_it_is_called() -> None:
+    imported = "print([m for m in sys.modules if m.startswith(('spike4dgs.leaderboard', 'spike4dgs.baselines'))])"
+    done = python("-c", f"import sys; from spike4dgs.benchmark.cli import load; load('run-benchmark'); {imported}")
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submitted: list[Path] = []
+    measured: list[Sequence[str]] = []
+    command = RunBenchmark(
+        submit=lambda result, **options: submitted.append(result) or 0,
+        measure_images=lambda arguments: measured.append(arguments) or 0,
+    )
+    monkeypatch.setattr("spike4dgs.benchmark.runs.run_command.find_methods", lambda: {"counts": CountMethod()})
+    out = tmp_path / "out"
+    assert command.run_benchmark((small_scene,), out=out, device="cpu", metrics=("psnr",)) == 0
+    assert submitted == [out / "results/counts.json"] and not measured
+    assert command.run_benchmark((small_scene,), table=6, out=out) == 0
+    assert measured == [[str(small_scene), "--out", str(out)]] and len(submitted) == 1
 
 
 def test_speed_passes_the_rest_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
     monkeypatch.setattr(cli, "SPEED", {"x": Command("m:f", "measure", "speed x")})
-    monkeypatch.setattr(cli, "_import", lambda command: lambda argv: seen.append(argv))
+    monkeypatch.setattr(cli, "_load", lambda command: lambda argv: seen.append(argv))
     assert main(["speed", "x", "--frames", "10"]) == 0
     assert seen == [["--frames", "10"]]
 

@@ -14,9 +14,11 @@ from small_scenes import write_small_scene
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.paper_tables import published
-from spike4dgs.benchmark.runs import run
+from spike4dgs.benchmark.runs import run_command
+from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
+COMMAND = RunBenchmark(submit=lambda result, **options: 0, measure_images=lambda arguments: 0)
 VIEWS = tuple(f"views-{n}" for n in range(3, 9))
 
 
@@ -54,7 +56,7 @@ def test_rows_without_msdi_are_methods_and_rows_of_ours_have_no_published_values
 @pytest.mark.parametrize("number", [None, 6, 4])
 def test_a_track_belongs_to_tables_1_and_2(number: int | None, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--track: expected (--table 1 or 2 beside it|calibrated for table 4)"):
-        run.run_benchmark(table=number, track="uncalibrated", out=tmp_path / "out")
+        COMMAND.run_benchmark(table=number, track="uncalibrated", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -70,12 +72,11 @@ def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
     scenes = {name: seen_as(open_scene(path), name) for name in ("views-3", "views-4")}
     table = replace(published(5), splits=tuple(scenes))
     methods = {"tfi+4dgs": CountMethod("tfi+4dgs"), "tfi+stg": FailingMethod("tfi+stg", ValueError("no views"))}
-    monkeypatch.setattr(run, "published", lambda number, track: table)
-    monkeypatch.setattr(run, "table_scenes", lambda table, data, profile: (path,))
-    monkeypatch.setattr(run, "find_methods", lambda: methods)
-    monkeypatch.setattr(run, "open_scenes", lambda paths, gaps, split: [scenes[split]])
-    monkeypatch.setattr(run, "_submit", lambda *args: False)
-    assert run.run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",)) == 1, "one method fails"
+    monkeypatch.setattr(run_command, "published", lambda number, track: table)
+    monkeypatch.setattr(run_command, "table_scenes", lambda table, data, profile: (path,))
+    monkeypatch.setattr(run_command, "find_methods", lambda: methods)
+    monkeypatch.setattr(run_command, "open_scenes", lambda paths, gaps, split: [scenes[split]])
+    assert COMMAND.run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",)) == 1, "one method fails"
     content = json.loads((out / "table.json").read_text())
     assert content["scenes"] == {"pattern-0, views-3": "views-3", "pattern-0, views-4": "views-4"}
     assert content["dataset"]["split"] == "views-3, views-4"

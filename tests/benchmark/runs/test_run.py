@@ -16,14 +16,16 @@ from dummy_methods import CountMethod, FailingMethod, run
 from PIL import Image
 
 from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark.cli import load
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.cell import FitClock
-from spike4dgs.benchmark.runs.run import run_benchmark
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.leaderboard.submit import read_entry
+
+run_benchmark = load("run-benchmark")
 
 # Also the state of the checkout, which somebody may change while the tests run.
 TIMINGS = ("fit_seconds", "render_fps", "peak_memory_mb", "fitted_with")
