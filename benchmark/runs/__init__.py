@@ -1,0 +1,1 @@
+"""Running methods on scenes: cells, displays, executors, the command `run-benchmark`."""

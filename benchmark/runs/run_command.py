@@ -1,0 +1,192 @@
+"""`run-benchmark`: run methods on scenes, then write the table, the sheets and the leaderboard's entries.
+
+Besides what `run` keeps, OUT has sheet_SCENE.png, scatter.png, leaderboard/ and, for a table of the paper, table.*.
+A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
+
+Submitting a record and measuring images from spikes are the work of other rooms, which this one does not import: the
+command line passes the functions in.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from rich.console import Console
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.method import Method, find_methods, make_budget
+from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.reports.console import make_console, results_table
+from spike4dgs.benchmark.reports.paper_files import write_paper_table
+from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, TRACKS, PublishedTable, published, table_scenes
+from spike4dgs.benchmark.reports.scatter import write_scatter
+from spike4dgs.benchmark.reports.sheet import write_sheet
+from spike4dgs.benchmark.results.record import Record
+from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
+from spike4dgs.benchmark.scene.scene import Scene, open_scenes
+
+
+class Submit(Protocol):
+    """Checks a result record and enters it into a leaderboard; raises UserError where it refuses the record."""
+
+    def __call__(
+        self, result: Path, *, predictions: Path | None, scenes: tuple[Path, ...], leaderboard: Path, replace: bool
+    ) -> int:
+        """Submit the record in the file `result`."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunBenchmark:
+    """The command, and the functions of other rooms that it calls."""
+
+    submit: Submit
+    measure_images: Callable[[Sequence[str]], int]  # the command line of `speed images`, which makes table 6
+
+    def run_benchmark(
+        self,
+        scenes: Positional[tuple[Path, ...]] = (),
+        *,
+        table: int | None = None,
+        track: str = TRACKS[0],
+        data: Path = Path("data"),
+        profile: str = "small",
+        methods: tuple[str, ...] = (),
+        out: Path = Path("runs/benchmark"),
+        seed: int = 0,
+        device: str = "auto",
+        budget: str = "quick",
+        metrics: tuple[str, ...] = (AUTO,),
+        split: str | None = None,
+        leaderboard: Path | None = None,
+        replace: bool = False,
+        allow_gaps: bool = False,
+    ) -> int:
+        """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it was.
+
+        Args:
+            scenes: Scene folders.
+            table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
+                (number of views; plotted in views.png), 6 (images from spikes), 7 (MSDI without SPSS).
+            track: Of table 1 or 2: calibrated (methods are given the rig's poses) or uncalibrated (each estimates its
+                own).
+            data: Folder of the table's scenes.
+            profile: Profile of the table's scenes.
+            methods: Methods by name; all that are installed, or all rows of the table, if left out.
+            out: Folder for predictions, results, images and logs; for another split than the default, OUT/SPLIT is.
+            seed: Seed that every fit gets.
+            device: auto, cpu or cuda.
+            budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
+            metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
+                error are always computed.
+            split: Training views and held-out views, such as corner or views-3; each scene's default if left out.
+            leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
+            replace: Replace entries of the same name in that leaderboard.
+            allow_gaps: Accept recordings with gaps.
+        """
+        if track != TRACKS[0] and table in (None, IMAGE_TABLE):
+            fix = "without a table, name the methods, such as tfp+colmap+4dgs"
+            raise problem("--track", "--table 1 or 2 beside it", f"--table {table}" if table else "no table", fix)
+        if table == IMAGE_TABLE:
+            return self._measure_images(scenes, data, profile, out, allow_gaps)
+        paper = None if table is None else published(table, track)
+        if paper and scenes:
+            raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
+        scenes = table_scenes(paper, data, profile) if paper else scenes
+        chosen = _choose_methods(methods, paper)
+        console, common = make_console(), (seed, choose_device(device), make_budget(budget), metrics)
+        splits = paper.splits if paper and paper.splits and split is None else (split,)
+        runs, refused = [], False
+        for name in splits:
+            opened = open_scenes(scenes, allow_gaps, name)
+            folder = out / name if name and not all(s.is_default_split for s in opened) else out
+            settings = Settings(folder, *common)
+            records = run_matrix(opened, chosen, settings, console)
+            console.print(results_table(records))
+            write_images(opened, records, folder)
+            _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png")
+            refused |= self._submit(records, scenes, settings, leaderboard, replace)
+            runs.append((opened, records))
+        if paper:
+            folder = out if len(runs) > 1 else folder
+            worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
+            write_paper_table(paper, runs, worlds, select_metrics(metrics).metrics, folder)
+            _say(console, f"table {paper.number}: {folder}/table.md, .csv, .tex, .json")
+        failed = _failed_cells([r for _, records in runs for r in records])
+        if failed:
+            print(f"failed: {', '.join(failed)}", file=sys.stderr)
+        return 1 if failed or refused else 0
+
+    def _measure_images(self, scenes: tuple[Path, ...], data: Path, profile: str, out: Path, allow_gaps: bool) -> int:
+        """Make table 6, which compares images from spikes and fits no method."""
+        worlds = [world for number in (1, 2) for world in published(number).worlds]
+        chosen = scenes or tuple(p for world in worlds if (p := data / f"{world}-0-{profile}").is_dir())
+        if not chosen:
+            fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
+            raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
+        gaps = ["--allow-gaps"] if allow_gaps else []
+        return int(self.measure_images([*map(str, chosen), "--out", str(out), *gaps]))
+
+    def _submit(
+        self,
+        records: Sequence[Record],
+        scenes: tuple[Path, ...],
+        settings: Settings,
+        leaderboard: Path | None,
+        replace: bool,
+    ) -> bool:
+        """Submit every record. Return True where the leaderboard refused one: the run's results stand all the same."""
+        refused = False
+        for name in (r["method"]["name"] for r in records):
+            predictions = settings.out / "predictions" / name
+            try:
+                self.submit(
+                    settings.out / "results" / f"{name}.json",
+                    predictions=predictions if predictions.is_dir() else None,
+                    scenes=scenes,
+                    leaderboard=leaderboard or settings.out / "leaderboard",
+                    replace=replace or leaderboard is None,
+                )
+            except UserError as e:
+                print(f"error: {e}", file=sys.stderr)
+                refused = True
+        return refused
+
+
+def make_run_benchmark(submit: Submit, measure_images: Callable[[Sequence[str]], int]) -> Callable[..., int]:
+    """Return the command `run-benchmark`, which calls these functions of other rooms."""
+    return RunBenchmark(submit, measure_images).run_benchmark
+
+
+def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
+    """Write sheet_SCENE.png for each scene, and scatter.png."""
+    for scene in scenes:
+        folders = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
+        write_sheet(out / f"sheet_{scene.id}.png", scene, folders, records)
+    write_scatter(out / "scatter.png", records)
+
+
+def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> list[Method]:
+    """Return the methods by name; without names the rows of the table, or all that are installed."""
+    known: Mapping[str, Method] = find_methods()
+    names = names or (tuple(m for m in paper.rows if m in known) if paper else ())
+    if unknown := [m for m in names if m not in known]:
+        raise problem("--methods", f"names among {', '.join(sorted(known))}", ", ".join(unknown), "correct the names")
+    if not known:
+        raise problem("--methods", "an installed method", "none", "install a package that registers one")
+    return [known[name] for name in dict.fromkeys(names or known)]
+
+
+def _failed_cells(records: Sequence[Record]) -> list[str]:
+    cells = [(f"{r['method']['name']} on {s}", c["status"]) for r in records for s, c in r["scenes"].items()]
+    return [name for name, status in cells if status == "failed"]
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False)
