@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32, UInt8, encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
@@ -20,7 +20,6 @@ from spike4dgs.method.saved_model import SavedModel
 Mode = Literal["rendered", "spike rate", "error"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 WINDOW_TICKS = 40  # of the spike rate: 2 ms at 20 kHz, in which a bright pixel fires 24 times
-ERROR_MAX = 0.3  # white in an error image, as in the sheets of a run
 BORDER = 24  # gray around an image that is not as wide or high as the window
 
 
@@ -48,8 +47,7 @@ class Stage:
         recorded = self.spike_rate(camera.id, t_us)
         if mode == "spike rate":
             return _gray(recorded)
-        error = np.clip(self.saved.model.render(camera, t_us), 0, 1) - np.clip(recorded, 0, 1)
-        return error_colors()[np.rint(np.abs(error).clip(max=ERROR_MAX) * (255 / ERROR_MAX)).astype(np.uint8)]
+        return error_image(self.saved.model.render(camera, t_us), recorded)
 
     def spike_rate(self, camera: str, t_us: float) -> Float32:
         """Spikes per tick in the window around `t_us`, over the radiance gain: [H, W], 1.0 = white.
@@ -92,14 +90,6 @@ def open_stage(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) 
 
 def _gray(image: Float32) -> UInt8:
     return np.repeat(encode_srgb(image)[:, :, None], 3, 2)
-
-
-@cache
-def error_colors() -> UInt8:
-    """The colours [256, 3] of an error from 0 to `ERROR_MAX`: those of the sheets."""
-    from matplotlib import colormaps
-
-    return (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
 
 
 def padded(picture: UInt8, aspect: float) -> UInt8:

@@ -17,15 +17,14 @@ from small_scenes import array_cameras
 
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.reports.error_map import ERROR_MAX, error_colors
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
 from spike4dgs.method.saved_model import SavedModel
 from spike4dgs.method.viewing.camera_paths import still
 from spike4dgs.method.viewing.stage import (
     BORDER,
-    ERROR_MAX,
     MODES,
     Stage,
-    error_colors,
     free_camera,
     matching,
     open_stage,
