@@ -9,9 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import dummy_methods
 import numpy as np
 import pytest
-import dummy_methods
 from dummy_methods import CountMethod, FailingMethod, run
 from PIL import Image
 
@@ -23,7 +23,7 @@ from spike4dgs.benchmark.runs.cell import FitClock
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.leaderboard.submit import read_entry
+from spike4dgs.leaderboard.entry import read_entry
 
 run_benchmark = load("run-benchmark")
 

@@ -25,7 +25,8 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription
-from spike4dgs.leaderboard.submit import read_entry, submit
+from spike4dgs.leaderboard.entry import read_entry
+from spike4dgs.leaderboard.submit_command import submit
 
 
 def at(*places: tuple[float, float]) -> tuple[Camera, ...]:

@@ -1,0 +1,26 @@
+"""Fixtures of the leaderboard's tests: a finished run, made once, and a copy that a test may damage."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from dummy_methods import CountMethod, FailingMethod, run
+from small_scenes import write_small_scene
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes, and a run of two methods and a failing one on them."""
+    root = tmp_path_factory.mktemp("finished")
+    scenes = [write_small_scene(root / f"s{i}", seed=i) for i in range(2)]
+    methods = (CountMethod("tfp+4dgs"), CountMethod("rough", steps=1), FailingMethod("bad", ValueError("no luck")))
+    run(root / "out", scenes, *methods)
+    return root
+
+
+@pytest.fixture
+def done(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may damage."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from dummy_methods import CountMethod, run
+from submissions import Record, board, edit, enter
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.results.predictions import INFO, SUMS
+from spike4dgs.benchmark.runs.score_command import score
+from spike4dgs.benchmark.weights import METAIQA, VARIABLE
+from spike4dgs.leaderboard.entry import read_entry
+from spike4dgs.leaderboard.submit_command import submit
+
+
+def better_psnr(record: Record) -> None:
+    """A forgery that agrees with itself."""
+    cells = record["scenes"].values()
+    for cell in cells:
+        for values in cell["per_image"].values():
+            values["psnr"] += 0.01
+        cell["metrics"]["psnr"] += 0.01
+    record["mean"]["psnr"] += 0.01
+
+
+def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
+    edit(done / "out/results/tfp+4dgs.json", better_psnr)
+    with pytest.raises(
+        UserError, match=r"scene pattern-0, cam_03/0000\d0: expected psnr = .* as computed from the files"
+    ):
+        enter(done)
+    assert not (done / "board").exists()
+    assert read_entry(enter(done, verified=False))["label"] == "self-reported"
+
+
+def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
+    def nudge(record: Record) -> None:
+        values = record["scenes"]["pattern-0"]["per_image"]["cam_03/000020"]
+        values["psnr"] += 1e-7
+        record["scenes"]["pattern-0"]["metrics"]["psnr"] += 1e-7 / 3
+        record["mean"]["psnr"] += 1e-7 / 6
+
+    edit(done / "out/results/tfp+4dgs.json", nudge)
+    assert read_entry(enter(done))["label"] == "verified"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda r: r["scenes"]["pattern-0"].update(predictions_sha256="0" * 64),
+            "expected predictions 00000000",
+        ),
+        (lambda r: r["scenes"]["pattern-1"].update(fit_seconds=1e-3), "expected fit_seconds"),
+        (lambda r: r["scenes"]["pattern-1"].update(gain_aligned=7.0), "expected gain_aligned"),
+        (lambda r: r["method"].update(params={"steps": 1}), "as in the record"),
+        (lambda r: r["dataset"]["scenes"].update({"pattern-0": "1" * 64}), "expected scene revision 1111111111111111"),
+        (lambda r: r["mean"].update(psnr=99.0), "expected psnr ="),
+        (lambda r: r["scenes"]["pattern-0"]["per_image"].pop("cam_03/000020"), "the mean of its parts"),
+        (lambda r: r["method"].update(name="../../evil"), "at method/name"),
+        (lambda r: r["method"].update(name="a/b"), "at method/name"),
+        (lambda r: r.update(surprise=1), "'surprise' was unexpected"),
+    ],
+)
+def test_records_that_the_files_contradict_are_refused(done: Path, change: Any, message: str) -> None:
+    edit(done / "out/results/tfp+4dgs.json", change)
+    with pytest.raises(UserError) as e:
+        enter(done)
+    assert message in str(e.value) and "\n" not in str(e.value)
+    assert not (done / "board").exists()
+
+
+def test_damaged_predictions_are_refused_by_name(done: Path) -> None:
+    path = done / "out/predictions/tfp+4dgs/pattern-1/cam_03/000040.exr"
+    path.write_bytes(path.read_bytes()[:-1] + b"\1")
+    with pytest.raises(UserError, match=r"pattern-1/cam_03/000040\.exr: expected sha256"):
+        enter(done)
+
+
+def test_missing_predictions_and_paths_are_refused(done: Path) -> None:
+    shutil.rmtree(done / "out/predictions/tfp+4dgs/pattern-1")
+    with pytest.raises(UserError, match="pattern-1: expected a predictions folder"):
+        enter(done)
+    with pytest.raises(UserError, match="nowhere: expected a predictions folder"):
+        enter(done, predictions=done / "nowhere")
+    with pytest.raises(UserError, match="nowhere: expected a scene folder"):
+        enter(done, scenes=(done / "nowhere",))
+    with pytest.raises(UserError, match=r"nothing\.json: expected a spike4dgs-result/1 record, found no such file"):
+        submit(done / "nothing.json", leaderboard=done / "board")
+
+
+def test_other_predictions_of_the_method_are_refused(done: Path) -> None:
+    with pytest.raises(UserError, match="give the predictions that were scored"):
+        enter(done, predictions=done / "out/predictions/rough")
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine that has weights for MetaIQA (random ones) and nothing else."""
+    torch.manual_seed(0)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    torch.save(metaiqa_network().state_dict(), folder / METAIQA.name)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv(VARIABLE, str(folder))
+    return folder
+
+
+def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
+    done: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
+    monkeypatch.delenv(VARIABLE)
+    entry = read_entry(enter(done, "with", verified=False))
+    assert set(entry["unverified"]) == {*METRICS} - {"lpips_alex", "lpips_vgg", "lpips_squeeze"}
+    entry = read_entry(enter(done, "with"))
+    assert (entry["label"], entry["unverified"]) == ("verified", ["metaiqa"])
+    assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
+    assert "with: verified (as claimed, for lack of weights: metaiqa), rank 1" in capsys.readouterr().out
+    monkeypatch.setenv(VARIABLE, str(weights))
+    path = enter(done, "with")
+    assert read_entry(path)["unverified"] == []
+    before = path.read_bytes()
+    monkeypatch.delenv(VARIABLE)
+    assert enter(done, "with").read_bytes() == before, "what was verified stays so"
+
+
+def better_metaiqa(record: Record) -> None:
+    for cell in record["scenes"].values():
+        for values in cell["per_image"].values():
+            values["metaiqa"] += 0.25
+        cell["metrics"]["metaiqa"] += 0.25
+    record["mean"]["metaiqa"] += 0.25
+
+
+def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done: Path, weights: Path) -> None:
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
+    edit(done / "out/results/with.json", better_metaiqa)
+    with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
+        enter(done, "with")
+    torch.manual_seed(1)
+    torch.save(metaiqa_network().state_dict(), weights / METAIQA.name)
+    assert read_entry(enter(done, "with"))["unverified"] == ["metaiqa"]
+
+
+def test_more_weights_than_the_claimants_do_no_harm(done: Path, weights: Path) -> None:
+    assert read_entry(enter(done))["unverified"] == []
+
+
+def test_predictions_of_another_program_are_scored_and_verified(done: Path) -> None:
+    """No key, no environment, no times: a folder written with other tools."""
+    theirs = done / "theirs"
+    for scene in ("pattern-0", "pattern-1"):
+        folder = theirs / scene
+        shutil.copytree(done / "out/predictions/rough" / scene, folder)
+        smallest = {"schema": "spike4dgs-prediction/1", "method": {"name": "theirs"}, "scene": scene}
+        (folder / INFO).write_text(json.dumps(smallest))
+        lines = (folder / SUMS).read_text().splitlines(keepends=True)
+        (folder / SUMS).write_text("".join(reversed(lines)))
+    scenes = (done / "s0", done / "s1")
+    assert score(theirs, scenes, out=done / "theirs.json") == 0
+    assert submit(done / "theirs.json", predictions=theirs, scenes=scenes, leaderboard=done / "board") == 0
+    assert read_entry(done / "board/entries/pattern-0+pattern-1/theirs.json")["label"] == "verified"
+    (row,) = board(done)["boards"][0]["rows"]
+    ours = json.loads((done / "out/results/rough.json").read_text())
+    assert row["rank"] == 1 and row["fit_seconds"] is None and row["mean"] == ours["mean"]
