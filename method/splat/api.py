@@ -12,7 +12,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat.cpu import render_cpu
 from spike4dgs.method.splat.gsplat_cuda import render_cuda
 from spike4dgs.method.splat.reference import render_reference
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import EPS2D, NEAR, RenderOutput, Splats, Views
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 _BACKENDS: dict[str, Callable[..., RenderOutput]] = {
@@ -29,21 +29,22 @@ def render(
     background: Tensor | None = None,
     depth: bool = False,
     antialiased: bool = False,
-    near: float = 0.01,
-    eps2d: float = 0.3,
+    near: float = NEAR,
+    eps2d: float = EPS2D,
     backend: Backend = "auto",
 ) -> RenderOutput:
-    """Draw N Gaussians into C views, differentiable in every tensor of `splats` and in `views.w2c`.
+    """Render N Gaussians into C views, differentiable in every tensor of `splats` and in `views.w2c`.
 
     Args:
         splats: the Gaussians; float64 tensors are projected in float64, which a world far from its origin needs.
         views: the cameras.
-        background: [F] or [C, F], seen through what the Gaussians leave transparent; None is black.
+        background: [F] or [C, F], the colour behind the Gaussians; None is black.
         depth: also accumulate the camera-space z with the colours' weights.
         antialiased: dim Gaussians that the pixel filter enlarges, so that their total light stays.
-        near: Gaussians whose centre is nearer than this (in world units) are not drawn.
+        near: Gaussians whose centre is nearer than this (in world units) are not rendered.
         eps2d: variance of the pixel filter, px^2.
-        backend: "reference" (float64, tiny scenes), "cpu" (numba), "cuda" (gsplat); "auto" goes by the device.
+        backend: "reference" (float64, tiny scenes), "cpu" (numba), "cuda" (gsplat); "auto" chooses by the
+            device.
 
     Raises:
         UserError: for wrong shapes, non-finite values, or a back end that is not installed.

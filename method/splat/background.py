@@ -1,9 +1,9 @@
-"""Gaussians that stay as they are before fixed cameras: projected and listed once, then drawn with others that change.
+"""Gaussians that never change, in views that never change: projected and listed once, rendered with others that move.
 
 A fit of a mostly static scene renders the same Gaussians into the same views again and again. A `Background` keeps, for
-each view, what they project to, their tile lists and their image. A tile that no other Gaussian touches is copied
-from that image; in the others both lists are sorted and composited together, so that the result is what rendering all
-Gaussians at once gives, to the bit. No gradient flows to the background.
+each view, their projection, their tile lists and their image. A tile that no other Gaussian touches is copied from that
+image. In the other tiles both lists are sorted and composited together, so the result is what rendering all Gaussians
+at once gives, to the bit. No gradient flows to the background.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torch import Tensor
 from spike4dgs.method.splat import api, cpu
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import kernel
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+from spike4dgs.method.splat.kernels.project import Geometry
+from spike4dgs.method.splat.types import EPS2D, NEAR, RenderOutput, Splats, Views
 
 Array = np.ndarray
-NEAR, EPS2D = 0.01, 0.3  # `render`'s defaults
 
 
 @dataclass(frozen=True, eq=False)
-class _Still:
+class _Layer:
     """The background in one view."""
 
     projection: cpu.Projection
@@ -36,18 +36,18 @@ class _Still:
 
 
 class Background:
-    """Splats seen by views, none of which changes. Splats that are drawn with it need the same number of channels."""
+    """Splats in views, neither of which changes. Splats rendered with it need the same number of channels."""
 
     def __init__(self, splats: Splats, views: Views) -> None:
         self.splats = Splats(*(t.detach() for t in (*splats.geometry, splats.colors)))
         self.views = views
-        self._still: dict[int, _Still] = {}
+        self._layers: dict[int, _Layer] = {}
 
     def __len__(self) -> int:
         return len(self.splats)
 
     def render(self, splats: Splats, chosen: Sequence[int]) -> RenderOutput:
-        """Draw `splats` [N] and the background into the views `chosen`, differentiable in `splats`; no depth.
+        """Render `splats` [N] and the background into the views `chosen`, differentiable in `splats`; no depth.
 
         `radii` and `means2d` are those of `splats` alone. Raises UserError for values that are not finite.
         """
@@ -65,24 +65,24 @@ class Background:
         return RenderOutput(image.permute(0, 2, 3, 1), alpha, None, radii, means2d)
 
     def settings(self) -> cpu.Settings:
-        """What the kernels are asked for."""
+        """Return the kernels' settings: the defaults of `render`, in the size of the views."""
         return cpu.Settings(self.views.width, self.views.height, NEAR, EPS2D, antialiased=False, depth=False)
 
-    def still(self, view: int) -> _Still:
-        """The background in a view, made when it is first asked for."""
-        if view not in self._still:
+    def layer(self, view: int) -> _Layer:
+        """Return the background in a view. It is rendered on the first call."""
+        if view not in self._layers:
             s, n = self.settings(), len(self)
-            geometry = tuple(t.float().contiguous().numpy() for t in self.splats.geometry)
+            geometry = Geometry(*(t.float().contiguous().numpy() for t in self.splats.geometry))
             camera = cpu.camera_entries(self.views.w2c[view], self.views.K[view])
             p = cpu.project_view(geometry, camera, s, np.empty((n, 2), np.float32), np.empty(n, np.float32))
             colors = cpu.pack_colors(self.splats.colors.float().numpy(), None)
             frame = cpu.composite_view(p, colors, cpu.chunking(self.splats.colors.shape[1])[0], s)
-            self._still[view] = _Still(p, colors, frame.image, frame.alpha)
-        return self._still[view]
+            self._layers[view] = _Layer(p, colors, frame.image, frame.alpha)
+        return self._layers[view]
 
 
 def join(a: Splats, b: Splats) -> Splats:
-    """The Gaussians of `a` followed by those of `b`."""
+    """Return the Gaussians of `a` followed by those of `b`."""
     return Splats(*(torch.cat(pair) for pair in zip(_tensors(a), _tensors(b), strict=True)))
 
 
@@ -90,36 +90,36 @@ def _tensors(splats: Splats) -> tuple[Tensor, ...]:
     return (*splats.geometry, splats.colors)
 
 
-def _join(still: cpu.Projection, own: cpu.Projection, across: int) -> cpu.Projection:
-    """Both sets of Gaussians, the background's first, with lists for the tiles that `own` touches.
+def _join(behind: cpu.Projection, own: cpu.Projection, s: cpu.Settings) -> cpu.Projection:
+    """Return both sets of Gaussians, the background's first, with lists for the tiles that `own` touches.
 
-    A Gaussian of the background has, instead of gradient records of its own, the record of its tile behind all others:
-    it is written to, by one thread at a time, and never read. `across`: tiles in a row.
+    A Gaussian of the background has no gradient records of its own. It writes to the record of its tile, which follows
+    all others; one thread at a time writes there, and nobody reads it.
     """
-    n, counts = len(still.keys), np.diff(own.offsets)
-    offsets = np.concatenate([[0], np.cumsum(np.where(counts > 0, counts + np.diff(still.offsets), 0))])
+    n, counts = len(behind.keys), np.diff(own.offsets)
+    offsets = np.concatenate([[0], np.cumsum(np.where(counts > 0, counts + np.diff(behind.offsets), 0))])
     pairs = np.empty(offsets[-1], np.uint64)
-    _merge(still.pairs, still.offsets, own.pairs, own.offsets, n, offsets, pairs)
+    _merge(behind.pairs, behind.offsets, own.pairs, own.offsets, n, offsets, pairs)
     tiles, slots = np.empty((n + len(own.keys), 4), np.int32), np.empty(n + len(own.slots), np.int32)
-    tiles[:n], tiles[n:] = (0, across, 0, 1), own.tiles
+    tiles[:n], tiles[n:] = (0, s.tiles[0], 0, 1), own.tiles
     slots[:n], slots[n:] = len(own.pairs), own.slots
     records = cpu.aligned((n + len(own.keys), 8), np.float64)
-    records[:n], records[n:] = still.records, own.records
-    keys, depths = np.concatenate([still.keys, own.keys]), np.concatenate([still.depths, own.depths])
+    records[:n], records[n:] = behind.records, own.records
+    keys, depths = np.concatenate([behind.keys, own.keys]), np.concatenate([behind.depths, own.depths])
     return cpu.Projection(own.camera, records, keys, depths, tiles, slots, pairs, offsets)
 
 
 @kernel
 def _merge(
-    still_pairs: Any, still_offsets: Any, own_pairs: Any, own_offsets: Any, n: int, offsets: Any, pairs: Any
+    behind_pairs: Any, behind_offsets: Any, own_pairs: Any, own_offsets: Any, n: int, offsets: Any, pairs: Any
 ) -> None:
     """Fill each tile's list with the background's pairs and the others', whose index moves up by n."""
     for tile in range(len(offsets) - 1):
         at = offsets[tile]
         if offsets[tile + 1] == at:
             continue
-        for k in range(still_offsets[tile], still_offsets[tile + 1]):
-            pairs[at] = still_pairs[k]
+        for k in range(behind_offsets[tile], behind_offsets[tile + 1]):
+            pairs[at] = behind_pairs[k]
             at += 1
         for k in range(own_offsets[tile], own_offsets[tile + 1]):
             pairs[at] = own_pairs[k] + np.uint64(n)
@@ -127,9 +127,8 @@ def _merge(
 
 
 def _untouched(own: cpu.Projection, s: cpu.Settings) -> Array:
-    """Pixels [H, W] of the tiles that no Gaussian of `own` touches."""
-    across = -(-s.width // TILE_WIDTH)
-    empty = (np.diff(own.offsets) == 0).reshape(-1, across)
+    """Return the pixels [H, W] of the tiles that no Gaussian of `own` touches."""
+    empty = (np.diff(own.offsets) == 0).reshape(-1, s.tiles[0])
     return empty.repeat(TILE_HEIGHT, 0).repeat(TILE_WIDTH, 1)[: s.height, : s.width]
 
 
@@ -142,20 +141,18 @@ class _Over(torch.autograd.Function):
         background: Background, chosen: tuple[int, ...], radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         s, channels = background.settings(), colors.shape[1]
-        geometry = tuple(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities))
+        geometry = Geometry(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities)))
         packed = cpu.pack_colors(colors.detach().contiguous().numpy(), None)
         images, alphas, frames = [], [], []
         with cpu.busy:
             for c, view in enumerate(chosen):
-                still = background.still(view)
-                camera = still.projection.camera
+                behind = background.layer(view)
+                camera = behind.projection.camera
                 own = cpu.project_view(geometry, camera, s, probe.detach()[c].numpy(), radii[c].numpy())
-                both = np.concatenate([still.colors, packed], axis=1)
-                frame = cpu.composite_view(
-                    _join(still.projection, own, -(-s.width // TILE_WIDTH)), both, cpu.chunking(channels)[0], s
-                )
+                both = np.concatenate([behind.colors, packed], axis=1)
+                frame = cpu.composite_view(_join(behind.projection, own, s), both, cpu.chunking(channels)[0], s)
                 rest = _untouched(own, s)
-                frame.image[:, rest], frame.alpha[rest] = still.image[:, rest], still.alpha[rest]
+                frame.image[:, rest], frame.alpha[rest] = behind.image[:, rest], behind.alpha[rest]
                 images.append(frame.image[:channels])
                 alphas.append(frame.alpha)
                 frames.append((own, frame))
@@ -164,9 +161,8 @@ class _Over(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        n, s = len(ctx.geometry[0]), ctx.settings
-        outputs = [np.zeros(a.shape, np.float32) for a in ctx.geometry] + [np.zeros((n, ctx.channels), np.float32)]
-        d_centers = np.zeros((len(ctx.frames), n, 2), np.float32)
+        s, no_pose = ctx.settings, np.zeros((0, 4))
+        total = cpu.zero_gradients(ctx.geometry, ctx.channels, len(ctx.frames))
         with cpu.busy:
             for c, (own, frame) in enumerate(ctx.frames):
                 layers = np.zeros(frame.image.shape, np.float32)
@@ -174,12 +170,6 @@ class _Over(torch.autograd.Function):
                 count, tiles = len(own.pairs), len(own.offsets) - 1
                 d_opaque = np.ascontiguousarray(d_alpha[c].numpy())
                 sums = cpu.record_sums(frame, s, layers, d_opaque, cpu.chunking(ctx.channels)[0], count + tiles)
-                cpu.chain(
-                    own,
-                    ctx.geometry,
-                    s,
-                    np.ascontiguousarray(sums[:, :count]),
-                    (*outputs, d_centers[c]),
-                    np.zeros((0, 4)),
-                )
-        return (*(torch.from_numpy(a) for a in outputs), torch.from_numpy(d_centers), None, None, None)
+                own_sums = np.ascontiguousarray(sums[:, :count])
+                cpu.chain(own, ctx.geometry, s, own_sums, total._replace(centers=total.centers[c]), no_pose)
+        return (*(torch.from_numpy(a) for a in total), None, None, None)

@@ -20,6 +20,8 @@ from spike4dgs.method.splat.kernels import project_gradient
 from spike4dgs.method.splat.kernels import tiles as tile_kernels
 from spike4dgs.method.splat.kernels.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import announce_compilation
+from spike4dgs.method.splat.kernels.project import Geometry, Projected, View
+from spike4dgs.method.splat.kernels.project_gradient import Gradients, Records
 from spike4dgs.method.splat.kernels.raster import AHEAD, MAX_BLOCKS, raster_kernels, record_width
 from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
@@ -31,7 +33,7 @@ busy = threading.Lock()  # the scratch memory is shared by all renders of the pr
 
 @dataclass(frozen=True)
 class Settings:
-    """What one call of `render` asks for, in the kernels' terms."""
+    """The options of one call of `render`, in the kernels' terms."""
 
     width: int
     height: int
@@ -40,12 +42,21 @@ class Settings:
     antialiased: bool
     depth: bool
 
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Tiles across and down the image."""
+        return -(-self.width // TILE_WIDTH), -(-self.height // TILE_HEIGHT)
+
+    def view(self, camera: Array) -> View:
+        """Return the kernels' view of a camera [16], see `camera_entries`."""
+        return View(camera, self.width, self.height, self.near, self.eps2d, self.antialiased)
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One rendered view and what its gradient needs again. P: Gaussian-tile pairs; L: kernel channels in all."""
 
-    camera: Array  # [16] float64, see camera_constants
+    camera: Array  # [16] float64, see camera_entries
     records: Array  # [N * 8] float64
     keys: Array  # [N] uint32
     tiles: Array  # [N, 4] int32
@@ -71,7 +82,7 @@ def _thread_memory(thread: int) -> tuple[Array, ...]:
 
 
 def camera_entries(w2c: Tensor, K: Tensor) -> Array:
-    """A camera [16] as `project_kernels.camera_constants` takes it, from [4, 4] and [3, 3]."""
+    """Return a camera as the kernels take it, [16]: R row by row, t, fx, fy, cx, cy; from [4, 4] and [3, 3]."""
     pose, k = w2c.detach().double().numpy(), K.detach().double().numpy()
     return np.concatenate([pose[:3, :3].reshape(-1), pose[:3, 3], k[[0, 1, 0, 1], [0, 1, 2, 2]]])
 
@@ -98,9 +109,9 @@ def pack_colors(colors: Array, depths: Array | None) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """N Gaussians in one view: where they are drawn, and which tiles they touch. P: Gaussian-tile pairs."""
+    """N Gaussians in one view: where they are rendered, and which tiles they touch. P: Gaussian-tile pairs."""
 
-    camera: Array  # [16] float64, see camera_constants
+    camera: Array  # [16] float64, see camera_entries
     records: Array  # [N, 8] float64
     keys: Array  # [N] uint32
     depths: Array  # [N] float32
@@ -110,19 +121,19 @@ class Projection:
     offsets: Array  # [tiles + 1] int64
 
 
-def project_view(geometry: tuple[Array, ...], camera: Array, s: Settings, centers: Array, radii: Array) -> Projection:
+def project_view(geometry: Geometry, camera: Array, s: Settings, centers: Array, radii: Array) -> Projection:
     """Project into one view and list the tiles; fills centers [N, 2] and radii [N]. Raises UserError for NaN."""
-    n, threads = len(geometry[0]), get_threads()
-    across, down = -(-s.width // TILE_WIDTH), -(-s.height // TILE_HEIGHT)
+    n, threads = len(geometry.means), get_threads()
+    across, down = s.tiles
     blocks = -(-n // project_kernels.BLOCK)
     records, keys, depths = aligned((n, 8), np.float64), np.empty(n, np.uint32), np.empty(n, np.float32)
     tiles, slots = np.empty((n, 4), np.int32), np.zeros(n + 1, np.int32)
     histogram, invalid = np.empty((blocks, 1 + across * down), np.int32), np.empty(blocks, np.int64)
     offsets = np.empty(across * down + 1, np.int64)
-    arguments = (*geometry, camera, s.width, s.height, s.near, s.eps2d, s.antialiased)
-    outputs = (records, keys, depths, centers, radii, tiles, histogram, invalid)
+    out = Projected(records, keys, depths, centers, radii, tiles, histogram, invalid)
     announce_compilation(project_kernels.project_forward, "CPU splatting")
-    run(project_kernels.project_forward, (*arguments, *outputs), [(_thread_memory(t)[0],) for t in range(threads)])
+    scratch = [(_thread_memory(t)[0],) for t in range(threads)]
+    run(project_kernels.project_forward, (geometry, s.view(camera), out), scratch)
     if n and invalid.max() >= 0:
         raise not_finite("geometry", int(invalid.max()))
     pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
@@ -131,7 +142,7 @@ def project_view(geometry: tuple[Array, ...], camera: Array, s: Settings, center
 
 
 def composite_view(p: Projection, colors: Array, channels: int, s: Settings) -> Frame:
-    """Draw one view's lists, nearest first. `colors` as `pack_colors` gives them; `channels` in one kernel pass."""
+    """Composite one view's lists, nearest first. `colors` come from `pack_colors`; `channels` in one kernel pass."""
     passes, tiles = len(colors), len(p.offsets) - 1
     order = np.zeros(len(p.pairs) + AHEAD, np.int32)
     image = np.empty((passes * channels, s.height, s.width), np.float32)
@@ -147,7 +158,7 @@ def composite_view(p: Projection, colors: Array, channels: int, s: Settings) -> 
 
 
 def record_sums(frame: Frame, s: Settings, d_image: Array, d_alpha: Array, channels: int, count: int) -> Array:
-    """The gradient records [passes, count, record width] of a frame's Gaussian-tile pairs."""
+    """Return the gradient records [passes, count, record width] of a frame's Gaussian-tile pairs."""
     sums = aligned((len(frame.colors), count * record_width(channels)), np.float32)
     _, backward = raster_kernels(host_lanes(), channels)
     lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
@@ -156,41 +167,44 @@ def record_sums(frame: Frame, s: Settings, d_image: Array, d_alpha: Array, chann
     return sums.reshape(len(frame.colors), count, record_width(channels))
 
 
+def zero_gradients(geometry: Geometry, channels: int, views: int) -> Gradients:
+    """Return zeros to add the gradients of some views to; `centers` [views, N, 2] has a part for each view."""
+    dtype, n = geometry.means.dtype, len(geometry.means)
+    means, quats, scales, opacities = (np.zeros(a.shape, dtype) for a in geometry)
+    colors, centers = np.zeros((n, channels), np.float32), np.zeros((views, n, 2), dtype)
+    return Gradients(means, quats, scales, opacities, colors, centers)
+
+
 def chain(
-    frame: Frame | Projection, geometry: tuple[Array, ...], s: Settings, sums: Array, outputs: tuple[Array, ...],
-    d_pose: Array,
-) -> None:  # fmt: skip
-    """Add what the records say to outputs (means, quats, scales, opacities, colors, centers); d_pose [4, 4] is set."""
+    frame: Frame | Projection, geometry: Geometry, s: Settings, sums: Array, gradients: Gradients, d_pose: Array
+) -> None:
+    """Add what the records say to the gradients; d_pose [4, 4] is set, unless it is empty."""
     blocks = -(-len(frame.keys) // project_kernels.BLOCK) if d_pose.size else 0
     block_pose = np.empty((blocks, 12))
-    depth_channel = outputs[4].shape[1] if s.depth else -1
-    arguments = (*geometry, frame.camera, s.width, s.height, s.eps2d, s.antialiased, depth_channel)
+    records = Records(frame.keys, frame.slots, sums, gradients.colors.shape[1] if s.depth else -1)
     run(
         project_gradient.project_backward,
-        (*arguments, frame.keys, frame.slots, sums, *outputs, block_pose),
+        (geometry, s.view(frame.camera), records, gradients, block_pose),
         [_thread_memory(t)[:2] for t in range(get_threads())],
     )
     if d_pose.size:
         d_pose[:3] = block_pose.sum(0).reshape(3, 4)
 
 
-def _render_view(
-    geometry: tuple[Array, ...], colors: Array, camera: Array, s: Settings, centers: Array, radii: Array
-) -> Frame:
-    """Draw one view; fills centers [N, 2] and radii [N]."""
+def _render_view(geometry: Geometry, colors: Array, camera: Array, s: Settings, centers: Array, radii: Array) -> Frame:
+    """Render one view; fills centers [N, 2] and radii [N]."""
     projection = project_view(geometry, camera, s, centers, radii)
     packed = pack_colors(colors, projection.depths if s.depth else None)
     return composite_view(projection, packed, chunking(colors.shape[1] + s.depth)[0], s)
 
 
 def _differentiate_view(
-    frame: Frame, geometry: tuple[Array, ...], s: Settings, d_image: Array, d_alpha: Array, outputs: tuple[Array, ...],
-    d_pose: Array,
-) -> None:  # fmt: skip
-    """Add one view's gradients to outputs (means, quats, scales, opacities, colors, centers); d_pose [4, 4] is set."""
-    channels = chunking(outputs[4].shape[1] + s.depth)[0]
+    frame: Frame, geometry: Geometry, s: Settings, d_image: Array, d_alpha: Array, gradients: Gradients, d_pose: Array
+) -> None:
+    """Add one view's gradients; d_pose [4, 4] is set, unless it is empty."""
+    channels = chunking(gradients.colors.shape[1] + s.depth)[0]
     sums = record_sums(frame, s, d_image, d_alpha, channels, int(frame.slots[len(frame.keys)]))
-    chain(frame, geometry, s, sums, outputs, d_pose)
+    chain(frame, geometry, s, sums, gradients, d_pose)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -201,7 +215,7 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, w2c: Tensor,
         probe: Tensor, K: Tensor, settings: Settings, radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        geometry = tuple(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities))
+        geometry = Geometry(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities)))
         frames = []
         with busy:
             for c in range(len(w2c)):
@@ -217,20 +231,19 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        n, dtype = len(ctx.geometry[0]), ctx.geometry[0].dtype
-        outputs = [np.zeros(a.shape, dtype) for a in ctx.geometry] + [np.zeros((n, ctx.channels), np.float32)]
-        d_centers = np.zeros((len(ctx.frames), n, 2), dtype)
+        total = zero_gradients(ctx.geometry, ctx.channels, len(ctx.frames))
         d_w2c = np.zeros((len(ctx.frames), 4, 4) if ctx.needs_input_grad[5] else (len(ctx.frames), 0))
         with busy:
             for c, frame in enumerate(ctx.frames):
                 layers = np.zeros(frame.image.shape, np.float32)
                 layers[: d_image.shape[1]] = d_image[c].numpy()
                 own = np.ascontiguousarray(d_alpha[c].numpy())
-                _differentiate_view(frame, ctx.geometry, ctx.settings, layers, own, (*outputs, d_centers[c]), d_w2c[c])
-        grads = [torch.from_numpy(a) for a in outputs]
+                gradients = total._replace(centers=total.centers[c])
+                _differentiate_view(frame, ctx.geometry, ctx.settings, layers, own, gradients, d_w2c[c])
+        *grads, centers = (torch.from_numpy(a) for a in total)
         grads[4] = grads[4].to(ctx.colors_dtype)
         pose = torch.from_numpy(d_w2c).to(ctx.pose_dtype) if ctx.needs_input_grad[5] else None
-        return (*grads, pose, torch.from_numpy(d_centers), None, None, None)
+        return (*grads, pose, centers, None, None, None)
 
 
 def render_cpu(

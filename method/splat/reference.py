@@ -21,7 +21,9 @@ from torch import Tensor
 from spike4dgs.method.splat.types import (
     ALPHA_MAX,
     ALPHA_MIN,
+    EPS2D,
     FRUSTUM_MARGIN,
+    NEAR,
     T_MIN,
     RenderOutput,
     Splats,
@@ -144,9 +146,9 @@ def render_reference(
 
 @torch.no_grad()
 def cutoff_margin(
-    splats: Splats, views: Views, *, antialiased: bool = False, near: float = 0.01, eps2d: float = 0.3
+    splats: Splats, views: Views, *, antialiased: bool = False, near: float = NEAR, eps2d: float = EPS2D
 ) -> Tensor:
-    """How close each pixel comes to a decision that float32 may take otherwise, [C, H, W] float64.
+    """Return each pixel's distance from a decision that float32 may take otherwise, [C, H, W] float64.
 
     The smallest relative distance, over the Gaussians that reach the pixel, of alpha from 1/255 and of the next T
     from 1e-4. Where it is below the precision of a back end, a whole Gaussian may be there or not.

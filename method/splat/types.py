@@ -1,4 +1,4 @@
-"""What goes into a renderer and what comes out of it."""
+"""The inputs and the output of a renderer, and the constants that all back ends share."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ ALPHA_MIN = 1.0 / 255.0  # a Gaussian fainter than this at a pixel is skipped th
 ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becomes 0
 T_MIN = 1e-4  # a pixel is finished before the Gaussian that would bring T down to this
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
+
+# Defaults of `render`
+NEAR = 0.01  # Gaussians whose centre is nearer than this (in world units) are not rendered
+EPS2D = 0.3  # variance of the pixel filter, px^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +100,7 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """Images of C views, and what densification wants to know of the N Gaussians in each.
+    """Images of C views, and the N Gaussians' statistics in each, which densification uses.
 
     `means2d` holds the projected centres in pixels (0 where invisible). Where the render is differentiated,
     `means2d.grad` is dLoss/dmeans2d in the same units after `backward()`, on every back end.

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,8 +23,8 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.speed.timing import show_table
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
-from spike4dgs.method.splat import render as rasterise
 from spike4dgs.method.splat.reference import Projection, composite, project
+from spike4dgs.method.splat.types import EPS2D, NEAR
 from spike4dgs.method.trainer import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
 
@@ -119,11 +119,10 @@ def exact_patch(
 
     The Gaussians are projected as for the whole image; those that cannot reach the patch are left out.
     """
-    defaults: dict[str, Any] = rasterise.__kwdefaults__ or {}
     drawn, views = model.splats(t_us), Views.from_cameras([camera])
     wide = Splats(*(t.double().cpu() for t in (*drawn.geometry, drawn.colors)))
     whole = (camera.width, camera.height)
-    seen = project(wide, views.w2c[0], views.K[0], whole, False, defaults["near"], defaults["eps2d"])
+    seen = project(wide, views.w2c[0], views.K[0], whole, False, NEAR, EPS2D)
     offset = torch.tensor(corner, dtype=torch.float64)
     half = torch.tensor(size, dtype=torch.float64) / 2
     near = ((seen.center - offset - half).abs() <= half + seen.radius[:, None]).all(-1)

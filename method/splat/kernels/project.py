@@ -11,7 +11,7 @@ B = T A with rows b0, b1; the blurred 2D covariance is [[xx, xy], [xy, yy]] = B 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,39 @@ HALF_LOG2E = 0.5 / math.log(2.0)
 # Scratch rows: the parameters, then the projection.
 MX, MY, MZ, QW, QX, QY, QZ, SX, SY, SZ, OP = (k * BLOCK for k in range(11))
 CX, CY, SLOPE, HX, HY, XTOP, XIS, ETAS, RATIO, DEPTH, BAD = (k * BLOCK for k in range(11, 22))
+
+
+class Geometry(NamedTuple):
+    """The parameters of N Gaussians that decide where they are seen: arrays of one dtype."""
+
+    means: np.ndarray  # [N, 3]
+    quats: np.ndarray  # [N, 4]
+    scales: np.ndarray  # [N, 3]
+    opacities: np.ndarray  # [N]
+
+
+class View(NamedTuple):
+    """A camera, its image, and how Gaussians are projected into it."""
+
+    camera: np.ndarray  # [16] float64: R row by row (9), t (3), fx, fy, cx, cy
+    width: int
+    height: int
+    near: float
+    eps2d: float
+    antialiased: bool
+
+
+class Projected(NamedTuple):
+    """The outputs of `project_forward`: per Gaussian, and in the last two per block."""
+
+    records: np.ndarray  # [N, 8] float64, see blend_ir.py
+    keys: np.ndarray  # [N] uint32: depth bits or CULLED
+    depths: np.ndarray  # [N] float32
+    centers: np.ndarray  # [N, 2] px, 0 where culled
+    radii: np.ndarray  # [N] px, 0 where culled
+    tiles: np.ndarray  # [N, 4] int32: first and last + 1 tile in x, in y
+    histogram: np.ndarray  # [blocks, 1 + tiles] int32: total and per-tile count of Gaussian-tile pairs
+    invalid: np.ndarray  # [blocks] int64: a Gaussian with a parameter that is not finite, or -1
 
 
 @helper
@@ -72,8 +105,9 @@ def rotation(w: float, x: float, y: float, z: float) -> Any:
 
 
 @helper
-def camera_constants(camera: np.ndarray, width: int, height: int) -> Any:
-    """camera [16] = R (9), t (3), fx, fy, cx, cy -> the same as scalars, and the limits of x/z and y/z."""
+def camera_constants(view: Any) -> Any:
+    """Return R, t and (fx, fy, cx, cy) of a view as scalars, and the limits of x/z and y/z."""
+    camera, width, height = view.camera, view.width, view.height
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     mx, my = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     limits = (-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my)
@@ -120,28 +154,21 @@ def cross(a: Any, b: Any) -> Any:
 
 
 @helper
-def gather_parameters(s: np.ndarray, l: int, i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> None:  # noqa: E741
+def gather_parameters(s: np.ndarray, l: int, i: int, geometry: Any) -> None:  # noqa: E741
     """Copy Gaussian i into lane l."""
+    means, quats, scales, opacities = geometry
     s[MX + l], s[MY + l], s[MZ + l] = means[i, 0], means[i, 1], means[i, 2]
     s[QW + l], s[QX + l], s[QY + l], s[QZ + l] = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     s[SX + l], s[SY + l], s[SZ + l], s[OP + l] = scales[i, 0], scales[i, 1], scales[i, 2], opacities[i]
 
 
 @kernel
-def project_forward(
-    means: Any, quats: Any, scales: Any, opacities: Any, camera: Any, width: int, height: int, near: float,
-    eps2d: float, antialiased: bool, records: Any, keys: Any, depths: Any, centers: Any, radii: Any, tiles: Any,
-    histogram: Any, invalid: Any, counter: Any, s: Any,
-) -> None:  # fmt: skip
-    """Project all Gaussians into one view.
-
-    Writes per Gaussian: records [N, 8] (blend_ir.py), keys [N] (depth bits or CULLED), depths [N], centers [N, 2] and
-    radii [N] in px (0 where culled), tiles [N, 4] (first and last + 1 tile in x, in y); per block: histogram
-    [blocks, 1 + tiles] (total and per-tile count of Gaussian-tile pairs), invalid [blocks] (a Gaussian with a
-    parameter that is not finite, or -1).
-    """
-    n_all, across = means.shape[0], (width + TILE_WIDTH - 1) // TILE_WIDTH
-    R, t, f, limits = camera_constants(camera, width, height)
+def project_forward(geometry: Any, view: Any, out: Any, counter: Any, s: Any) -> None:
+    """Project all Gaussians (a `Geometry`) into one `View` and fill `out` (a `Projected`)."""
+    _, width, height, near, eps2d, antialiased = view
+    records, keys, depths, centers, radii, tiles, histogram, invalid = out
+    n_all, across = len(geometry.means), (width + TILE_WIDTH - 1) // TILE_WIDTH
+    R, t, f, limits = camera_constants(view)
     while True:
         block = fetch_add(counter, 0, 1)
         first = block * BLOCK
@@ -149,9 +176,9 @@ def project_forward(
             break
         n = min(BLOCK, n_all - first)
         for l in range(n):  # noqa: E741
-            gather_parameters(s, l, first + l, means, quats, scales, opacities)
+            gather_parameters(s, l, first + l, geometry)
         for l in range(n, BLOCK):  # noqa: E741
-            gather_parameters(s, l, first, means, quats, scales, opacities)
+            gather_parameters(s, l, first, geometry)
         for l in range(BLOCK):  # noqa: E741
             project_lane(s, l, R, t, f, limits, width, height, near, eps2d, antialiased)
         histogram[block, :] = 0

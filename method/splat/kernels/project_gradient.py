@@ -1,6 +1,6 @@
 """The gradient of the projection: from each Gaussian's summed moments to its parameters and the camera pose, float64.
 
-Symbols as in project_kernels.py. With p = dx / sqrt(xx) and q = (dy - slope dx) / sqrt(r), r = det / xx, a Gaussian is
+Symbols as in project.py. With p = dx / sqrt(xx) and q = (dy - slope dx) / sqrt(r), r = det / xx, a Gaussian is
 ln(alpha) = ln(o) - p^2 / 2 - q^2 / 2, and the rasteriser delivers the sums of s, s p, s q, s p^2, s p q, s q^2 over
 its pixels, s = dL/d ln(alpha) (up to the factor between xi, eta and p, q). Their chain rule has no cancelling terms:
 
@@ -13,7 +13,7 @@ and det = |b0 x b1|^2 + eps2d (|b0|^2 + |b1|^2) + eps2d^2 has the gradient 2 b1 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,21 +50,40 @@ GX, GY, GZ, GQW, GQX, GQY, GQZ, GSX, GSY, GSZ, GOP, GCX, GCY = (k * BLOCK for k 
 P_PER_XI = math.sqrt(2 * math.log(2.0))  # p = xi sqrt(2 ln 2), likewise q and eta
 
 
+class Records(NamedTuple):
+    """The gradient records that the rasteriser wrote, one per Gaussian-tile pair."""
+
+    keys: np.ndarray  # [N] uint32: depth bits or CULLED
+    slots: np.ndarray  # [N + 1] int32: Gaussian i owns the pairs slots[i]:slots[i + 1]
+    sums: np.ndarray  # [chunks, pairs, 8 or 16] float32: six moments and the colour gradients
+    depth_channel: int  # the channel that holds the depth, or -1
+
+
+class Gradients(NamedTuple):
+    """dLoss of a view's Gaussians: `centers` is written, the others are added to."""
+
+    means: np.ndarray  # [N, 3]
+    quats: np.ndarray  # [N, 4]
+    scales: np.ndarray  # [N, 3]
+    opacities: np.ndarray  # [N]
+    colors: np.ndarray  # [N, F] float32
+    centers: np.ndarray  # [N, 2] px
+
+
 @kernel
 def project_backward(
-    means: Any, quats: Any, scales: Any, opacities: Any, camera: Any, width: int, height: int, eps2d: float,
-    antialiased: bool, depth_channel: int, keys: Any, slots: Any, sums: Any, d_means: Any, d_quats: Any,
-    d_scales: Any, d_opacities: Any, d_colors: Any, d_centers: Any, d_pose: Any, counter: Any, s: Any, lanes: Any,
-) -> None:  # fmt: skip
-    """Sum each Gaussian's records over its tiles and chain them to the parameters.
+    geometry: Any, view: Any, records: Any, gradients: Any, d_pose: Any, counter: Any, s: Any, lanes: Any
+) -> None:
+    """Sum each Gaussian's `Records` over its tiles and chain them to the parameters: `Gradients`.
 
-    sums [chunks, pairs, 8 or 16]: per Gaussian-tile pair, six moments and the colour gradients; Gaussian i owns the
-    pairs slots[i]:slots[i + 1]. Channel `depth_channel` (or -1) is the depth. Accumulates into the d_ arrays;
-    d_centers [N, 2] is written; d_pose [blocks, 12] or [0, 12] gets dL/d[R | t] of each block.
+    d_pose [blocks, 12] or [0, 12] gets dL/d[R | t] of each block. s and lanes are scratch.
     """
-    n_all, chunks, n_colors = means.shape[0], sums.shape[0], d_colors.shape[1]
+    keys, _, sums, depth_channel = records
+    d_means, d_quats, d_scales, d_opacities, d_colors, d_centers = gradients
+    n_all, chunks, n_colors = len(geometry.means), sums.shape[0], d_colors.shape[1]
     per_chunk = (n_colors + (depth_channel >= 0) + chunks - 1) // chunks
-    R, t, f, limits = camera_constants(camera, width, height)
+    R, t, f, limits = camera_constants(view)
+    eps2d, antialiased = view.eps2d, view.antialiased
     while True:
         block = fetch_add(counter, 0, 1)
         first = block * BLOCK
@@ -75,8 +94,8 @@ def project_backward(
             d_centers[i, 0], d_centers[i, 1] = 0, 0
             if keys[i] == CULLED:
                 continue
-            gather_parameters(s, n, i, means, quats, scales, opacities)
-            gather_gradients(s, n, i, slots, sums, d_colors, depth_channel, per_chunk)
+            gather_parameters(s, n, i, geometry)
+            gather_gradients(s, n, i, records, d_colors, per_chunk)
             lanes[n] = i
             n += 1
         if d_pose.shape[0] > 0:
@@ -85,7 +104,7 @@ def project_backward(
             continue
         rounded = (n + 7) // 8 * 8
         for l in range(n, rounded):  # noqa: E741
-            gather_parameters(s, l, lanes[0], means, quats, scales, opacities)
+            gather_parameters(s, l, lanes[0], geometry)
             for row in range(MOMENTS + 1):
                 s[M0 + row * BLOCK + l] = 0.0
         for l in range(rounded):  # noqa: E741
@@ -108,10 +127,9 @@ def project_backward(
 
 
 @helper
-def gather_gradients(
-    s: np.ndarray, l: int, i: int, slots: Any, sums: Any, d_colors: Any, depth_channel: int, per_chunk: int  # noqa: E741
-) -> None:  # fmt: skip
+def gather_gradients(s: np.ndarray, l: int, i: int, records: Any, d_colors: Any, per_chunk: int) -> None:  # noqa: E741
     """Add up Gaussian i's records over its tiles, in their order, into lane l and d_colors[i]."""
+    _, slots, sums, depth_channel = records
     m0, mp, mq, mpp, mpq, mqq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for chunk in range(sums.shape[0]):
         for slot in range(slots[i], slots[i + 1]):
