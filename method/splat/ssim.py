@@ -1,7 +1,7 @@
 """Fused SSIM for training: value and gradient in one pass of numba kernels, with its plain torch twin.
 
-SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5, zero padding, data range 1, averaged over all
-pixels and images. The windows are separable and stay in the cache; the gradient needs three more blurs:
+SSIM (Wang et al. 2004) with the metric's Gaussian window (`ssim_window`), zero padding, data range 1, averaged over
+all pixels and images. The window is separable; the gradient needs three more blurs:
 
     S = A B / (C D),  A = 2 m1 m2 + c1,  B = 2 (q12 - m1 m2) + c2,
     C = m1^2 + m2^2 + c1,  D = q1 - m1^2 + q2 - m2^2 + c2,
@@ -21,15 +21,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.method.splat.kernels import threads
 from spike4dgs.method.splat.kernels.jit import announce_compilation, helper, kernel
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
-RADIUS = 5
+RADIUS = SSIM_WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
-_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SSIM_SIGMA) ** 2)
 _WINDOW /= _WINDOW.sum()
-W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in _WINDOW[: RADIUS + 1])  # from the window's edge to its middle
+# From the window's edge to its middle. An argument of the kernel: numba's cache would keep constants of another module.
+_HALF = tuple(np.float32(w) for w in _WINDOW[: RADIUS + 1])
 _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 
 
@@ -84,7 +86,7 @@ class _FusedSsim(torch.autograd.Function):
             )
             for _ in range(workers)
         ]
-        threads.run(_ssim_kernel, (a, b, sums, gradient), scratch)
+        threads.run(_ssim_kernel, (a, b, _HALF, sums, gradient), scratch)
         if image.requires_grad:
             ctx.save_for_backward(torch.from_numpy(gradient))
             ctx.dtype = image.dtype
@@ -97,8 +99,9 @@ class _FusedSsim(torch.autograd.Function):
 
 
 @helper
-def _blur(source, out, rows, line):  # type: ignore[no-untyped-def]
+def _blur(source, out, half, rows, line):  # type: ignore[no-untyped-def]
     """Blur [H, W] into `out`, which may be `source`. `rows` [H + 10, W] and `line` [W + 10] have zero margins."""
+    w0, w1, w2, w3, w4, w5 = half  # unrolled for a window of 11
     height, width = source.shape
     for y in range(height):
         for x in range(width):
@@ -106,23 +109,23 @@ def _blur(source, out, rows, line):  # type: ignore[no-untyped-def]
         r = rows[y + 5]
         for x in range(width):
             r[x] = (
-                W5 * line[x + 5]
-                + W4 * (line[x + 4] + line[x + 6])
-                + W3 * (line[x + 3] + line[x + 7])
-                + W2 * (line[x + 2] + line[x + 8])
-                + W1 * (line[x + 1] + line[x + 9])
-                + W0 * (line[x] + line[x + 10])
+                w5 * line[x + 5]
+                + w4 * (line[x + 4] + line[x + 6])
+                + w3 * (line[x + 3] + line[x + 7])
+                + w2 * (line[x + 2] + line[x + 8])
+                + w1 * (line[x + 1] + line[x + 9])
+                + w0 * (line[x] + line[x + 10])
             )
     for y in range(height):
         o = out[y]
         for x in range(width):
             o[x] = (
-                W5 * rows[y + 5, x]
-                + W4 * (rows[y + 4, x] + rows[y + 6, x])
-                + W3 * (rows[y + 3, x] + rows[y + 7, x])
-                + W2 * (rows[y + 2, x] + rows[y + 8, x])
-                + W1 * (rows[y + 1, x] + rows[y + 9, x])
-                + W0 * (rows[y, x] + rows[y + 10, x])
+                w5 * rows[y + 5, x]
+                + w4 * (rows[y + 4, x] + rows[y + 6, x])
+                + w3 * (rows[y + 3, x] + rows[y + 7, x])
+                + w2 * (rows[y + 2, x] + rows[y + 8, x])
+                + w1 * (rows[y + 1, x] + rows[y + 9, x])
+                + w0 * (rows[y, x] + rows[y + 10, x])
             )
 
 
@@ -146,7 +149,7 @@ def _row_sum(row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _ssim_kernel(images, targets, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
+def _ssim_kernel(images, targets, half, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
     """Sum of SSIM of each image, and the gradient of the mean over all of them where `gradients` is not empty."""
     batch, height, width = images.shape
     scale = np.float32(1.0 / (batch * height * width))
@@ -161,11 +164,11 @@ def _ssim_kernel(images, targets, sums, gradients, counter, rows, line, maps):  
                 q1[y, x] = a[y, x] * a[y, x]
                 q2[y, x] = b[y, x] * b[y, x]
                 q12[y, x] = a[y, x] * b[y, x]
-        _blur(a, m1, rows, line)
-        _blur(b, m2, rows, line)
-        _blur(q1, q1, rows, line)
-        _blur(q2, q2, rows, line)
-        _blur(q12, q12, rows, line)
+        _blur(a, m1, half, rows, line)
+        _blur(b, m2, half, rows, line)
+        _blur(q1, q1, half, rows, line)
+        _blur(q2, q2, half, rows, line)
+        _blur(q12, q12, half, rows, line)
         total = 0.0
         for y in range(height):
             for x in range(width):
@@ -182,9 +185,9 @@ def _ssim_kernel(images, targets, sums, gradients, counter, rows, line, maps):  
             total += _row_sum(q2[y])
         sums[i] = total
         if gradients.size:
-            _blur(m1, m1, rows, line)
-            _blur(q1, q1, rows, line)
-            _blur(q12, q12, rows, line)
+            _blur(m1, m1, half, rows, line)
+            _blur(q1, q1, half, rows, line)
+            _blur(q12, q12, half, rows, line)
             g = gradients[i]
             for y in range(height):
                 for x in range(width):
