@@ -1,42 +1,30 @@
-"""An event camera before the same scene: an event whenever a pixel's log radiance has changed by the threshold.
+"""An event camera of the same scene: an event whenever a pixel's log radiance has changed by the threshold.
 
-Contrast-threshold model without noise (as in ESIM, Rebecq et al. 2018): each pixel remembers the log radiance of its
-last event, at first that of the first key, and fires one event, positive or negative, each time it is a whole threshold
-away. Between keys log radiance is linear in time; times are microseconds, rounded down.
+Contrast-threshold model without noise (as in ESIM, Rebecq et al. 2018). Each pixel stores the log radiance of its last
+event, at first that of the first key. Whenever the log radiance is a whole threshold away, the pixel fires a positive
+or negative event. Between keys log radiance is linear in time; times are microseconds, rounded down.
 """
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.scene.events import Events
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.generators.sensor.model import Float32
 
 THRESHOLD = 0.2  # of log radiance
-_DARKEST = 1e-3  # radiance below which log radiance does not fall
-
-
-class Events(NamedTuple):
-    """Events in order of time, then row, then column."""
-
-    t: NDArray[np.int64]  # microseconds from the start of the clip
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    p: NDArray[np.uint8]  # 1: brighter, 0: darker
+_DARKEST = 1e-3  # lower radiances count as this one
 
 
 def events(
     keys: Sequence[Float32], key_ticks: Sequence[int], n_ticks: int, rate_hz: int, threshold: float = THRESHOLD
 ) -> Events:
-    """Events of a clip from radiance keys [H, W], which are read one at a time; those after `n_ticks` are left out."""
+    """Return the events of a clip from radiance keys [H, W], read one at a time, up to tick `n_ticks`."""
     before = _log(keys[0])
     level = before.astype(np.float64)
     height, width = before.shape
@@ -86,22 +74,3 @@ def crossings(
             p[n] = 1 if sign > 0 else 0
             n += 1
     return n
-
-
-def write_events(path: Path, found: Events) -> None:
-    """Write events as `.npz` with the arrays t, x, y, p. Equal events give equal bytes."""
-    with atomic_path(path) as part:
-        np.savez_compressed(part, allow_pickle=False, **found._asdict())
-
-
-def read_events(path: Path) -> Events:
-    """Read events. Raises UserError where the file is missing or damaged."""
-    try:
-        with open(path, "rb") as f, np.load(f) as data:
-            return Events(*(data[name] for name in Events._fields))
-    except FileNotFoundError:
-        raise problem(path, "events", "no such file", "restore it or make the scene again") from None
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as e:
-        raise problem(
-            path, "events (t, x, y, p)", f"damaged data ({e})", "restore it or make the scene again"
-        ) from None

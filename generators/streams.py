@@ -1,6 +1,6 @@
-"""What a camera records of the radiance: its spikes, its calibration recordings, and what other sensors would see.
+"""Recordings of each camera: its spikes, its calibration recordings, and those of other sensors at the same position.
 
-One call writes everything of one camera, its spikes last.
+One call writes all recordings of one camera, the spikes last.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.events import write_events
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
@@ -26,7 +27,7 @@ CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
 
 
 def is_done(scene: Path, camera: Camera) -> bool:
-    """Whether `write_camera` has finished for this camera."""
+    """Return whether `write_camera` has finished for this camera."""
     return (scene / stream_name(camera.id)).is_file()
 
 
@@ -40,7 +41,7 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
     for tick, image in conventional.exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
         write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(image))
     found = events.events(store.instants(view, plan).keys, instants.ticks, job.n_ticks, RATE_HZ)
-    events.write_events(scene / f"events/{camera.id}.npz", found)
+    write_events(scene / f"events/{camera.id}.npz", found)
     clip, charge = store.view(view, plan), random_charge(*size, entropy)
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
         for packed in simulate(clip.keys, clip.ticks, job.n_ticks, sensor, charge, means=clip.means):
@@ -48,7 +49,7 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
 
 
 def sensor_of(job: Job, camera: Camera) -> Sensor:
-    """A camera's sensor; its maps belong to the camera and not to the world."""
+    """Return a camera's sensor; its maps belong to the camera, not to the world."""
     pixels = camera.height, camera.width, job.seed, camera.id
     return Sensor(
         gain=gain_map(*pixels) if job.gain_map else None,
@@ -59,7 +60,7 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
 
 
 def sensor_facts(job: Job) -> dict[str, Any]:
-    """`sensor` of scene.json."""
+    """Return `sensor` of scene.json."""
     return {
         "model": SENSOR.name,
         "rows_bottom_up": True,
@@ -72,7 +73,7 @@ def sensor_facts(job: Job) -> dict[str, Any]:
 
 
 def extras(job: Job) -> dict[str, dict[str, Any]]:
-    """What scene.json says of the files that `write_camera` and the ground truth add."""
+    """Return the entries of scene.json about the files that `write_camera` and the ground truth add."""
     return {
         "ground_truth": {
             "images": "linear radiance, half float: R, G, B and gray Y; 1 is white",

@@ -10,12 +10,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json
 
 Float64 = NDArray[np.float64]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes
@@ -152,3 +154,19 @@ def from_mitsuba(
     m = np.asarray(to_world, dtype=np.float64) @ _MITSUBA
     R = m[:3, :3].T
     return Camera(id, width, height, f, f, width * (0.5 - offset[0]), height * (0.5 - offset[1]), R, -R @ m[:3, 3])
+
+
+def read_cameras(root: Path) -> dict[str, Camera]:
+    """Read the cameras of a scene folder by id, from transforms_train.json and transforms_test.json.
+
+    Raises UserError where a file is missing or damaged.
+    """
+    cameras: dict[str, Camera] = {}
+    for name in ("transforms_train.json", "transforms_test.json"):
+        frames = read_json(root / name, "camera poses").get("frames")
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise problem(root / name, "a list `frames` of objects", "none", "make or import the scene again")
+        for frame in frames:
+            camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
+            cameras.setdefault(camera.id, camera)
+    return cameras

@@ -136,6 +136,21 @@ def write_png(path: Path, image: UInt8) -> None:
         Image.fromarray(image).save(part)
 
 
+def read_png(path: Path) -> UInt8:
+    """Read an 8-bit PNG, gray [H, W] or RGB [H, W, 3]. Raises UserError where it is missing, damaged or foreign."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            if image.mode not in ("L", "RGB"):
+                raise problem(path, "an 8-bit gray or RGB image", f"mode {image.mode}", _AGAIN)
+            return np.asarray(image)
+    except FileNotFoundError:
+        raise problem(path, "a PNG image", "no such file", _AGAIN) from None
+    except OSError as e:
+        raise problem(path, "a PNG image", f"damaged data ({e})", _AGAIN) from None
+
+
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Write a mask [H, W] as 8-bit PNG (0 and 255)."""
     write_png(path, mask.astype(np.uint8) * 255)
@@ -155,9 +170,15 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def encode_srgb(image: NDArray[np.floating[Any]]) -> UInt8:
-    """Linear radiance -> sRGB-encoded 8 bit, clipped to [0, 1]: how linear images are shown to people."""
+    """Return linear radiance as sRGB-encoded 8 bit, clipped to [0, 1]: linear images are shown to people this way."""
     x = np.clip(np.nan_to_num(image), 0.0, 1.0)
     encoded = np.where(
         x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4, where=x > 0, out=np.zeros_like(x)) - 0.055
     )
     return np.asarray(np.rint(encoded * 255), dtype=np.uint8)
+
+
+def decode_srgb(image: UInt8) -> Float32:
+    """Return the linear radiance of an sRGB-encoded 8-bit image: the inverse of `encode_srgb`."""
+    x = image / 255
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
@@ -31,6 +31,10 @@ class Manifest:
             self._check(name)
             self._checked.add(name)
         return self.root / name
+
+    def only(self, prefix: str) -> Manifest:
+        """Return the manifest of the files alone whose path begins with `prefix`."""
+        return replace(self, files={name: facts for name, facts in self.files.items() if name.startswith(prefix)})
 
     def problems(self) -> Iterator[str]:
         """Check every recorded file and yield one line for each that is missing or differs."""

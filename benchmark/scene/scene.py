@@ -1,4 +1,4 @@
-"""The scene folder, format `spike4dgs-scene/1`: what every method reads and every generator writes.
+"""The scene folder, format `spike4dgs-scene/1`: every generator writes it and every method reads it.
 
 Orientation, rate and camera identity come from scene.json, never from a guess. Every file is checked against the
 manifest before it is used, so a damaged stream is refused by whoever reads it.
@@ -6,8 +6,8 @@ manifest before it is used, so a damaged stream is refused by whoever reads it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate
-from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
+from spike4dgs.benchmark.scene.cameras import Camera, read_cameras
+from spike4dgs.benchmark.scene.events import EventStream, events_of, find_events
+from spike4dgs.benchmark.scene.frames import Frames, find_frames, frames_of
 from spike4dgs.benchmark.scene.images import read_exr, read_mask, read_rgb
 from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
-from spike4dgs.benchmark.scene.splits import Split
+from spike4dgs.benchmark.scene.splits import Split, check_splits
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
@@ -44,7 +46,10 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class TrainingScene:
-    """What a method may see: the training cameras and their streams, and the clock. No ground truth, no test stream."""
+    """The part of a scene that methods get: the clock, and the training cameras with their streams and recordings.
+
+    It has no ground truth, and nothing of a held-out camera: neither its stream nor its frames nor its events.
+    """
 
     id: str
     revision: str
@@ -54,10 +59,20 @@ class TrainingScene:
     n_ticks: int
     radiance_gain: float  # spikes per tick of a pixel that sees radiance 1 (white)
     recordings: tuple[Recordings | None, ...] = ()  # calibration recordings of each camera, if there are any
+    found_frames: Mapping[str, Frames] = field(default_factory=dict)  # by camera; see `frames`
+    found_events: Mapping[str, EventStream] = field(default_factory=dict)  # by camera; see `events`
+
+    def frames(self, camera: str) -> Frames:
+        """Return the conventional camera's frames beside a training camera, as `Scene.frames` does."""
+        return frames_of(self.found_frames, camera, f"{self.id}, training cameras")
+
+    def events(self, camera: str) -> EventStream:
+        """Return the event camera's events beside a training camera, as `Scene.events` does."""
+        return events_of(self.found_events, camera, f"{self.id}, training cameras")
 
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...] | None:
-        """What each camera does to light, estimated from its recordings; None unless all cameras have some."""
+        """Each camera's response to light, estimated from its recordings; None unless all cameras have some."""
         known = [r for r in self.recordings if r is not None]
         return tuple(estimate(r) for r in known) if known and len(known) == len(self.cameras) else None
 
@@ -67,13 +82,13 @@ class TrainingScene:
         return self.n_ticks * 1e6 / self.rate_hz
 
     def tick(self, t_us: float) -> int:
-        """The tick that contains the time `t_us`, clipped to the clip."""
+        """Return the tick that contains the time `t_us`, clipped to the clip."""
         return int(min(max(t_us * self.rate_hz * 1e-6, 0), self.n_ticks - 1))
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An opened scene folder, seen through one of its splits: it decides `train`, `test`, `targets` and `training`.
+    """An opened scene folder with one of its splits, which decides `train`, `test`, `targets` and `training`.
 
     Images are gray linear radiance, [H, W] float32, 1.0 = white.
     """
@@ -126,11 +141,11 @@ class Scene:
         return bool(self.split == self.meta["default_split"])
 
     def t_us(self, tick: int) -> float:
-        """Time at which a tick starts, in microseconds."""
+        """Return the time at which a tick starts, in microseconds."""
         return tick * 1e6 / self.rate_hz
 
     def stream(self, camera: str) -> SpikeStream:
-        """The packed stream of a camera, checked and memory-mapped."""
+        """Return the packed stream of a camera, checked and memory-mapped."""
         path = self.manifest.path(self.meta["streams"][camera])
         c = self.cameras[camera]
         bottom_up, gaps = bool(self.meta["sensor"]["rows_bottom_up"]), tuple(g for g in self.gaps if g.camera == camera)
@@ -138,7 +153,7 @@ class Scene:
         return open_stream(path, *size, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks, gaps=gaps)
 
     def recordings(self, camera: str) -> Recordings | None:
-        """A camera's recordings before uniform light and in the dark; None where the scene has none."""
+        """Return a camera's recordings under uniform light and in the dark; None where the scene has none."""
         facts, c = self.meta.get("calibration", {}), self.cameras[camera]
         if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
             return None
@@ -149,16 +164,32 @@ class Scene:
         return Recordings(streams[0], streams[1], float(facts["flat_radiance"]))
 
     def ground_truth(self, target: Target) -> NDArray[np.float32]:
-        """Radiance of a target, [H, W] float32."""
+        """Read the radiance of a target, [H, W] float32."""
         return read_exr(self.manifest.path(f"images/{target.name}.exr"))
 
     def ground_truth_rgb(self, target: Target) -> NDArray[np.float32]:
-        """The same in colour, [H, W, 3]. Raises UserError where the scene has gray images only."""
+        """Read it in colour, [H, W, 3]. Raises UserError where the scene has gray images only."""
         return read_rgb(self.manifest.path(f"images/{target.name}.exr"))
 
     def moving(self, target: Target) -> NDArray[np.bool_]:
-        """The moving region of a target, [H, W] bool: where the `*_dynamic` metrics look."""
+        """Read the moving region of a target, [H, W] bool, which the `*_dynamic` metrics use."""
         return read_mask(self.manifest.path(f"masks/{target.name}.png"))
+
+    def frames(self, camera: str) -> Frames:
+        """Return the frames of the conventional camera at a camera's pose: 60 a second, with motion blur.
+
+        A frame gives its time, its exposure, the 8-bit sRGB image of the file, and linear radiance. The simulator
+        writes gray frames, for every camera. Raises UserError where the scene has none, as where the clip is shorter
+        than an exposure.
+        """
+        return frames_of(find_frames(self.meta, self.manifest, (camera,)), camera, self.root)
+
+    def events(self, camera: str) -> EventStream:
+        """Return the events of the event camera at a camera's pose: time in microseconds, column, row and polarity.
+
+        The simulator writes events for every camera. Raises UserError where the scene has none.
+        """
+        return events_of(find_events(self.meta, self.manifest, (camera,)), camera, self.root)
 
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
@@ -167,16 +198,18 @@ class Scene:
 
     @cached_property
     def training(self) -> TrainingScene:
-        """The part of the scene that methods see."""
+        """The part of the scene that methods get."""
         cameras = tuple(self.cameras[c] for c in self.train)
         streams = tuple(self.stream(c) for c in self.train)
         clock = self.rate_hz, self.n_ticks, self.radiance_gain
         recordings = tuple(self.recordings(c) for c in self.train)
-        return TrainingScene(self.id, self.revision, cameras, streams, *clock, recordings)
+        frames = find_frames(self.meta, self.manifest, self.train)
+        events = find_events(self.meta, self.manifest, self.train)
+        return TrainingScene(self.id, self.revision, cameras, streams, *clock, recordings, frames, events)
 
 
 def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = None) -> Scene:
-    """Read and validate a scene folder, and see it through a split: the scene's default one if None.
+    """Read and validate a scene folder, and open it with a split: the scene's default one if None.
 
     Raises UserError where the folder, scene.json, the cameras or the targets are missing, foreign, damaged or
     inconsistent, where there is no such split, and where a recording has gaps unless `allow_gaps`.
@@ -189,8 +222,8 @@ def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = N
     manifest = read_manifest(root)
     for name in ("scene.json", "transforms_train.json", "transforms_test.json", "targets.json"):
         manifest.path(name)
-    cameras = _read_cameras(root)
-    _check_splits(meta, cameras, root / "scene.json")
+    cameras = read_cameras(root)
+    check_splits(meta, cameras, root / "scene.json")
     targets = _read_targets(root / "targets.json", meta)
     chosen = meta["default_split"] if split is None else split
     if chosen not in targets:
@@ -208,29 +241,6 @@ def check_meta(meta: dict[str, Any], path: Path) -> None:
         found = f"schema {meta.get('schema')!r}"
         raise problem(path, f"schema '{SCHEMA}'", found, "it is not a scene of this format: make or import one")
     check_schema(meta, load_schema("spike4dgs.benchmark", "scene.schema.json"), path, "make or import the scene again")
-
-
-def _read_cameras(root: Path) -> dict[str, Camera]:
-    cameras: dict[str, Camera] = {}
-    for name in ("transforms_train.json", "transforms_test.json"):
-        frames = read_json(root / name, "camera poses").get("frames")
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise problem(root / name, "a list `frames` of objects", "none", "make or import the scene again")
-        for frame in frames:
-            camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
-            cameras.setdefault(camera.id, camera)
-    return cameras
-
-
-def _check_splits(meta: dict[str, Any], cameras: dict[str, Camera], path: Path) -> None:
-    if meta["default_split"] not in meta["splits"]:
-        raise problem(path, "default_split among the splits", repr(meta["default_split"]), "correct scene.json")
-    for split, parts in meta["splits"].items():
-        both = set(parts["train"]) & set(parts["test"])
-        unknown = (set(parts["train"]) | set(parts["test"])) - (set(cameras) & set(meta["streams"]))
-        if both or unknown:
-            found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
-            raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
 
 
 def _read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
@@ -267,7 +277,7 @@ def _check_targets(path: Path, targets: tuple[Target, ...], held_out: tuple[str,
 
 
 def open_scenes(paths: Sequence[Path], allow_gaps: bool = False, split: str | None = None) -> list[Scene]:
-    """Open the scenes of a command line through a split. Raises UserError where there is none."""
+    """Open the scenes of a command line with a split. Raises UserError where there is none."""
     if not paths:
         raise problem("scenes", "at least one scene folder", "none", "make one with `spike4dgs make-dataset`")
     return [open_scene(p, allow_gaps, split) for p in paths]

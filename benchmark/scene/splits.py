@@ -1,9 +1,10 @@
-"""Splits: which cameras of a scene train, and which are held out. The standard ones of an array."""
+"""Splits: the training cameras and the held-out cameras of a scene, and the standard splits of an array."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Split(NamedTuple):
 
 
 def standard_splits(cameras: Sequence[Camera], held_out: str) -> dict[str, Split]:
-    """The splits of an array by name, as far as it has enough cameras; `held_out` is the camera in its middle.
+    """Return the splits of an array by name, as far as it has enough cameras; `held_out` is the camera in its middle.
 
     - `center`: test on `held_out`, train on all others (interpolation; the default).
     - `corner`: test on the camera farthest from `held_out`, train on all others (extrapolation); from 3 cameras on.
@@ -49,7 +50,7 @@ def standard_splits(cameras: Sequence[Camera], held_out: str) -> dict[str, Split
 
 
 def spread_order(cameras: Sequence[Camera], held_out: str) -> tuple[str, ...]:
-    """The cameras other than `held_out`, such that the first ones are spread over the array, for every number of them.
+    """Return the cameras other than `held_out`, ordered so that any number of the first ones is spread over the array.
 
     First the camera that is farthest from `held_out`, then always the one whose nearest camera among those already
     taken is farthest away. Of equally far ones (to 1e-6 of the array's extent) the first in `cameras` is taken.
@@ -62,3 +63,15 @@ def spread_order(cameras: Sequence[Camera], held_out: str) -> tuple[str, ...]:
         near = [min(float(np.linalg.norm(c.center - o.center)) for o in order or taken) for c in left]
         order.append(left.pop(int(np.argmax(np.round(np.array(near) / extent, 6)))))
     return tuple(c.id for c in order)
+
+
+def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: Path) -> None:
+    """Raise UserError unless the splits of scene.json name known cameras, and none of them in both parts."""
+    if meta["default_split"] not in meta["splits"]:
+        raise problem(path, "default_split among the splits", repr(meta["default_split"]), "correct scene.json")
+    for split, parts in meta["splits"].items():
+        both = set(parts["train"]) & set(parts["test"])
+        unknown = (set(parts["train"]) | set(parts["test"])) - (set(cameras) & set(meta["streams"]))
+        if both or unknown:
+            found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
+            raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")

@@ -1,4 +1,4 @@
-"""One image that shows what a scene folder holds."""
+"""One image that shows the contents of a scene folder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.scene.events import read_events
 from spike4dgs.benchmark.scene.images import encode_srgb, read_geometry
 from spike4dgs.benchmark.scene.scene import Scene, Target
-from spike4dgs.generators.events import read_events
 
 _COUNT_TICKS = 32
 _EVENT_US = 2000
@@ -60,7 +60,7 @@ def _geometry(scene: Scene, target: Target) -> list[tuple[str, Any]]:
     low, high = np.percentile(depth[np.isfinite(depth)], [1, 99])
     return [
         ("inverse depth", np.clip((depth - low) / max(high - low, 1e-9), 0, 1)),
-        ("moving things", _colours(geometry.ids)),
+        ("moving objects", _colours(geometry.ids)),
         ("moving region", scene.moving(target)),
         (f"flow, up to {np.linalg.norm(geometry.flow, axis=-1).max():.1f} px/ms", _wheel(geometry.flow)),
         ("truth, gray", encode_srgb(scene.ground_truth(target))),
@@ -98,24 +98,24 @@ def _png(path: Path) -> NDArray[np.uint8]:
 
 
 def _events(scene: Scene, name: str, t_us: float) -> NDArray[np.float64]:
-    """Brighter red, darker blue, on white."""
+    """Return events as an image: brighter red, darker blue, on white."""
     found = read_events(scene.manifest.path(name))
     now = (found.t >= t_us) & (found.t < t_us + _EVENT_US)
-    picture = np.ones((scene.meta["height"], scene.meta["width"], 3))
+    image = np.ones((scene.meta["height"], scene.meta["width"], 3))
     for polarity, colour in ((1, (0.8, 0.1, 0.1)), (0, (0.1, 0.2, 0.8))):
         mine = now & (found.p == polarity)
-        picture[found.y[mine], found.x[mine]] = colour
-    return picture
+        image[found.y[mine], found.x[mine]] = colour
+    return image
 
 
 def _colours(ids: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """One colour for each number, black for 0."""
+    """Return one colour for each number, black for 0."""
     hue = (ids * 0.381966) % 1
     return _hsv(hue, np.where(ids > 0, 0.75, 0.0), np.where(ids > 0, 0.95, 0.0))
 
 
 def _wheel(flow: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Direction as hue, length as saturation."""
+    """Return the flow as an image: direction as hue, length as saturation."""
     length = np.linalg.norm(flow, axis=-1)
     hue = (np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi)) % 1
     return _hsv(hue, length / max(float(length.max()), 1e-9), np.ones_like(length))

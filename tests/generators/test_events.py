@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.events import THRESHOLD, Events, events, read_events, write_events
+from spike4dgs.generators.events import THRESHOLD, events
 
 RATE = 20_000
 
@@ -62,28 +60,11 @@ def test_a_ramp_has_as_many_events_as_thresholds():
 
 
 def test_nothing_moves_nothing_happens():
-    still = np.random.default_rng(0).random((6, 9), dtype=np.float32)
-    assert len(events([still] * 4, [0, 5, 10, 15], 15, RATE).t) == 0
+    image = np.random.default_rng(0).random((6, 9), dtype=np.float32)
+    assert len(events([image] * 4, [0, 5, 10, 15], 15, RATE).t) == 0
 
 
 def test_events_after_the_clip_are_left_out():
     keys = [np.full((1, 1), v, np.float32) for v in (0.1, 0.1, 0.9)]
     assert len(events(keys, [0, 20, 40], 20, RATE).t) == 0
     assert len(events(keys, [0, 20, 40], 40, RATE).t) == 10
-
-
-def test_files_come_back_and_damage_is_named(tmp_path):
-    found = Events(
-        np.array([1, 5]), np.array([3, 4], np.uint16), np.array([0, 1], np.uint16), np.array([1, 0], np.uint8)
-    )
-    path = tmp_path / "events/cam.npz"
-    write_events(path, found)
-    assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(read_events(path), found, strict=True))
-    first = path.read_bytes()
-    write_events(path, found)
-    assert path.read_bytes() == first
-    path.write_bytes(first[: len(first) // 2])
-    with pytest.raises(UserError, match="damaged data"):
-        read_events(path)
-    with pytest.raises(UserError, match="no such file"):
-        read_events(tmp_path / "none.npz")

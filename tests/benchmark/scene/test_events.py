@@ -1,0 +1,132 @@
+"""Events of an event camera: files come back, and what lies outside the clip or the image is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.events import Events, EventStream, read_events, write_events
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.generators.events import THRESHOLD, events
+from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.streams import extras
+
+FACTS = {"events": extras(Job("car", 0, 0, "tiny", PROFILES["tiny"], 0.004))["events"]}
+RATE = 20_000
+
+
+def simulated(seed: int) -> Events:
+    """The simulator's events of random light, in the small scene's clip and image."""
+    keys = np.exp(np.random.default_rng(seed).normal(-1, 0.5, (5, HEIGHT, WIDTH))).astype(np.float32)
+    return events(keys, [0, 20, 40, 60, TICKS], TICKS, RATE)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """A small scene with events at every camera."""
+    root = write_small_scene(tmp_path / "scene", extras=FACTS)
+    for camera in range(4):
+        write_events(root / f"events/cam_{camera:02d}.npz", simulated(camera))
+    write_manifest(root)
+    return root
+
+
+def same(a: Events, b: Events) -> bool:
+    return all(np.array_equal(x, y) and x.dtype == y.dtype for x, y in zip(a, b, strict=True))
+
+
+def test_events_are_what_the_simulator_wrote(recorded: Path) -> None:
+    scene = open_scene(recorded)
+    stream, expected = scene.events("cam_02"), simulated(2)
+    assert same(stream.events, expected) and len(stream) == len(expected.t) > 1000
+    assert (stream.threshold, stream.rate_hz) == (THRESHOLD, RATE)
+    assert same(scene.training.events("cam_02").events, expected)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0, 4000), st.floats(0, 4000))
+def test_events_are_in_order_within_clip_and_image(seed: int, a: float, b: float) -> None:
+    with TemporaryDirectory() as folder:
+        write_events(Path(folder) / "events/cam.npz", simulated(seed))
+        stream = EventStream("cam", WIDTH, HEIGHT, RATE, TICKS, THRESHOLD, write_manifest(Path(folder)))
+        found = stream.events  # checked as it is read
+    assert (np.diff(found.t) >= 0).all() and ((found.t >= 0) & (found.t < TICKS * 50)).all()
+    assert (found.x < WIDTH).all() and (found.y < HEIGHT).all() and set(np.unique(found.p)) <= {0, 1}
+    assert ((stream.ticks >= 0) & (stream.ticks < TICKS)).all()
+    assert (np.abs(stream.ticks * 50 + 25 - found.t) <= 25).all()
+    start, stop = min(a, b), max(a, b)
+    part = stream.between(start, stop)
+    inside = (found.t >= start) & (found.t < stop)
+    assert same(part, Events(*(column[inside] for column in found)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t": np.array([5, 1])}, "events in order of time"),
+        ({"t": np.array([1, 4000])}, r"t of every event in \[0, 4000\)"),
+        ({"t": np.array([-1, 5])}, "t of every event"),
+        ({"x": np.array([3, WIDTH], np.uint16)}, "x of every event in"),
+        ({"y": np.array([HEIGHT, 0], np.uint16)}, "y of every event in"),
+        ({"p": np.array([1, 2], np.uint8)}, "p of every event in"),
+        ({"x": np.array([3], np.uint16)}, "x of every event in"),
+    ],
+)
+def test_events_outside_clip_or_image_are_refused(recorded: Path, change: dict[str, Any], message: str) -> None:
+    write_events(recorded / "events/cam_00.npz", pair()._replace(**change))
+    write_manifest(recorded)
+    stream = open_scene(recorded).events("cam_00")
+    with pytest.raises(UserError, match=message):
+        _ = stream.events
+
+
+def pair() -> Events:
+    x, y, p = np.array([3, 4], np.uint16), np.array([0, 1], np.uint16), np.array([1, 0], np.uint8)
+    return Events(np.array([1, 5]), x, y, p)
+
+
+def test_methods_get_events_of_training_cameras_only(recorded: Path) -> None:
+    scene = open_scene(recorded)
+    assert len(scene.events("cam_03")) > 0
+    with pytest.raises(UserError, match="expected events of an event camera at cam_03, found those of cam_00, cam_01"):
+        scene.training.events("cam_03")
+    files = [name for stream in scene.training.found_events.values() for name in stream.files.files]
+    assert sorted(files) == [f"events/cam_0{i}.npz" for i in range(3)]
+
+
+def test_a_scene_without_events_says_so(small_scene: Path) -> None:
+    scene = open_scene(small_scene)
+    for found in (scene.events, scene.training.events):
+        with pytest.raises(UserError, match="events of an event camera at cam_00, found none; use a scene that has"):
+            found("cam_00")
+
+
+def test_damaged_events_are_refused_when_they_are_read(recorded: Path) -> None:
+    path = recorded / "events/cam_00.npz"
+    path.write_bytes(path.read_bytes()[:-1] + b"\1")
+    stream = open_scene(recorded).training.events("cam_00")
+    with pytest.raises(UserError, match=r"cam_00\.npz: expected sha256"):
+        _ = stream.events
+
+
+def test_files_come_back_and_damage_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "events/cam.npz"
+    write_events(path, pair())
+    assert same(read_events(path), pair())
+    first = path.read_bytes()
+    write_events(path, pair())
+    assert path.read_bytes() == first
+    path.write_bytes(first[: len(first) // 2])
+    with pytest.raises(UserError, match="damaged data"):
+        read_events(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_events(tmp_path / "none.npz")
