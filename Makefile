@@ -6,7 +6,7 @@ STAMP  := $(VENV)/.installed
 SCENES := data/car-0-small data/turntable-0-small
 METHODS := nearest-view tfp+static tfi+4dgs tfp+4dgs spike4dgs spike4dgs-x
 
-.PHONY: benchmark test check wheel clean
+.PHONY: benchmark test check docs wheel clean
 
 # The main job: two small scenes, six recipes, table, sheets and leaderboard entries. Killed runs resume.
 benchmark: $(STAMP)
@@ -20,6 +20,10 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+# The docs site, into site/. The variable silences an announcement of mkdocs-material, which is no warning about the docs.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 wheel: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
@@ -29,5 +33,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $@
 
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf build dist *.egg-info
+	rm -rf build dist site *.egg-info

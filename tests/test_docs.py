@@ -1,0 +1,127 @@
+"""The docs say what is true: links resolve, named places exist, every page is in the site, the README is short."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from spike4dgs.benchmark.cli import COMMANDS, SPEED
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "examples" / "README.md", *DOCS.rglob("*.md")])
+TEN_LINES = DOCS / "snippets" / "ten_lines.md"
+README_WORDS = 1200
+_FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def prose(path: Path) -> str:
+    """The text of a page without code blocks and inline code."""
+    return re.sub(r"`[^`\n]+`", "", _FENCE.sub("", path.read_text()))
+
+
+def change_table() -> list[tuple[str, str]]:
+    """(what to change, where) of CONTRIBUTING's table; a row that names two places gives two pairs."""
+    table = (ROOT / "CONTRIBUTING.md").read_text().partition("| to change | go to |\n")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
+    return [(row[0], place) for row in rows for place in re.findall(r"`([^`]+)`", row[1])]
+
+
+def defined_names(path: Path) -> set[str]:
+    names = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        names |= {t.id for t in targets if isinstance(t, ast.Name)}
+    return names
+
+
+def anchors(path: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MkDocs make them."""
+    titles = re.findall(r"^#+ (.+)$", _FENCE.sub("", path.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().split()) <= README_WORDS
+
+
+def test_the_readme_has_the_ten_lines() -> None:
+    if not TEN_LINES.is_file():
+        pytest.skip(f"{named(TEN_LINES)} is not written yet")
+    assert TEN_LINES.read_text().strip() in (ROOT / "README.md").read_text()
+
+
+def test_the_change_table_covers_fifteen_requests() -> None:
+    assert len({what for what, _ in change_table()}) >= 15
+
+
+@pytest.mark.parametrize(("what", "place"), change_table())
+def test_the_change_table_names_what_exists(what: str, place: str) -> None:
+    name, _, member = place.partition("::")
+    assert (ROOT / name).is_file(), f"{what}: no file {name}"
+    if member:
+        assert member in defined_names(ROOT / name), f"{what}: {name} defines no {member}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_relative_links_resolve(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        name, _, anchor = target.partition("#")
+        if "://" in name or name.startswith("mailto:"):
+            continue
+        found = page.parent / name if name else page
+        assert found.exists(), f"{named(page)} links to {target}"
+        if anchor and found.suffix == ".md" and "<!-- include" not in found.read_text():
+            assert anchor in anchors(found), f"{named(page)} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_named_files_exist(page: Path) -> None:
+    """Paths of source files in prose and tables, such as `benchmark/files.py`."""
+    text = _FENCE.sub("", page.read_text())
+    for name in re.findall(
+        r"`((?:benchmark|generators|method|baselines|leaderboard|tests|examples)/[\w/.]+\.\w+)`", text
+    ):
+        placeholder = re.search("NAME|DATASET|METHOD", name)
+        assert placeholder or (ROOT / name).exists(), f"{named(page)} names {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_python_blocks_parse(page: Path) -> None:
+    for language, code in _FENCE.findall(page.read_text()):
+        if language == "python" and not code.lstrip().startswith(">>>"):
+            ast.parse(code)
+
+
+def test_every_page_is_in_the_site() -> None:
+    def files(item: object) -> list[str]:
+        if isinstance(item, str):
+            return [item]
+        values = item.values() if isinstance(item, dict) else item
+        return [name for value in values for name in files(value)]  # type: ignore[union-attr]
+
+    nav = files(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    pages = {p.relative_to(DOCS).as_posix() for p in DOCS.rglob("*.md") if TEN_LINES.parent not in p.parents}
+    assert sorted(nav) == sorted(pages)
+
+
+def test_the_commands_are_all_described() -> None:
+    text = (DOCS / "commands.md").read_text()
+    missing = [name for name in [*COMMANDS, *SPEED] if f"`{name}`" not in text]
+    assert not missing
+
+
+def test_the_citation_is_complete() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors", "version", "license"} <= citation.keys()
+    paper = citation["preferred-citation"]
+    assert {"type", "title", "authors", "year"} <= paper.keys()
+    assert all({"family-names", "given-names"} <= author.keys() for author in paper["authors"])
