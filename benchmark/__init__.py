@@ -1,1 +1,56 @@
 """The contract and the judge: spike streams, cameras, scene folders, metrics, results and the runner."""
+
+from typing import TYPE_CHECKING
+
+from spike4dgs.benchmark.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from spike4dgs.benchmark.errors import UserError
+    from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Recipe, find_methods, get_method
+    from spike4dgs.benchmark.metrics.measure import score_image
+    from spike4dgs.benchmark.metrics.table import METRICS
+    from spike4dgs.benchmark.results.dataframe import records_to_dataframe
+    from spike4dgs.benchmark.results.record import read_record
+    from spike4dgs.benchmark.results.score import score_predictions
+    from spike4dgs.benchmark.scene.cameras import Camera
+    from spike4dgs.benchmark.scene.scene import Scene, Target, TrainingScene, open_scene
+    from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "errors": ("UserError",),
+            "method": ("Budget", "FitRequest", "Method", "Model", "Recipe", "find_methods", "get_method"),
+            "metrics.measure": ("score_image",),
+            "metrics.table": ("METRICS",),
+            "results.dataframe": ("records_to_dataframe",),
+            "results.record": ("read_record",),
+            "results.score": ("score_predictions",),
+            "scene.cameras": ("Camera",),
+            "scene.scene": ("Scene", "Target", "TrainingScene", "open_scene"),
+            "spikes.stream": ("SpikeStream", "open_stream"),
+        },
+    )
+
+__all__ = [
+    "METRICS",
+    "Budget",
+    "Camera",
+    "FitRequest",
+    "Method",
+    "Model",
+    "Recipe",
+    "Scene",
+    "SpikeStream",
+    "Target",
+    "TrainingScene",
+    "UserError",
+    "find_methods",
+    "get_method",
+    "open_scene",
+    "open_stream",
+    "read_record",
+    "records_to_dataframe",
+    "score_image",
+    "score_predictions",
+]

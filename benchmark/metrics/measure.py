@@ -9,14 +9,14 @@ by it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair
-from spike4dgs.benchmark.metrics.selection import Selection
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
+from spike4dgs.benchmark.metrics.selection import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, Images, Metric
 
 Values = dict[str, float | None]  # metric id -> value, None where there is none
@@ -31,7 +31,7 @@ class Measured:
 
 
 def measure(pair: ImagePair, gain: float | None, metrics: Iterable[Metric]) -> Measured:
-    """Compute metrics of one image; the others are None. `gain` is the scene's (None: unknown).
+    """Compute metrics of one image; all others are None. `gain` is the scene's (None: unknown).
 
     >>> truth = np.full((16, 16), 0.5)
     >>> pair = ImagePair(truth, truth + 0.1, np.ones((16, 16), bool), "example")
@@ -50,8 +50,29 @@ def measure(pair: ImagePair, gain: float | None, metrics: Iterable[Metric]) -> M
     return Measured(values, refused)
 
 
+def score_image(
+    truth: Image, prediction: Image, moving: Mask | None = None, metrics: Sequence[str] = (AUTO,)
+) -> dict[str, float]:
+    """Score one image and return the metrics' values by id: PSNR, SSIM and all that this machine can compute.
+
+    truth, prediction: linear radiance [H, W], 1.0 = white; moving: the moving region [H, W] bool, for the `*_dynamic`
+    metrics; metrics: as in the option `--metrics`. The `*_aligned` metrics fit their gain to this image alone. Metrics
+    without a value are left out: those of a moving region or an earlier image that is not given, and those that refuse
+    the image, as no-reference metrics refuse an even one. Raises UserError for images that do not fit together.
+
+    >>> truth = np.full((16, 16), 0.5)
+    >>> round(score_image(truth, truth + 0.1, metrics=["psnr"])["psnr"], 6)
+    20.0
+    """
+    region = np.zeros(truth.shape, np.bool_) if moving is None else moving
+    check_images(truth, prediction, region, "image")
+    pair = ImagePair(truth, prediction, region, "image")
+    values = measure(pair, fit_gain([(truth, prediction)]), select_metrics(metrics).metrics).values
+    return {metric: value for metric, value in values.items() if value is not None}
+
+
 def fit_gain(pairs: Iterable[tuple[Image, Image]]) -> float | None:
-    """The gain g that minimises sum (g * prediction - truth)^2 over a scene's (truth, prediction), before clipping.
+    """Return the gain g that minimises sum (g * prediction - truth)^2 over (truth, prediction) pairs, before clipping.
 
     None where no positive gain does (predictions all zero, or of the wrong sign).
     """
@@ -64,7 +85,7 @@ def fit_gain(pairs: Iterable[tuple[Image, Image]]) -> float | None:
 
 
 def scene_means(per_image: Mapping[str, Mapping[str, float | None]]) -> Values:
-    """Mean of each metric over the images (camera/tick) where the dataset defines it; None where one has no value."""
+    """Return each metric's mean over the images (camera/tick) for which it is defined; None if one lacks a value."""
     means: Values = {}
     later = _later(per_image)
     for m in METRICS.values():
@@ -83,7 +104,7 @@ def scene_notes(
     refused: Mapping[str, Mapping[str, str]],
     selection: Selection,
 ) -> dict[str, str]:
-    """A note for every scene value that needs one: why it is null, which images it stands for, which were capped.
+    """Return a note for every scene value that needs one: why it is null, which images it covers, which were capped.
 
     `refused` has the reasons by image name and metric. Where users choose the weights, the note has their hash.
     """
@@ -107,7 +128,7 @@ def _coverage(
     values: Mapping[str, float],
     reasons: Mapping[str, str],
 ) -> str:
-    """Why there is no value, or for which images there is one; empty where it is the mean over all."""
+    """Return why there is no value, or which images have one; an empty string where all have."""
     if reasons:
         name, reason = next(iter(reasons.items()))
         return f"{len(reasons)} of {len(per_image)} images refused, the first {name}: {reason}"
@@ -125,7 +146,7 @@ def _capped(m: Metric, values: Mapping[str, float]) -> str:
 
 
 def _later(names: Iterable[str]) -> set[str]:
-    """Names (camera/tick) without the first of each camera."""
+    """Return the names (camera/tick) without the first of each camera."""
     everything = set(names)
     cameras: dict[str, list[str]] = {}
     for name in everything:

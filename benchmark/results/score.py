@@ -9,7 +9,7 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
 from spike4dgs.benchmark.metrics.measure import fit_gain, measure, scene_means, scene_notes
-from spike4dgs.benchmark.metrics.selection import Selection
+from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
 from spike4dgs.benchmark.results.predictions import SUMS, MethodInfo, Predictions, open_predictions
 from spike4dgs.benchmark.results.record import Cell, Record, build_record, missing_cell
 from spike4dgs.benchmark.scene.scene import Scene, Target
@@ -89,11 +89,14 @@ def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
     return {s.id: root / s.id for s in scenes}
 
 
-def score_all(root: Path, scenes: Sequence[Scene], selection: Selection) -> Record:
-    """Score one method on several scenes by the selected metrics. A scene without a folder counts as skipped.
+def score_predictions(root: Path | str, scenes: Sequence[Scene], selection: Selection | None = None) -> Record:
+    """Score one method's predictions on several scenes and return the result record.
 
-    Raises UserError for bad predictions, and where the folders are of different methods.
+    `root` holds one predictions folder per scene id; for a single scene it may be that folder. Without `selection` all
+    metrics that this machine can compute are computed. A scene without a folder counts as skipped. Raises UserError for
+    bad predictions, and where the folders are of different methods.
     """
+    root, selection = Path(root), selection or select_metrics()
     if not root.is_dir():
         raise problem(root, "a predictions folder", "no such folder", "check the path or run the method")
     if len({s.id for s in scenes}) < len(scenes):

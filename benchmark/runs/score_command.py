@@ -9,7 +9,7 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.results.record import write_record
-from spike4dgs.benchmark.results.score import score_all
+from spike4dgs.benchmark.results.score import score_predictions
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 
@@ -34,7 +34,7 @@ def score(
         split: Split of the scenes that the predictions are for; each scene's default one if left out.
         allow_gaps: Accept recordings with gaps.
     """
-    record = score_all(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
+    record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
     make_console().print(results_table([record]))
     if out:
         write_record(out, record)

@@ -21,7 +21,7 @@ from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.predictions import MethodInfo, PredictionInfo, PredictionWriter
 from spike4dgs.benchmark.results.record import check_record, read_record
-from spike4dgs.benchmark.results.score import score_all
+from spike4dgs.benchmark.results.score import score_predictions
 from spike4dgs.benchmark.runs.score_command import score
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
@@ -170,7 +170,7 @@ def predict(root: Path, scene: Scene, change: Any = lambda tick, image: image) -
 
 def test_a_scenes_temporal_error_follows_the_targets_in_time(scene: Scene, tmp_path: Path) -> None:
     root = predict(tmp_path / "p", scene, lambda tick, image: image * (0.5 if tick == 40 else 1.0))
-    record = score_all(root, [scene], select_metrics())
+    record = score_predictions(root, [scene], select_metrics())
     cell = record["scenes"][scene.id]
     images = {t: scene.ground_truth(t).astype(np.float64) for t in scene.targets}
     shown = {t: read_exr(root / f"{t.name}.exr").astype(np.float64) for t in scene.targets}
@@ -183,7 +183,7 @@ def test_a_scenes_temporal_error_follows_the_targets_in_time(scene: Scene, tmp_p
 
 
 def test_a_black_prediction_gets_reasons_and_no_good_values(scene: Scene, tmp_path: Path) -> None:
-    record = score_all(predict(tmp_path / "p", scene, lambda _, image: 0 * image), [scene], select_metrics())
+    record = score_predictions(predict(tmp_path / "p", scene, lambda _, image: 0 * image), [scene], select_metrics())
     cell = record["scenes"][scene.id]
     for metric in ("brisque", "niqe", "temporal_error"):
         assert cell["metrics"][metric] is None
@@ -212,7 +212,7 @@ def test_a_weight_file_makes_its_metric_part_of_the_record(
     torch.save(metaiqa_network().state_dict(), tmp_path / "metaiqa_resnet18.pth")
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     root = predict(tmp_path / "p", scene)
-    record = score_all(root, [scene], select_metrics())
+    record = score_predictions(root, [scene], select_metrics())
     cell = record["scenes"][scene.id]
     sha256 = cell["computed"]["metaiqa"]
     assert 0 < cell["metrics"]["metaiqa"] < 1 and cell["notes"]["metaiqa"] == f"weights with sha256 {sha256}"
@@ -225,4 +225,4 @@ def test_damaged_truth_is_still_an_error(scene: Scene, tmp_path: Path) -> None:
     target = scene.targets[0]
     write_exr(copy / f"images/{target.name}.exr", np.zeros((24, 40), np.float32), 0.0)
     with pytest.raises(UserError, match="sha256|bytes"):
-        score_all(root, [open_scene(copy)], select_metrics())
+        score_predictions(root, [open_scene(copy)], select_metrics())

@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
-from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes
+from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes, score_image
 from spike4dgs.benchmark.metrics.measure import measure as measure_pair
 from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, PRIMARY, Images
@@ -208,3 +208,26 @@ def test_the_table_describes_every_metric_once() -> None:
     for m in METRICS.values():
         assert m.title and m.definition and m.implementation and m.digits > 0 < m.tolerance
     assert METRICS["psnr"].format(21.987) == "21.99" and METRICS["ssim"].format(None) == "-"
+
+
+def test_one_image_is_scored_by_every_metric_that_has_a_value() -> None:
+    truth, prediction = images()
+    values = score_image(truth, prediction, region(), metrics=("psnr", "flip"))
+    assert set(values) == {m.id for m in METRICS.values() if m.takes == "linear" and m.images is not Images.LATER} | {
+        "flip"
+    }
+    gain = fit_gain([(truth, prediction)])
+    expected = measure(truth, prediction, region(), gain)
+    assert {k: values[k] for k in expected if k in values} == {k: v for k, v in expected.items() if k in values} | {
+        "flip": values["flip"]
+    }
+    without_region = score_image(truth, prediction, metrics=("psnr",))
+    assert set(without_region) == {"psnr", "ssim", "psnr_aligned", "ssim_aligned"}
+
+
+def test_a_metric_that_refuses_an_image_leaves_it_out() -> None:
+    truth = images()[0]
+    values = score_image(truth, np.full_like(truth, 0.5))
+    assert "psnr" in values and not {"brisque", "niqe"} & set(values)
+    with pytest.raises(UserError, match="image: expected a gray image of shape"):
+        score_image(truth, truth[:-1])
