@@ -54,7 +54,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One rendered view and what its gradient needs again. P: Gaussian-tile pairs; L: kernel channels in all."""
+    """One rendered view, and the arrays that its gradient needs. P: Gaussian-tile pairs; L: kernel channels in all."""
 
     camera: Array  # [16] float64, see camera_entries
     records: Array  # [N * 8] float64
@@ -71,7 +71,7 @@ class Frame:
 
 @cache
 def _thread_memory(thread: int) -> tuple[Array, ...]:
-    """Scratch of one thread: projection rows, lanes, tile planes, block list (starts, xis, etas, ends), digits."""
+    """Return a thread's scratch: projection rows, lanes, tile planes, block list (starts, xis, etas, ends), digits."""
     rows = max(project_kernels.ROWS, project_gradient.ROWS) * project_kernels.BLOCK
     planes = 8 * PLANE  # T, R, alpha gradient and up to 4 colours, and room for a vector that overhangs the last
     block_list = (np.empty(MAX_BLOCKS, np.int32), np.empty(MAX_BLOCKS, np.float32), np.empty(MAX_BLOCKS, np.float32))
@@ -88,13 +88,13 @@ def camera_entries(w2c: Tensor, K: Tensor) -> Array:
 
 
 def chunking(channels: int) -> tuple[int, int]:
-    """(channels per kernel pass, passes): kernels exist for 1, 2 and 4 channels."""
+    """Return (channels per kernel pass, passes). Kernels exist for 1, 2 and 4 channels."""
     per_pass = channels if channels <= 2 else 4
     return per_pass, -(-channels // per_pass)
 
 
 def pack_colors(colors: Array, depths: Array | None) -> Array:
-    """[N, F] and depths [N] or None -> [chunks, N * channels] float32, padded with zeros."""
+    """Return colours [N, F] and depths [N], if any, as [chunks, N * channels] float32, padded with zeros."""
     layers = colors.shape[1] + (depths is not None)
     per_pass, passes = chunking(layers)
     if depths is None and passes == 1 and per_pass == layers and colors.dtype == np.float32:
@@ -178,7 +178,7 @@ def zero_gradients(geometry: Geometry, channels: int, views: int) -> Gradients:
 def chain(
     frame: Frame | Projection, geometry: Geometry, s: Settings, sums: Array, gradients: Gradients, d_pose: Array
 ) -> None:
-    """Add what the records say to the gradients; d_pose [4, 4] is set, unless it is empty."""
+    """Chain the records to the parameters and add them to the gradients; d_pose [4, 4] is set, unless it is empty."""
     blocks = -(-len(frame.keys) // project_kernels.BLOCK) if d_pose.size else 0
     block_pose = np.empty((blocks, 12))
     records = Records(frame.keys, frame.slots, sums, gradients.colors.shape[1] if s.depth else -1)
@@ -249,7 +249,7 @@ class _Rasterize(torch.autograd.Function):
 def render_cpu(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
-    """Back end "cpu": see `render` for the arguments."""
+    """Render with the back end "cpu": see `render` for the arguments."""
     if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
         require_finite(splats)
     dtype = torch.float32

@@ -44,7 +44,7 @@ def recentre(means: Tensor, w2c: Tensor) -> tuple[Tensor, Tensor]:
 def render_cuda(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
-    """Back end "cuda": see `render` for the arguments."""
+    """Render with the back end "cuda": see `render` for the arguments."""
     rasterization = _rasterization()
     if not splats.means.is_cuda:
         raise problem("back end cuda", "tensors on a CUDA device", str(splats.means.device), "move them with .cuda()")

@@ -46,7 +46,7 @@ class Projection:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Quaternions wxyz [M, 4] of any length -> rotation matrices [M, 3, 3]."""
+    """Return the rotation matrices [M, 3, 3] of quaternions wxyz [M, 4] of any length."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -94,7 +94,7 @@ def project(
 
 
 def alphas(view: Projection, center: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Unclamped alpha [M, H*W] of each Gaussian at each pixel, and whether it is composited there (bool)."""
+    """Return the unclamped alpha [M, H*W] of each Gaussian at each pixel, and whether it is composited there (bool)."""
     width, height = size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     xx, xy = view.cov[:, :1], view.cov[:, 1:2]
@@ -122,7 +122,7 @@ def composite(view: Projection, center: Tensor, colors: Tensor, size: tuple[int,
 def render_reference(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
-    """Back end "reference": see `render` for the arguments. Computes in float64, answers in the dtype of colors."""
+    """Render with the back end "reference": see `render`. Computes in float64, returns the dtype of the colours."""
     require_finite(splats)
     dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
     wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))

@@ -36,7 +36,7 @@ _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean SSIM of images [B, H, W] against targets [B, H, W], differentiable in `image`.
+    """Return the mean SSIM of images [B, H, W] against targets [B, H, W], differentiable in `image`.
 
     CPU tensors go through the kernels in float32, others through `ssim_reference`.
     Raises UserError for other shapes, or for a target that wants a gradient, which the kernels do not give.
@@ -53,7 +53,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
-    """The same in plain torch, in the precision of its inputs: the twin that the kernels are tested against."""
+    """Return the mean SSIM by plain torch, in the precision of the inputs: the twin of the kernels."""
     window = torch.as_tensor(_WINDOW, dtype=image.dtype, device=image.device)
 
     def blur(x: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
 
 
 class _FusedSsim(torch.autograd.Function):
-    """The gradient is made together with the value, while the blurred images are at hand."""
+    """Mean SSIM. The gradient is computed with the value, while the blurred images are at hand."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:

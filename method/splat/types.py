@@ -16,7 +16,7 @@ ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becom
 T_MIN = 1e-4  # a pixel is finished before the Gaussian that would bring T down to this
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
 
-# Defaults of `render`
+# Defaults of `render`.
 NEAR = 0.01  # Gaussians whose centre is nearer than this (in world units) are not rendered
 EPS2D = 0.3  # variance of the pixel filter, px^2
 
@@ -108,7 +108,7 @@ class RenderOutput:
 
     image: Tensor  # [C, H, W, F]
     alpha: Tensor  # [C, H, W] 1 - transmittance
-    depth: Tensor | None  # [C, H, W] sum of weight * z (not divided by alpha), or None where it was not asked for
+    depth: Tensor | None  # [C, H, W] sum of weight * z (not divided by alpha), or None if not requested
     radii: Tensor  # [C, N] px, larger half side of the visible ellipse's bounding box; 0 where invisible
     means2d: Tensor  # [C, N, 2] px
 
@@ -127,6 +127,6 @@ def require_finite(splats: Splats) -> None:
 
 
 def not_finite(name: str, index: int) -> UserError:
-    """The error for a parameter that is NaN or infinite."""
+    """Return the error for a parameter that is NaN or infinite."""
     fix = "look for a diverging learning rate or a division by 0"
     return problem(f"Splats.{name}", "finite numbers", f"NaN or infinity at Gaussian {index}", fix)

@@ -42,7 +42,7 @@ Generated = tuple[Any, Any]
 
 @dataclass(frozen=True)
 class Variant:
-    """What one compiled kernel is specialised for, packed in an integer that numba sees as a literal type.
+    """The properties of one compiled kernel, packed in an integer that numba sees as a literal type.
 
     The digest of the kernel sources rides along, because numba's cache key knows only the text of one file.
     """
@@ -52,12 +52,12 @@ class Variant:
     digest: int = 0
 
     def pack(self) -> int:
-        """Integer code."""
+        """Return the integer code."""
         return self.lanes + 256 * self.channels + 65536 * self.digest
 
     @classmethod
     def unpack(cls, code: int) -> Variant:
-        """Inverse of `pack`."""
+        """Return the variant of an integer code."""
         return cls(code % 256, code // 256 % 256, code // 65536)
 
     @property
@@ -84,7 +84,7 @@ class BlockLoop:
         self.color = [v.splat(builder.load(offset(builder, color, int64(f)))) for f in range(channels)]
 
     def open(self, begin: Any, end: Any, totals: int) -> list[Any]:
-        """Start the loop; returns `totals` vectors that are carried from turn to turn, zero at first."""
+        """Start the loop and return `totals` vectors that are carried from turn to turn, zero at first."""
         self.end, self.entry = end, self.b.block
         self.body, self.done = (self.b.append_basic_block(name) for name in ("blocks", "blocks_done"))
         self.b.cbranch(self.b.icmp_signed("<", begin, end), self.body, self.done)
@@ -97,7 +97,7 @@ class BlockLoop:
         return self.totals
 
     def close(self, new_totals: list[Any]) -> list[Any]:
-        """End the loop; returns the totals after the last turn."""
+        """End the loop and return the totals after the last turn."""
         following = self.b.add(self.i, int64(1))
         for phi, value in zip([self.i, *self.totals], [following, *new_totals], strict=True):
             phi.add_incoming(value, self.body)
@@ -112,7 +112,7 @@ class BlockLoop:
         return finals
 
     def block(self) -> tuple[Any, Any, Any, Any]:
-        """The current block: address of its first pixel, xi, eta, and the unclamped alpha."""
+        """Return the current block: address of its first pixel, xi, eta, and the unclamped alpha."""
         b, v = self.b, self.v
         start, xi, eta = (b.load(offset(b, self.p[name], self.i)) for name in ("starts", "xis", "etas"))
         xi, eta = v.add(v.splat(xi), self.xi_offsets), v.add(v.splat(eta), self.eta_offsets)
@@ -120,7 +120,7 @@ class BlockLoop:
         return offset(b, self.p["tile"], b.sext(start, I64)), xi, eta, v.exp2(exponent)
 
     def blend(self, raw: Any, T: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """alpha, T of unfinished pixels, weight, T to store, and where the Gaussian is composited."""
+        """Return alpha, T of unfinished pixels, weight, T to store, and the pixels that composite the Gaussian."""
         b, v = self.b, self.v
         hit, alpha = b.fcmp_ordered(">=", raw, v.const(ALPHA_MIN)), v.min(raw, v.const(ALPHA_MAX))
         before = v.max(T, v.const(0))
@@ -132,7 +132,7 @@ class BlockLoop:
 
 
 def _pointers(context: Any, builder: Any, sig: Any, args: Any, names: str) -> dict[str, Any]:
-    """Data pointers of the array arguments 1, 2, ... (argument 0 is the variant)."""
+    """Return the data pointers of the array arguments 1, 2, ... (argument 0 is the variant)."""
     return {n: array_data(context, builder, sig.args[i], args[i]) for i, n in enumerate(names.split(), start=1)}
 
 
@@ -141,7 +141,7 @@ def composite_blocks(
     typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
     begin: Any, end: Any, gaussian: Any,
 ) -> Generated:  # fmt: skip
-    """Forward: blend one Gaussian into blocks [begin, end) of the list (starts, xis, etas)."""
+    """Blend one Gaussian into blocks [begin, end) of the list (starts, xis, etas)."""
     integer = types.int64
     signature = types.void(variant, tile, records, colors, starts, xis, etas, integer, integer, integer)
     chosen = Variant.unpack(variant.literal_value)
@@ -168,7 +168,7 @@ def differentiate_blocks(
     typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
     sums: Any, begin: Any, end: Any, gaussian: Any, row: Any,
 ) -> Generated:  # fmt: skip
-    """Backward, front to back: the six moments of s = dL/d ln(alpha) and the colour gradients -> sums[row:].
+    """Write the six moments of s = dL/d ln(alpha) and the colour gradients to sums[row:], front to back.
 
     With cg = sum_f dL/dC_f c_f + dL/dA, a Gaussian's own share of the loss is w cg, and everything behind it
     scales with 1 - alpha: dL/dalpha = T cg - R_behind / (1 - alpha). T and R are replayed, never divided back.
@@ -211,7 +211,7 @@ def differentiate_blocks(
 
 
 def _sum_across(v: Lanes, vectors: list[Any]) -> Any:
-    """Up to 8 vectors -> one vector of 8 floats with the sum over the lanes of each, by a tree of shuffles."""
+    """Return the sums over the lanes of up to 8 vectors, as one vector of 8 floats, by a tree of shuffles."""
     half = Lanes(v.b, 8)
     if v.count == 16:
         low, high = list(range(8)), list(range(8, 16))
@@ -254,7 +254,7 @@ def emit_blocks(
 
 @intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
 def any_unfinished(typing_context: Any, variant: Any, tile: Any, vectors: Any) -> Generated:
-    """Whether any of the first `vectors` vectors of T has a pixel that is not finished."""
+    """Return whether any of the first `vectors` vectors of T has a pixel that is not finished."""
     signature = types.boolean(variant, tile, types.int64)
     lanes = Variant.unpack(variant.literal_value).lanes
 

@@ -1,4 +1,4 @@
-"""How the kernels are compiled: one place for numba's options, the source digest and the notice of a first compile."""
+"""Compilation of the kernels: numba's options, the source digest and the notice of a first compile."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """A function that exists only inlined into kernels."""
+    """Compile a function that exists only inlined into kernels."""
     return njit(forceinline=True, **_OPTIONS)(function)
 
 
 def template(function: Callable[..., Any]) -> Any:
-    """A helper inlined before type inference, so that literal arguments stay literal inside."""
+    """Compile a helper that is inlined before type inference, so that literal arguments stay literal inside."""
     return njit(inline="always", **_OPTIONS)(function)
 
 
 @cache
 def source_digest() -> int:
-    """24 bits of the digest of the sources of `method/splat`.
+    """Return 24 bits of the digest of the sources of `method/splat`.
 
     numba invalidates its cache by the one file that holds a kernel. The kernels here inline others' code, so a
     changed neighbour must change something that the cache key does hold: an integer in the kernel's closure.

@@ -65,21 +65,21 @@ class Projected(NamedTuple):
 
 @helper
 def floor_int(x: float) -> int:
-    """Largest integer <= x (math.floor would be a library call that spills every vector register)."""
+    """Return the largest integer <= x (math.floor would be a library call that spills every vector register)."""
     i = np.int64(x)
     return i - np.int64(np.float64(i) > x)
 
 
 @helper
 def ceil_int(x: float) -> int:
-    """Smallest integer >= x."""
+    """Return the smallest integer >= x."""
     i = np.int64(x)
     return i + np.int64(np.float64(i) < x)
 
 
 @helper
 def log2(x: float) -> float:
-    """log2 of a positive normal number to 3e-11: atanh series around the nearest power of two."""
+    """Return log2 of a positive normal number to 3e-11: atanh series around the nearest power of two."""
     bits = double_bits(x)
     # An exponent written into the low mantissa bits of 2^52 becomes a number by subtraction.
     exponent = bits_double((bits >> 52) | 0x4330000000000000) - 4503599627371519.0
@@ -95,7 +95,7 @@ def log2(x: float) -> float:
 
 @helper
 def rotation(w: float, x: float, y: float, z: float) -> Any:
-    """Rotation matrix, row by row, of a quaternion of any length."""
+    """Return the rotation matrix, row by row, of a quaternion of any length."""
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return (
         1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
@@ -117,7 +117,7 @@ def camera_constants(view: Any) -> Any:
 
 @helper
 def jacobian(f: Any, limits: Any, u: float, v: float, inverse_z: float) -> Any:
-    """jx, jxz, jy, jyz of the projection at the point (u, v) = (x/z, y/z), held inside the limits."""
+    """Return jx, jxz, jy, jyz of the projection at the point (u, v) = (x/z, y/z), held inside the limits."""
     held_u, held_v = min(max(u, limits[0]), limits[1]), min(max(v, limits[2]), limits[3])
     jx, jy = f[0] * inverse_z, f[1] * inverse_z
     return jx, -jx * held_u, jy, -jy * held_v
@@ -125,7 +125,7 @@ def jacobian(f: Any, limits: Any, u: float, v: float, inverse_z: float) -> Any:
 
 @helper
 def half_covariance(R: Any, j: Any, a: Any) -> Any:
-    """T = J R and B = T A, each as two rows of three. a: A row by row."""
+    """Return T = J R and B = T A, each as two rows of three. a: A row by row."""
     t0 = (j[0] * R[0] + j[1] * R[6], j[0] * R[1] + j[1] * R[7], j[0] * R[2] + j[1] * R[8])
     t1 = (j[2] * R[3] + j[3] * R[6], j[2] * R[4] + j[3] * R[7], j[2] * R[5] + j[3] * R[8])
     b0 = (
@@ -143,13 +143,13 @@ def half_covariance(R: Any, j: Any, a: Any) -> Any:
 
 @helper
 def dot(a: Any, b: Any) -> float:
-    """a . b of two 3-tuples."""
+    """Return a . b of two 3-tuples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @helper
 def cross(a: Any, b: Any) -> Any:
-    """a x b of two 3-tuples."""
+    """Return a x b of two 3-tuples."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -219,7 +219,7 @@ def project_lane(
     s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, width: int, height: int, near: float, eps2d: float,  # noqa: E741
     antialiased: bool,
 ) -> None:  # fmt: skip
-    """Project one lane; DEPTH becomes -1 for what cannot be seen."""
+    """Project one lane; DEPTH becomes -1 where the Gaussian is invisible."""
     mx, my, mz, o = s[MX + l], s[MY + l], s[MZ + l], s[OP + l]
     qw, qx, qy, qz = s[QW + l], s[QX + l], s[QY + l], s[QZ + l]
     sx, sy, sz = s[SX + l], s[SY + l], s[SZ + l]
@@ -243,8 +243,8 @@ def project_lane(
     cx, cy = f[0] * u + f[2], f[1] * v + f[3]
     across = (cx + half_width >= 0.5) & (cx - half_width <= width - 0.5)
     down = (cy + half_height >= 0.5) & (cy - half_height <= height - 0.5)
-    drawable = (o >= ALPHA_MIN) & (det > 0.0) & (det < math.inf) & (qw * qw + qx * qx + qy * qy + qz * qz > 0.0)
-    s[DEPTH + l] = z if (z >= near) & drawable & across & down else -1.0
+    visible = (o >= ALPHA_MIN) & (det > 0.0) & (det < math.inf) & (qw * qw + qx * qx + qy * qy + qz * qz > 0.0)
+    s[DEPTH + l] = z if (z >= near) & visible & across & down else -1.0
     s[CX + l], s[CY + l], s[SLOPE + l] = cx, cy, xy / xx
     s[HX + l], s[HY + l], s[XTOP + l] = half_width, half_height, xy / yy * half_height
     s[XIS + l], s[ETAS + l] = math.sqrt(HALF_LOG2E / xx), math.sqrt(HALF_LOG2E * xx / det)

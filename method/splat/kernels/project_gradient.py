@@ -149,14 +149,14 @@ def gather_gradients(s: np.ndarray, l: int, i: int, records: Any, d_colors: Any,
 
 @helper
 def outer_rows(e0: Any, e1: Any, a: Any) -> Any:
-    """E A^T for E with rows e0, e1 (3-tuples) and a 3 x 3 matrix A given row by row."""
+    """Return E A^T for E with rows e0, e1 (3-tuples) and a 3 x 3 matrix A given row by row."""
     r0, r1, r2 = (a[0], a[1], a[2]), (a[3], a[4], a[5]), (a[6], a[7], a[8])
     return (dot(e0, r0), dot(e0, r1), dot(e0, r2)), (dot(e1, r0), dot(e1, r1), dot(e1, r2))
 
 
 @helper
 def covariance_gradient(s: np.ndarray, l: int, b0: Any, b1: Any, eps2d: float, antialiased: bool) -> Any:  # noqa: E741
-    """Moments of lane l -> gradients of the centre (x, y) and of b0, b1."""
+    """Return the gradients of the centre (x, y) and of b0, b1 from the moments of lane l."""
     m0, mp, mq = s[M0 + l], s[MP + l] * P_PER_XI, s[MQ + l] * P_PER_XI
     unit = P_PER_XI * P_PER_XI
     mpp, mpq, mqq = s[MPP + l] * unit, s[MPQ + l] * unit, s[MQQ + l] * unit
@@ -191,7 +191,7 @@ def covariance_gradient(s: np.ndarray, l: int, b0: Any, b1: Any, eps2d: float, a
 
 @helper
 def quaternion_gradient(w: float, x: float, y: float, z: float, m: Any) -> Any:
-    """dL/dR (row by row) -> dL/d quaternion, orthogonal to the quaternion since its length does not matter."""
+    """Return dL/d quaternion from dL/dR (row by row): orthogonal to the quaternion, as its length does not matter."""
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     gw = 2.0 * (x * (m[7] - m[5]) + y * (m[2] - m[6]) + z * (m[3] - m[1]))

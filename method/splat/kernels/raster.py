@@ -37,13 +37,13 @@ MAX_BLOCKS = BATCH * TILE_HEIGHT * (TILE_WIDTH // BLOCK_WIDTH + 1) + 2 * TILE_HE
 
 
 def record_width(channels: int) -> int:
-    """Floats in the gradient record of a Gaussian-tile pair."""
+    """Return the number of floats in the gradient record of a Gaussian-tile pair."""
     return -(-(MOMENTS + channels) // 8) * 8
 
 
 @helper
 def load_record(records: Any, r: int) -> Any:
-    """The record at records[r:], as scalars: the compiler cannot know that writing the lists leaves it unchanged."""
+    """Return the record at records[r:] as scalars, which the compiler can keep while the lists are written."""
     return (
         records[r], records[r + 1], records[r + 2], records[r + 3],
         records[r + 4], records[r + 5], records[r + 6], records[r + 7],
@@ -52,7 +52,7 @@ def load_record(records: Any, r: int) -> Any:
 
 @helper
 def rows_met(g: Any, dx: float, box: Any, rows: int) -> Any:
-    """First and last + 1 block row, counted from the tile's top, where the ellipse meets columns dx .. dx + 7.
+    """Return the first and last + 1 block row, from the tile's top, where the ellipse meets columns dx .. dx + 7.
 
     dx: offset from the Gaussian's centre. The ellipse's upper and lower edge are the ridge line plus and minus
     ratio * sqrt(hx^2 - dx^2); their extremes in the columns lie at the topmost point or at the nearest column.
@@ -69,7 +69,7 @@ def rows_met(g: Any, dx: float, box: Any, rows: int) -> Any:
 
 @template
 def list_column(variant: Any, g: Any, x: int, x_end: int, box: Any, rows: int, lists: Any, at: int) -> int:
-    """Append the blocks of pixel columns x .. x + 7; returns the new length of the list. No branches."""
+    """Append the blocks of pixel columns x .. x + 7 and return the new length of the list. No branches."""
     dx = x + 0.5 - g[0]
     first, last = rows_met(g, dx, box, rows)
     eta = g[6] * (box[2] + first * rows + 0.5 - g[1] - g[2] * dx)
@@ -80,7 +80,7 @@ def list_column(variant: Any, g: Any, x: int, x_end: int, box: Any, rows: int, l
 
 @template
 def list_blocks(variant: Any, records: Any, order: Any, begin: int, end: int, box: Any, rows: int, lists: Any) -> None:
-    """Blocks of the Gaussians order[begin:end] in the tile box (x0, x1, y0, y1).
+    """List the blocks of the Gaussians order[begin:end] in the tile box (x0, x1, y0, y1).
 
     lists: starts, xis, etas of the blocks, and ends, where the k-th Gaussian's run ends.
     """
@@ -102,7 +102,7 @@ def list_blocks(variant: Any, records: Any, order: Any, begin: int, end: int, bo
 
 @helper
 def tile_box(tile: int, width: int, height: int) -> Any:
-    """Pixel bounds x0, x1, y0, y1 of a tile."""
+    """Return the pixel bounds x0, x1, y0, y1 of a tile."""
     across = (width + TILE_WIDTH - 1) // TILE_WIDTH
     x0, y0 = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
     return x0, min(x0 + TILE_WIDTH, width), y0, min(y0 + TILE_HEIGHT, height)
@@ -110,7 +110,7 @@ def tile_box(tile: int, width: int, height: int) -> Any:
 
 @cache
 def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
-    """(forward, backward) tile kernels for this vector length and number of colour channels.
+    """Return the (forward, backward) tile kernels for this vector length and number of colour channels.
 
     numba's cache key covers integers in a closure, but neither global variables nor intrinsics: so everything that
     varies is in `variant`, and all else is global.
@@ -127,7 +127,7 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
         """Composite all tiles.
 
         records [N * 8]; colors [chunks, N * channels]; image [chunks * channels, H, W] and alpha [H, W] are written;
-        processed [chunks, tiles]: how many of a tile's Gaussians were looked at before every pixel was finished.
+        processed [chunks, tiles]: number of a tile's Gaussians that were visited before every pixel was finished.
         """
         while True:
             tile = fetch_add(counter, 0, 1)
@@ -172,7 +172,7 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
         height: int, image: Any, alpha: Any, d_image: Any, d_alpha: Any, sums: Any, counter: Any, buffer: Any,
         starts: Any, xis: Any, etas: Any, ends: Any,
     ) -> None:  # fmt: skip
-        """Gradients of all tiles, front to back: sums [chunks, pairs * record width] (see project_gradient.py)."""
+        """Write the gradients of all tiles to sums [chunks, pairs * record width], see project_gradient.py."""
         width_of_record = (MOMENTS + channels + 7) // 8 * 8
         while True:
             tile = fetch_add(counter, 0, 1)
@@ -223,5 +223,5 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
 
 @helper
 def slot_of(slots: Any, tiles: Any, i: int, tx: int, ty: int) -> int:
-    """Gradient record of Gaussian i in tile (tx, ty)."""
+    """Return the gradient record of Gaussian i in tile (tx, ty)."""
     return slots[i] + (ty - tiles[i, 2]) * (tiles[i, 1] - tiles[i, 0]) + tx - tiles[i, 0]

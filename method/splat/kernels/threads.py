@@ -35,17 +35,17 @@ def set_threads(count: int) -> None:
 
 
 def get_threads() -> int:
-    """How many threads the CPU kernels use."""
+    """Return the number of threads that the CPU kernels use."""
     return _threads
 
 
 def work_counter() -> np.ndarray:
-    """A fresh counter [1] int64 for one `run`, on a cache line of its own."""
+    """Return a fresh counter [1] int64 for one `run`, on a cache line of its own."""
     return np.zeros(8, np.int64)
 
 
 def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """An uninitialised array that begins on a cache line."""
+    """Return an uninitialised array that begins on a cache line."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     raw = np.empty(size + 64, np.uint8)
     start = -raw.ctypes.data % 64
@@ -55,7 +55,7 @@ def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
 def run(kernel: Any, arguments: Sequence[Any], scratch: Sequence[Sequence[Any]]) -> None:
     """Call `kernel(*arguments, counter, *scratch[t])` on len(scratch) threads, this one included, until all return.
 
-    A helper thread that has not started when the work is done is called off.
+    A helper thread that has not started when the work is done is cancelled.
     """
     global _pool
     counter = work_counter()

@@ -1,4 +1,4 @@
-"""Which Gaussians lie in which tile, nearest first: offsets from block histograms, filling, and a radix sort."""
+"""The tiles' lists of Gaussians, nearest first: offsets from block histograms, filling, and a radix sort."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 @kernel
 def tile_offsets(histogram: Any, offsets: Any) -> int:
-    """Turn the counts of `project_forward` into write positions, in place; returns the number of pairs.
+    """Turn the counts of `project_forward` into write positions, in place; return the number of pairs.
 
     histogram [blocks, 1 + tiles]: afterwards column 0 is each block's first pair (in Gaussian order), the others its
-    first place in each tile's list; offsets [tiles + 1] bound the tiles' lists.
+    first position in each tile's list; offsets [tiles + 1] bound the tiles' lists.
     """
     blocks, tiles = histogram.shape[0], offsets.shape[0] - 1
     total = 0
@@ -24,15 +24,15 @@ def tile_offsets(histogram: Any, offsets: Any) -> int:
         count = histogram[b, 0]
         histogram[b, 0] = total
         total += count
-    place = 0
+    position = 0
     for tile in range(tiles):
-        offsets[tile] = place
+        offsets[tile] = position
         for b in range(blocks):
             count = histogram[b, 1 + tile]
-            histogram[b, 1 + tile] = place
-            place += count
-    offsets[tiles] = place
-    return place
+            histogram[b, 1 + tile] = position
+            position += count
+    offsets[tiles] = position
+    return position
 
 
 @kernel
@@ -64,7 +64,7 @@ def fill_tiles(keys: Any, tiles: Any, across: int, histogram: Any, slots: Any, p
 
 @helper
 def sort_tile(pairs: Any, spare: Any, order: Any, begin: int, count: int, digits: Any) -> None:
-    """Stable radix sort of pairs[begin:begin + count] by depth, 8 bits at a time; order gets the indices.
+    """Sort pairs[begin:begin + count] by depth, stably, 8 bits at a time (radix sort); order gets the indices.
 
     digits [1024] and spare [count] are scratch. A digit that all share, such as the exponent's, is skipped.
     """
@@ -83,11 +83,11 @@ def sort_tile(pairs: Any, spare: Any, order: Any, begin: int, count: int, digits
         base, shift = 256 * digit, np.uint64(32 + 8 * digit)
         if digits[base + ((some_key >> np.uint32(8 * digit)) & 255)] == count:
             continue
-        place = np.int32(0)
+        position = np.int32(0)
         for value in range(base, base + 256):
             here = digits[value]
-            digits[value] = place
-            place += here
+            digits[value] = position
+            position += here
         for i in range(count):
             pair = spare[i] if in_spare else pairs[begin + i]
             bucket = base + np.int64((pair >> shift) & np.uint64(255))

@@ -27,22 +27,22 @@ EXP2_POLYNOMIAL = (  # minimax on [-0.5, 0.5], relative error 2.4e-7
 
 
 def host_lanes() -> int:
-    """Vector length that suits this machine: 16 floats with AVX-512, else 8."""
+    """Return the vector length that suits this machine: 16 floats with AVX-512, else 8."""
     return 16 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 8
 
 
 def int64(value: int) -> ir.Constant:
-    """An integer constant for address arithmetic."""
+    """Return an integer constant for address arithmetic."""
     return ir.Constant(I64, value)
 
 
 def offset(builder: Any, pointer: Any, index: Any) -> Any:
-    """`pointer + index`, in elements."""
+    """Return `pointer + index`, in elements."""
     return builder.gep(pointer, [index])
 
 
 def array_data(context: Any, builder: Any, array_type: Any, value: Any) -> Any:
-    """Pointer to the first element of a numba array argument."""
+    """Return the pointer to the first element of a numba array argument."""
     return context.make_array(array_type)(context, builder, value).data
 
 
@@ -54,19 +54,19 @@ class Lanes:
         self.type, self.int_type = ir.VectorType(F32, count), ir.VectorType(I32, count)
 
     def const(self, x: float) -> Any:
-        """The same number in every lane."""
+        """Return the same number in every lane."""
         return self.of([x] * self.count)
 
     def of(self, values: list[float]) -> Any:
-        """One constant per lane."""
+        """Return one constant per lane."""
         return ir.Constant(self.type, [ir.Constant(F32, float(v)) for v in values])
 
     def int_const(self, x: int) -> Any:
-        """The same integer in every lane."""
+        """Return the same integer in every lane."""
         return ir.Constant(self.int_type, [ir.Constant(I32, x)] * self.count)
 
     def splat(self, x: Any) -> Any:
-        """A scalar, float or double, copied into every lane."""
+        """Return a scalar, float or double, copied into every lane."""
         if x.type == F64:
             x = self.b.fptrunc(x, F32)
         element, vector = (F32, self.type) if x.type == F32 else (I32, self.int_type)
@@ -75,12 +75,12 @@ class Lanes:
         return self.b.shuffle_vector(one, undefined, ir.Constant(self.int_type, [ir.Constant(I32, 0)] * self.count))
 
     def shuffle(self, x: Any, y: Any, index: list[int]) -> Any:
-        """Lanes picked from the concatenation of x and y."""
+        """Return lanes picked from the concatenation of x and y."""
         mask = ir.Constant(ir.VectorType(I32, len(index)), [ir.Constant(I32, i) for i in index])
         return self.b.shuffle_vector(x, y, mask)
 
     def load(self, pointer: Any) -> Any:
-        """`count` floats from a pointer of any alignment."""
+        """Return `count` floats from a pointer of any alignment."""
         return self.b.load(self.b.bitcast(pointer, self.type.as_pointer()), align=4)
 
     def store(self, value: Any, pointer: Any) -> None:
@@ -88,39 +88,39 @@ class Lanes:
         self.b.store(value, self.b.bitcast(pointer, value.type.as_pointer()), align=4)
 
     def mul(self, x: Any, y: Any) -> Any:
-        """x * y."""
+        """Return x * y."""
         return self.b.fmul(x, y, flags=FAST)
 
     def add(self, x: Any, y: Any) -> Any:
-        """x + y."""
+        """Return x + y."""
         return self.b.fadd(x, y, flags=FAST)
 
     def sub(self, x: Any, y: Any) -> Any:
-        """x - y."""
+        """Return x - y."""
         return self.b.fsub(x, y, flags=FAST)
 
     def div(self, x: Any, y: Any) -> Any:
-        """x / y, by way of the reciprocal where that is faster."""
+        """Return x / y, by way of the reciprocal where that is faster."""
         return self.b.fdiv(x, y, flags=(*FAST, "arcp"))
 
     def fma(self, x: Any, y: Any, z: Any) -> Any:
-        """x * y + z, fused where the machine can."""
+        """Return x * y + z, fused where the machine can."""
         return self.add(self.mul(x, y), z)
 
     def max(self, x: Any, y: Any) -> Any:
-        """Larger of the two."""
+        """Return the larger of the two."""
         return self.b.select(self.b.fcmp_ordered(">", x, y), x, y)
 
     def min(self, x: Any, y: Any) -> Any:
-        """Smaller of the two."""
+        """Return the smaller of the two."""
         return self.b.select(self.b.fcmp_ordered("<", x, y), x, y)
 
     def minus_abs(self, x: Any) -> Any:
-        """-|x|: sets the sign bit."""
+        """Return -|x|: sets the sign bit."""
         return self.b.bitcast(self.b.or_(self.b.bitcast(x, self.int_type), self.int_const(-(2**31))), self.type)
 
     def exp2(self, x: Any) -> Any:
-        """2**x for x <= 127; below -125 the result stays at 2**-125.
+        """Return 2**x for x <= 127; below -125 the result stays at 2**-125.
 
         Adding 1.5 * 2**23 leaves round(x) in the low bits; shifted by 23 they are added to the exponent of the
         polynomial in the remainder.
@@ -138,7 +138,7 @@ class Lanes:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def fetch_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Atomic `array[index] += value` on int64; returns the old value."""
+    """Do `array[index] += value` atomically on int64 and return the old value."""
     signature = types.int64(array, types.int64, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -150,7 +150,7 @@ def fetch_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of `array[index]`; harmless for any index."""
+    """Prefetch the cache line of `array[index]`; harmless for any index."""
     signature = types.void(array, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
