@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from spike4dgs.benchmark.weights import load_into, read_tensors
 from spike4dgs.method.msdi.checkpoints import canonical_head
 from spike4dgs.method.msdi.dpt import Dpt, unpack
-from spike4dgs.method.msdi.transformer import NORM_EPS, Block, Mlp, SelfAttention, attend_placed, grid
+from spike4dgs.method.msdi.transformer import NORM_EPS, Block, Mlp, SelfAttention, attend_rotary, grid
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class CrossAttention(nn.Module):
     def forward(self, x: Tensor, other: Tensor, places: Tensor, other_places: Tensor) -> Tensor:
         """[B, N, C] and [B, M, C] -> [B, N, C]."""
         q, k, v = self.projq(x), self.projk(other), self.projv(other)
-        out: Tensor = self.proj(attend_placed(q, k, v, places, other_places, self.heads))
+        out: Tensor = self.proj(attend_rotary(q, k, v, places, other_places, self.heads))
         return out
 
 

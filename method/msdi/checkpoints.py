@@ -1,15 +1,15 @@
 """Weights that users bring, for the configuration `paper`: Fast3R's or DUSt3R's published files.
 
-| file | what is taken |
+| file | parts taken |
 |---|---|
 | Fast3R, `model.safetensors` of jedyang97/Fast3R_ViT_Large_512 | encoder, fusion transformer and the global head |
 | DUSt3R, `model.safetensors` of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt | encoder |
 
-DUSt3R's decoders work on pairs of views and are 768 wide, and so are the tokens that its heads take; neither has a
-place here (Fast3R starts from the same part of it). Fast3R's second head, for points in each view's own frame, is
-left. What no file has - extractor, image generator, the mixing layer before the patch embedding, the embedding of
-rays - keeps its values and must be trained. The weights are their authors' and come under their licences; they are
-neither shipped nor downloaded. Only safetensors files are read: nothing is unpickled.
+DUSt3R's decoders work on pairs of views and are 768 wide, and so are the inputs of its heads; this network has neither
+(Fast3R too starts from DUSt3R's encoder alone). Fast3R's second head, for points in each view's own frame, is left out.
+Extractor, image generator, the mixing layer before the patch embedding and the embedding of rays are in no file: they
+keep their values and must be trained. The weights are their authors' and come under their licences; they are neither
+shipped nor downloaded. Only safetensors files are read: nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _FIX = "use model.safetensors of jedyang97/Fast3R_ViT_Large_512 or naver/DUSt3R_
 
 @dataclass(frozen=True)
 class Transfer:
-    """What came out of a file."""
+    """The tensors that a file gave."""
 
     source: str  # "fast3r" or "dust3r"
     taken: tuple[str, ...]  # names of the network's tensors that the file gave
     fresh: tuple[str, ...]  # names of those that it has not, which keep their values
-    left: tuple[str, ...]  # names in the file that have no place here
+    left: tuple[str, ...]  # names in the file that the network does not have
 
 
 # Published name -> ours; the first pattern that matches counts. The head's names agree from `dpt.` on.
@@ -54,7 +54,7 @@ _FAST3R = (
 )
 _RULES = {"fast3r": _FAST3R, "dust3r": _ENCODER}
 _PARTS = {"fast3r": ("encoder.", "fusion.", "head."), "dust3r": ("encoder.",)}
-_OURS = ("encoder.mix.", "encoder.ray_embed.")  # of those parts, what only this network has
+_OURS = ("encoder.mix.", "encoder.ray_embed.")  # tensors of those parts that only this network has
 
 # Some files keep the other of two names that a layer of the head has.
 _HEAD_NAMES = (
@@ -64,14 +64,14 @@ _HEAD_NAMES = (
 
 
 def canonical_head(name: str) -> str:
-    """The name of a head's layer that `dpt.Dpt` uses, from either of its published names."""
+    """Return the name that `dpt.Dpt` uses for a head's layer, from either of its published names."""
     for pattern, ours in _HEAD_NAMES:
         name = pattern.sub(lambda m, ours=ours: ours.format(int(m[1]) - 1), name)  # type: ignore[misc]
     return name
 
 
 def source_of(names: Mapping[str, Tensor]) -> str | None:
-    """Whose state dict this is: "fast3r", "dust3r" or None."""
+    """Return the origin of a state dict: "fast3r", "dust3r" or None."""
     if any(name.startswith("decoder.dec_blocks.") for name in names):
         return "fast3r"
     if any(name.startswith("dec_blocks2.") for name in names):
@@ -80,7 +80,7 @@ def source_of(names: Mapping[str, Tensor]) -> str | None:
 
 
 def renamed(state: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], tuple[str, ...]]:
-    """Tensors under this network's names, and the names in the file that have no place here."""
+    """Return tensors under this network's names, and the names in the file that it does not have."""
     ours: dict[str, Tensor] = {}
     left = []
     for name, tensor in state.items():
@@ -94,7 +94,7 @@ def renamed(state: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor]
 
 
 def load_pretrained(network: Msdi, path: Path) -> Transfer:
-    """Take what a file of Fast3R or DUSt3R has for `network`, in place, and say what was taken.
+    """Take the tensors of a file of Fast3R or DUSt3R for `network`, in place, and return which were taken.
 
     Raises UserError where the file is neither's, is damaged, or is of other sizes than the network.
     """
@@ -102,7 +102,7 @@ def load_pretrained(network: Msdi, path: Path) -> Transfer:
 
 
 def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer:
-    """`load_pretrained` of a state dict; `path` is for the error."""
+    """Take a state dict as `load_pretrained` does; `path` is for the error."""
     source = source_of(state)
     if source is None:
         raise problem(path, "the tensors of Fast3R or DUSt3R", f"others, such as {min(state, default='none')}", _FIX)

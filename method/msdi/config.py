@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MsdiConfig:
-    """What `Msdi` is built from. Widths are channels."""
+    """Sizes of the networks of `Msdi`. Widths are channels."""
 
     name: str
-    ticks: int  # T, of the window that the network sees; its image is that of the middle
+    ticks: int  # T, length of the network's window; the image is that of its middle
     extractor_widths: tuple[int, ...]  # of each level, the first at full size, each next at half; one: a single layer
     generator_widths: tuple[int, int]  # of the first two of BCONV's three layers
     generator_sees_pixel: bool  # BCONV also gets the spikes of its own pixel, to which the features are blind
-    rate_windows: tuple[int, ...]  # ticks on either side, of the rates that it gets with them
-    embed_channels: int  # what the patch embedding sees, mixed from the extractor's features
+    rate_windows: tuple[int, ...]  # ticks on either side, for the rates that BCONV gets with them
+    embed_channels: int  # inputs of the patch embedding, mixed from the extractor's features
     patch: int  # px, 16 or 8
     encoder_layers: int
     encoder_width: int
@@ -28,7 +28,7 @@ class MsdiConfig:
 
     @property
     def own_channels(self) -> int:
-        """Of what BCONV gets of its own pixel: the spikes, and `inputs.own_rates`."""
+        """Channels that BCONV gets of its own pixel: the spikes, and `inputs.own_rates`."""
         if not self.generator_sees_pixel:
             return 0
         return self.ticks + (2 * len(self.rate_windows) + 1 if self.rate_windows else 0)
@@ -40,7 +40,7 @@ class MsdiConfig:
 
     @property
     def hooks(self) -> tuple[int, int, int, int]:
-        """What the head sees: 0 is the encoder's output, k that of the fusion's k-th layer."""
+        """The head's inputs: 0 is the encoder's output, k that of the fusion's k-th layer."""
         n = self.fusion_layers
         return 0, n // 2, 3 * n // 4, n
 
@@ -68,8 +68,8 @@ PAPER = MsdiConfig(
 )
 
 # For two CPU cores, at 64x104 px: patches of 8 give as many tokens there as patches of 16 at twice the size, for a
-# quarter of the pixels. The extractor is a pyramid, for one layer sees three rows and columns; the image also takes
-# the pixel's own spikes, which say more of it than any neighbour.
+# quarter of the pixels. The extractor is a pyramid, because one layer sees only three rows and columns; the image also
+# takes the pixel's own spikes, which say more about it than any neighbour.
 SMALL = MsdiConfig(
     name="small",
     ticks=41,

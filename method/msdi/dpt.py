@@ -11,18 +11,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-_LARGEST = 30.0  # of what is put into an exponential: e^30 is beyond all scenes, e^89 is beyond float32
+_LARGEST = 30.0  # argument of an exponential: e^30 is beyond all scenes, e^89 is beyond float32
 
 
 class ResidualUnit(nn.Module):
-    """Two 3x3 convolutions around which the input goes."""
+    """Two 3x3 convolutions, added to the input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.conv1, self.conv2 = nn.Conv2d(width, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, C, H, W]."""
+        """Return [B, C, H, W] from [B, C, H, W]."""
         out: Tensor = x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
         return out
 
@@ -36,7 +36,7 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(width, width, 1)
 
     def forward(self, x: Tensor, finer: Tensor | None = None) -> Tensor:
-        """[B, C, h, w] -> [B, C, 2 h, 2 w]."""
+        """Return [B, C, 2 h, 2 w] from [B, C, h, w]."""
         x = self.resConfUnit2(x if finer is None else x + self.resConfUnit1(finer))
         out: Tensor = _double(self.out_conv(x))  # a 1x1 convolution and an interpolation commute: the cheap order
         return out
@@ -76,7 +76,7 @@ class Dpt(nn.Module):
         )
         self.scratch = Levels(widths, features)
         half = features // 2
-        self.head = nn.ModuleDict(  # named by place: 1 and 3 have no parameters
+        self.head = nn.ModuleDict(  # named by position: 1 and 3 have no parameters
             {
                 "0": nn.Conv2d(features, half, 3, padding=1),
                 "2": nn.Conv2d(half, half, 3, padding=1),
@@ -85,7 +85,7 @@ class Dpt(nn.Module):
         )
 
     def forward(self, layers: list[Tensor], rows: int, columns: int) -> Tensor:
-        """[B, 4, rows * patch, columns * patch] of `layers`, [B, rows * columns, C] of the four hooks."""
+        """Return [B, 4, rows * patch, columns * patch] from `layers`, [B, rows * columns, C] of the four hooks."""
         maps = [x.transpose(1, 2).unflatten(2, (rows, columns)) for x in layers]
         levels = [post(x) for post, x in zip(self.act_postprocess, maps, strict=True)]
         levels = [conv(x) for conv, x in zip(self.scratch.layer_rn, levels, strict=True)]
@@ -98,9 +98,9 @@ class Dpt(nn.Module):
 
 
 def unpack(out: Tensor) -> tuple[Tensor, Tensor]:
-    """[B, 4, H, W] -> points x / |x| * (exp|x| - 1) [B, H, W, 3] and confidence 1 + exp(c) [B, H, W].
+    """Return points x / |x| * (exp|x| - 1) [B, H, W, 3] and confidence 1 + exp(c) [B, H, W] from (x, c) [B, 4, H, W].
 
-    Exponents are bounded by 30, so that no training step can make an infinity. Half floats become float32 before.
+    Exponents are at most 30, so that no training step gives infinity. Half floats become float32 first.
     """
     out = widened(out)
     x = out[:, :3].permute(0, 2, 3, 1)
@@ -110,5 +110,5 @@ def unpack(out: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def widened(x: Tensor) -> Tensor:
-    """Half floats as float32; others as they are."""
+    """Return half floats as float32, others unchanged."""
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x

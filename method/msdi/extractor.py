@@ -1,7 +1,7 @@
 """MSDI's spike feature extractor (eqs. 6, 7) and image generator (eq. 12): a blind-spot network on spikes.
 
-A layer that sees only rows above a pixel is run on the stream in four orientations. Turned back and put side by side,
-the four see all around the pixel, and never the pixel itself: a feature says what the neighbours tell of it.
+A layer that sees only rows above a pixel runs on the stream in four orientations. Turned back and concatenated, the
+four see all around the pixel, and never the pixel itself: a feature is what the neighbours say about it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ShiftedConv(nn.Module):
         self.conv = nn.Conv2d(inputs, outputs, 3, padding=(2, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, H, W] -> [N, outputs, H, W]."""
+        """Return [N, outputs, H, W] from [N, inputs, H, W]."""
         out: Tensor = self.conv(x)[:, :, :-2]
         return out
 
@@ -51,7 +51,7 @@ class UpwardNet(nn.Module):
         self.up = nn.ModuleList(ShiftedConv(a + b, b) for a, b in zip(widths[1:], widths, strict=False))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, H, W] -> [N, widths[0], H, W], the sides multiples of 2^(levels - 1)."""
+        """Return [N, widths[0], H, W] from [N, inputs, H, W]; the sides are multiples of 2^(levels - 1)."""
         levels: list[Tensor] = []
         for conv in self.down:
             x = functional.avg_pool2d(shift(levels[-1]), 2) if levels else x
@@ -79,7 +79,7 @@ class SpikeExtractor(nn.Module):
         initialize(self)
 
     def forward(self, spikes: Tensor) -> Tensor:
-        """[N, T, H, W] -> [N, 4 * widths[0], H, W], by direction; sides as for `UpwardNet`."""
+        """Return [N, 4 * widths[0], H, W], by direction, from [N, T, H, W]; sides as for `UpwardNet`."""
         turned = [torch.rot90(spikes, k, (2, 3)) for k in range(4)]
         seen: list[Tensor] = [torch.empty(0)] * 4
         for pair in ((0, 2), (1, 3)):  # turns of the same shape run together
@@ -93,7 +93,7 @@ class ImageGenerator(nn.Module):
     """BCONV of eq. 12: three 1x1 convolutions from a pixel's features to its image.
 
     With `ticks` > 0 they also get the pixel's own spikes. The published network learns without ground truth and must
-    be blind to them; with ground truth there is no need, and no neighbour says as much of a pixel as its own spikes.
+    be blind to them; with ground truth there is no need, and no neighbour says as much about a pixel as its own spikes.
     """
 
     def __init__(self, features: int, widths: tuple[int, int], ticks: int) -> None:
@@ -105,7 +105,7 @@ class ImageGenerator(nn.Module):
         initialize(self)
 
     def forward(self, features: Tensor, spikes: Tensor) -> Tensor:
-        """Features [N, F, H, W] and spikes [N, T, H, W] -> spikes per tick [N, H, W]."""
+        """Return spikes per tick [N, H, W] from features [N, F, H, W] and spikes [N, T, H, W]."""
         x = torch.cat([features, spikes], dim=1) if self.ticks else features
         for layer in self.layers[:-1]:
             x = _leaky(layer(x))
@@ -114,7 +114,7 @@ class ImageGenerator(nn.Module):
 
 
 def initialize(network: nn.Module) -> None:
-    """He's normal weights for LeakyReLU, zero biases: features keep their size from layer to layer."""
+    """Set He's normal weights for LeakyReLU and zero biases: features keep their size from layer to layer."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, a=_SLOPE)

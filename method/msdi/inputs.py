@@ -1,10 +1,10 @@
-"""What MSDI's networks see of a stream: spikes as an ideal sensor's, and what each pixel's own spikes say of its rate.
+"""Inputs of MSDI's networks: spikes corrected to an ideal sensor, and rates estimated from each pixel's own spikes.
 
-A network of few layers can learn to count spikes, and hardly to measure the time between them, which is the better
-estimate where it is bright: so that is done for BCONV (1.3 dB after three minutes of training). For windows of h ticks
-on either side of the middle, with n spikes, the first at t_1 and the last at t_n: (n - 1) / (t_n - t_1), or n / 2h
-below two spikes, and the count n / 2h itself; besides, one over the interval between the last spike before the middle
-and the first that is not, or the mean of the window where there is no such interval.
+A network of few layers can learn to count spikes, but hardly to measure the time between them, which is the better
+estimate of a bright pixel. BCONV therefore gets these rates (1.3 dB after three minutes of training). A window of h
+ticks on either side of the middle, with n spikes, the first at t_1 and the last at t_n, gives (n - 1) / (t_n - t_1), or
+n / 2h below two spikes, and the count n / 2h itself. The last rate is one over the interval between the last spike
+before the middle and the next one, or the mean of the window where there is no such interval.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """What cameras do to light, as far as it is known: float tensors [..., H, W]."""
+    """Known response of the cameras to light: float tensors [..., H, W]."""
 
     sensitivity: Tensor  # n(x, y), mean 1
     dark: Tensor  # spikes per tick in the dark
 
     def flat(self) -> Sensors:
-        """With one leading axis."""
+        """Return the same maps with one leading axis."""
         size = self.dark.shape[-2:]
         return Sensors(self.sensitivity.reshape(-1, *size), self.dark.reshape(-1, *size))
 
 
 def corrected(rates: Tensor, sensors: Sensors) -> Tensor:
-    """What an ideal sensor's pixels would have given: (rates - dark) / sensitivity, of `rates` [..., K, H, W].
+    """Return the rates of an ideal sensor, (rates - dark) / sensitivity, for `rates` [..., K, H, W].
 
-    A pixel without sensitivity has gathered nothing.
+    A pixel without sensitivity has rate 0.
     """
     inverse = torch.where(sensors.sensitivity > 0, 1 / sensors.sensitivity, 0.0)
     return (rates - sensors.dark.unsqueeze(-3)) * inverse.unsqueeze(-3)
 
 
 def own_rates(spikes: Tensor, half_windows: Sequence[int]) -> Tensor:
-    """Rates of spikes [N, T, H, W] of 0 and 1, T odd, in spikes per tick: [N, 2 K + 1, H, W] for K rising windows.
+    """Return rates [N, 2 K + 1, H, W], spikes per tick, for K rising windows, of spikes [N, T, H, W] of 0 and 1, T odd.
 
-    Each window's two rates, then the interval's; see the module. Constants: no gradient flows.
+    Each window has two rates, then comes the interval's; see the module. No gradient flows.
     """
     spikes = spikes.detach()
     middle, ticks = spikes.shape[1] // 2, spikes.shape[1]
@@ -64,6 +64,6 @@ def own_rates(spikes: Tensor, half_windows: Sequence[int]) -> Tensor:
 
 
 def network_inputs(spikes: Tensor, sensors: Sensors | None, half_windows: Sequence[int]) -> Tensor:
-    """What is seen of spikes [N, T, H, W]: those, and `own_rates` if windows are named, of ideal sensors if known."""
+    """Return spikes [N, T, H, W], with `own_rates` if there are windows, corrected for the sensors if known."""
     seen = torch.cat([spikes, own_rates(spikes, half_windows)], dim=1) if half_windows else spikes
     return corrected(seen, sensors) if sensors else seen

@@ -6,8 +6,8 @@ gives the point that each pixel sees, in the frame of view 0, with a confidence 
 by `pose.solve_poses`. Encoder, fusion and head are those of DUSt3R and Fast3R; `checkpoints` loads their weights.
 
 Known intrinsics enter as the direction of each pixel's ray, embedded beside the features. Known sensors enter as
-spikes of an ideal one (`inputs`), before anything looks at neighbours. The sides of the streams are
-padded to whole patches with zeros, and what comes out is cut back; nothing is cropped or resized.
+spikes of an ideal one (`inputs`), before any layer combines neighbours. The sides of the streams are padded to whole
+patches with zeros, and the outputs are cut back; nothing is cropped or resized.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _FUSION_EPS = 1e-5  # of Fast3R's fusion layers, unlike the encoder's
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What MSDI makes of B samples of V views of H x W pixels."""
+    """The output of MSDI for B samples of V views of H x W pixels."""
 
     points: Tensor  # [B, V, H, W, 3] what each pixel sees, in view 0's camera frame (OpenCV), at an arbitrary scale
     confidence: Tensor  # [B, V, H, W] more than 1
@@ -51,22 +51,22 @@ class Margins:
     right: int
 
     def pad(self, x: Tensor) -> Tensor:
-        """[..., H, W] with the margins."""
+        """Return [..., H, W] with the margins."""
         return functional.pad(x, (self.left, self.right, self.top, self.bottom))
 
     def cut(self, x: Tensor) -> Tensor:
-        """[N, H', W', ...] without them."""
+        """Return [N, H', W', ...] without the margins."""
         return x[:, self.top : x.shape[1] - self.bottom, self.left : x.shape[2] - self.right]
 
 
 def margins(height: int, width: int, patch: int) -> Margins:
-    """What brings the sides to multiples of `patch`, half of it (rounded down) above and left."""
+    """Return the margins that make the sides multiples of `patch`, half of them (rounded down) above and left."""
     rows, columns = -height % patch, -width % patch
     return Margins(rows // 2, rows - rows // 2, columns // 2, columns - columns // 2)
 
 
 class Encoder(nn.Module):
-    """Eq. 9: a ViT with rotary places, of one set of weights for all views."""
+    """Eq. 9: a ViT with rotary positions, with one set of weights for all views."""
 
     def __init__(self, config: MsdiConfig) -> None:
         super().__init__()
@@ -80,12 +80,12 @@ class Encoder(nn.Module):
         initialize(self.blocks)
 
     def forward(self, features: Tensor, rays: Tensor) -> Tensor:
-        """Features [N, F, H, W] and rays [N, 3, H, W] to tokens [N, patches, C], row by row."""
+        """Return tokens [N, patches, C], row by row, from features [N, F, H, W] and rays [N, 3, H, W]."""
         x = self.patch_embed(self.mix(features)) + self.ray_embed(rays)  # [N, C, rows, columns]
-        places = grid(x.shape[2], x.shape[3], x.device)
+        positions = grid(x.shape[2], x.shape[3], x.device)
         x = x.flatten(2).transpose(1, 2)
         for block in self.blocks:
-            x = block(x, places)
+            x = block(x, positions)
         out: Tensor = self.norm(x)
         return out
 
@@ -103,7 +103,7 @@ class FusionTransformer(nn.Module):
         initialize(self.blocks)
 
     def forward(self, tokens: Tensor) -> list[Tensor]:
-        """Tokens [B, V, n, C] to those of the four hooks, each [B V, n, C']."""
+        """Return the tokens of the four hooks, each [B V, n, C'], from tokens [B, V, n, C]."""
         batch, views = tokens.shape[:2]
         numbers = view_numbers(batch, views, shuffled=self.training).to(tokens.device)
         x = (self.embed(tokens) + sinusoids(numbers, self.width)[:, :, None]).flatten(1, 2)  # [B, V n, C']
@@ -117,7 +117,7 @@ class FusionTransformer(nn.Module):
 
 
 def view_numbers(batch: int, views: int, *, shuffled: bool) -> Tensor:
-    """The views' numbers [B, V], by which the network tells them apart: view 0 has 0.
+    """Return the views' numbers [B, V], which distinguish them in the network: view 0 has 0.
 
     In training the others are distinct random numbers, by torch's generator, so that all numbers are seen and no order
     is learnt; in inference they are spread evenly. Raises UserError for more views than numbers.
@@ -133,7 +133,7 @@ def view_numbers(batch: int, views: int, *, shuffled: bool) -> Tensor:
 
 
 def sinusoids(numbers: Tensor, width: int) -> Tensor:
-    """Sines, then cosines, of the numbers [...] at width / 2 falling frequencies: [..., width] float32."""
+    """Return sines, then cosines, of the numbers [...] at width / 2 falling frequencies: [..., width] float32."""
     half = width // 2
     angle = numbers[..., None] * 10000.0 ** (-torch.arange(half, device=numbers.device) / half)
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
@@ -150,11 +150,11 @@ class Msdi(nn.Module):
         self.encoder = Encoder(c)
         self.fusion = FusionTransformer(c)
         self.head = Dpt((c.encoder_width, *[c.fusion_width] * 3), c.head_widths, c.head_features, c.patch)
-        with torch.no_grad():  # points start before the camera
+        with torch.no_grad():  # points begin in front of the camera
             self.head.head["4"].bias.copy_(torch.tensor([0.0, 0.0, 1.0, 0.0]))  # type: ignore[operator, union-attr]
 
     def forward(self, spikes: Tensor, intrinsics: Tensor | None = None, sensors: Sensors | None = None) -> Estimate:
-        """Points, confidence and images of `spikes` [B, V, T, H, W] of 0 and 1; see `Estimate`.
+        """Return points, confidence and images of `spikes` [B, V, T, H, W] of 0 and 1; see `Estimate`.
 
         `intrinsics` [B, V, 3, 3] in pixels, pixel centres at +0.5, and `sensors` [B, V, H, W] are None where they
         are unknown. Raises UserError for spikes, intrinsics or sensors of another shape.
@@ -179,8 +179,11 @@ class Msdi(nn.Module):
         )
 
     def images(self, spikes: Tensor, sensors: Sensors | None = None, *, half: bool = False) -> Tensor:
-        """The images alone, of `spikes` [N, T, H, W], `sensors` [N, H, W]: spikes per tick [N, H, W]; raises as
-        `forward`. With `half` the features are bfloat16: 0.001 dB, in two thirds of the time where `has_bfloat16`."""
+        """Return the images alone, in spikes per tick [N, H, W], of `spikes` [N, T, H, W] and `sensors` [N, H, W].
+
+        With `half` the features are bfloat16: a difference of 0.001 dB, in two thirds of the time where `has_bfloat16`.
+        Raises as `forward`.
+        """
         _check_shapes((1, *spikes.shape), None, self.config.ticks)
         around = margins(spikes.shape[2], spikes.shape[3], self.config.patch)
         padded = around.pad(self._seen(spikes, sensors))
@@ -189,7 +192,7 @@ class Msdi(nn.Module):
         return widened(around.cut(self.generator(widened(features), padded)))
 
     def _seen(self, spikes: Tensor, sensors: Sensors | None) -> Tensor:
-        """What the networks see [N, T and rates, H, W]."""
+        """Return the networks' inputs [N, T and rates, H, W]."""
         n, _, height, width = spikes.shape
         flat = None if sensors is None else sensors.flat()
         if flat and {flat.sensitivity.shape, flat.dark.shape} != {(n, height, width)}:
@@ -200,7 +203,7 @@ class Msdi(nn.Module):
 
 @cache
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether a device has instructions that multiply bfloat16."""
+    """Return whether a device has instructions that multiply bfloat16."""
     return device.type != "cpu" or bool(get_host_cpu_features().get("avx512bf16"))
 
 
@@ -215,14 +218,14 @@ def _check_shapes(spikes: Sequence[int], intrinsics: Sequence[int] | None, ticks
 
 
 def _clean(spikes: Tensor) -> Tensor:
-    """Float spikes; what is not finite counts as no spike."""
+    """Return float spikes; a value that is not finite counts as no spike."""
     return spikes.nan_to_num(0.0, 0.0, 0.0) if spikes.is_floating_point() else spikes.float()
 
 
 def ray_map(intrinsics: Tensor | None, count: int, height: int, width: int, like: Tensor) -> Tensor:
-    """Where the pixels look: x / z, y / z and 1, [N, 3, H, W], of the type and on the device of `like`.
+    """Return the pixels' rays x / z, y / z and 1, [N, 3, H, W], of the type and on the device of `like`.
 
-    Where `intrinsics` are None, a focal length of the longer side stands in and the third channel is 0: places remain.
+    Where `intrinsics` are None, the focal length is the longer side and the third channel is 0: positions remain.
     """
     v, u = torch.meshgrid(
         torch.arange(height, device=like.device) + 0.5, torch.arange(width, device=like.device) + 0.5, indexing="ij"

@@ -1,6 +1,6 @@
 """Camera poses from MSDI's points: PnP with RANSAC per view, with or without known intrinsics (section 3.3).
 
-Each pixel of a view names the point that it sees, in view 0's frame. SQPnP within RANSAC finds the pose under which
+Each pixel of a view has the point that it sees, in view 0's frame. SQPnP within RANSAC finds the pose under which
 most points fall on their pixels; Levenberg-Marquardt refines it on those, twice, the second time on what the first
 result counts in. Where no pose holds, the view has none, with the reason; a wrong pose is worse than no pose.
 """
@@ -25,7 +25,7 @@ LEAST_POINTS = 6
 
 @dataclass(frozen=True)
 class PnpSettings:
-    """What counts as a pose.
+    """Numbers of the pose solver.
 
     DUSt3R and Fast3R take 10 rounds at 5 px of 512. With a third of the points right, a sample of four is right in one
     of 81 rounds: 10 rounds mostly miss. RANSAC stops by itself once it is sure.
@@ -36,12 +36,12 @@ class PnpSettings:
     reach: float = 0.01  # of the image's longer side: a point within this distance of its pixel is an inlier
     least_inliers: float = 0.1  # share of the points below which a pose counts as none
     least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
-    most_points: int = 4000  # evenly drawn from a view's points; more take longer and find no other pose
+    most_points: int = 4000  # random sample of a view's points; more take longer and give the same poses
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPose:
-    """A view's pose, or why there is none."""
+    """A view's pose, or the reason why there is none."""
 
     w2c: Float64 | None  # [4, 4] from view 0's frame to the camera's, OpenCV axes
     inlier_share: float  # of the points used; 0 without a pose
@@ -50,12 +50,12 @@ class ViewPose:
 
     @property
     def found(self) -> bool:
-        """Whether there is a pose."""
+        """True if there is a pose."""
         return self.w2c is not None
 
 
 def poses_of(estimate: Estimate, intrinsics: Float64 | None, seed: int = 0) -> list[list[ViewPose]]:
-    """Poses of each sample's views from what the network gave; `intrinsics` [B, V, 3, 3] or None. See `solve_poses`."""
+    """Return the poses of each sample's views; `intrinsics` [B, V, 3, 3] or None. See `solve_poses`."""
     points = estimate.points.detach().double().cpu().numpy()
     confidence = estimate.confidence.detach().double().cpu().numpy()
     known = [None] * len(points) if intrinsics is None else list(intrinsics)
@@ -69,7 +69,7 @@ def solve_poses(
     seed: int = 0,
     settings: PnpSettings | None = None,
 ) -> list[ViewPose]:
-    """The pose of each view from points [V, H, W, 3] in view 0's frame and their confidence [V, H, W].
+    """Return the pose of each view from points [V, H, W, 3] in view 0's frame and their confidence [V, H, W].
 
     `intrinsics` [V, 3, 3] are in pixels. Where they are None, the focal length of view 0's points serves all views,
     with square pixels and the principal point in the middle. View 0's pose is the identity by definition; its inlier
@@ -125,7 +125,7 @@ def solve_pose(
     reach_px: float,
     settings: PnpSettings | None = None,
 ) -> tuple[Float64, Float64] | None:
-    """World-to-camera (R [3, 3], t [3]) from points [N, 3] and their pixels [N, 2]; None where RANSAC finds no pose.
+    """Return world-to-camera (R [3, 3], t [3]) from points [N, 3] and pixels [N, 2], or None if RANSAC finds none.
 
     Points within `reach_px` of their pixel are inliers. The same seed gives the same pose.
     """
@@ -167,7 +167,7 @@ def solve_pose(
 def _inliers(
     R: Float64, t: Float64, points: Float64, pixels: Float64, K: Float64, reach_px: float
 ) -> NDArray[np.bool_]:
-    """Which points [N, 3] lie before the camera and within `reach_px` of their pixels [N, 2]."""
+    """Return which points [N, 3] are in front of the camera and within `reach_px` of their pixels [N, 2]."""
     p = points @ R.T + t
     ahead = p[:, 2] > 1e-9
     q = p @ K.T
@@ -176,7 +176,7 @@ def _inliers(
 
 
 def _chosen(points: Float64, confidence: Float64, settings: PnpSettings, seed: int) -> tuple[Float64, Float64]:
-    """Pixel centres [N, 2] and points [N, 3] of a view's finite points of sufficient confidence."""
+    """Return the pixel centres [N, 2] and points [N, 3] of a view's finite points of sufficient confidence."""
     usable = np.isfinite(points).all(axis=-1) & np.isfinite(confidence)
     if usable.any():
         usable &= confidence >= np.quantile(confidence[usable], settings.least_confidence)
@@ -188,10 +188,10 @@ def _chosen(points: Float64, confidence: Float64, settings: PnpSettings, seed: i
 
 
 def focal_from_points(points: Float64, offsets: Float64) -> float | None:
-    """The focal length f in px that makes sum |p - f q| smallest, q = (x / z, y / z) of points [N, 3] (Weiszfeld).
+    """Return the focal length f in px that minimises sum |p - f q|, q = (x / z, y / z) of points [N, 3] (Weiszfeld).
 
-    `offsets` p [N, 2] are pixels relative to the principal point. Each round solves the least squares that the last
-    one's residuals weigh; points that do not lie before the camera are left out. None where no positive one fits.
+    `offsets` p [N, 2] are pixels relative to the principal point. Each round solves least squares, weighted by the last
+    round's residuals; points that are not in front of the camera are left out. None if no positive one fits.
     """
     ahead = points[:, 2] > 1e-9
     q, p = points[ahead, :2] / points[ahead, 2:], offsets[ahead]

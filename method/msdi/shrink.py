@@ -1,8 +1,8 @@
-"""The stream that a sensor of larger pixels would have given: for an estimator that was trained at low resolution.
+"""Streams of larger pixels, for a network that was trained at low resolution.
 
-Attention costs the square of the number of patches, and a network sees best at the size that it was trained at. A
-stream cannot be resized like an image, but what several pixels fire together can charge one larger pixel, which fires
-whenever the sum makes a whole spike for each of them: again a stream of 0 and 1, of the mean rate to within one spike.
+Attention costs the square of the number of patches, and a network works best at the size of its training. A stream
+cannot be resized like an image, but the spikes of several pixels can charge one larger pixel, which fires whenever the
+sum makes a whole spike for each of them. This is again a stream of 0 and 1, of the mean rate to within one spike.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from spike4dgs.benchmark.errors import problem
 
 
 def shrink(spikes: Tensor, factor: int) -> Tensor:
-    """[..., T, H, W] of 0 and 1 -> the same of blocks of `factor` x `factor` pixels, sides rounded up, float32.
+    """Return a stream [..., T, H, W] of 0 and 1 in blocks of `factor` x `factor` pixels, sides rounded up, float32.
 
-    A block that reaches over the border has the pixels that there are. All start half charged. Raises UserError for a
-    factor below 1.
+    A block at the border has only the pixels inside. All blocks begin half charged. Raises UserError for a factor below
+    1.
     """
     if factor < 1:
         raise problem("spikes", "a factor of 1 or more", str(factor), "give 1 to keep the size")
@@ -36,11 +36,11 @@ def shrink(spikes: Tensor, factor: int) -> Tensor:
 
 
 def shrink_intrinsics(intrinsics: Tensor, factor: int) -> Tensor:
-    """[..., 3, 3] in pixels -> the same in blocks, which start at the corner of the first pixel."""
+    """Return intrinsics [..., 3, 3] in blocks, which start at the corner of the first pixel, from those in pixels."""
     scale = torch.tensor([1 / factor, 1 / factor, 1.0], dtype=intrinsics.dtype, device=intrinsics.device)
     return intrinsics * scale[:, None]
 
 
 def _block_sums(x: Tensor, factor: int) -> Tensor:
-    """[N, C, H, W] -> sums of blocks, exact for whole numbers."""
+    """Return the sums over blocks of [N, C, H, W], exact for whole numbers."""
     return functional.avg_pool2d(x, factor, divisor_override=1)

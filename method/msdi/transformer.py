@@ -1,4 +1,4 @@
-"""Transformer layers as DUSt3R and Fast3R have them: pre-norm, with or without rotary places in two dimensions."""
+"""Transformer layers of DUSt3R and Fast3R: pre-norm, with or without rotary positions in two dimensions."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ ROPE_BASE = 100.0
 NORM_EPS = 1e-6
 
 
-def rotate(x: Tensor, places: Tensor) -> Tensor:
-    """RoPE in two dimensions: x [B, heads, N, D], places [N, 2] (row, column), both in patches.
+def rotate(x: Tensor, positions: Tensor) -> Tensor:
+    """Return x [B, heads, N, D] rotated by its positions [N, 2] (row, column), in patches: RoPE in two dimensions.
 
     The first half of D turns with the row and the second with the column; within a half, number i is paired with
-    number i + D / 4, and the pair turns by place / 100^(i / (D / 4)).
+    number i + D / 4, and the pair turns by position / 100^(i / (D / 4)).
     """
     quarter = x.shape[-1] // 4
     frequency = ROPE_BASE ** (-torch.arange(quarter, device=x.device, dtype=torch.float32) / quarter)
     parts = []
-    for half, place in zip(x.chunk(2, dim=-1), places.T, strict=True):
-        angle = place[:, None].float() * frequency  # [N, D / 4]
+    for half, position in zip(x.chunk(2, dim=-1), positions.T, strict=True):
+        angle = position[:, None].float() * frequency  # [N, D / 4]
         cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
         a, b = half.chunk(2, dim=-1)
         parts += [a * cos - b * sin, b * cos + a * sin]
@@ -28,19 +28,19 @@ def rotate(x: Tensor, places: Tensor) -> Tensor:
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
-    """Attention of queries [B, N, C] to keys and values [B, M, C] without places: [B, N, C]."""
+    """Return the attention [B, N, C] of queries [B, N, C] to keys and values [B, M, C], without positions."""
     out = functional.scaled_dot_product_attention(split(q, heads), split(k, heads), split(v, heads))
     return out.transpose(1, 2).flatten(2)
 
 
-def attend_placed(q: Tensor, k: Tensor, v: Tensor, q_places: Tensor, k_places: Tensor, heads: int) -> Tensor:
-    """Attention of [B, N, C] to [B, M, C] with queries and keys turned by their places: [B, N, C]."""
-    q, k = rotate(split(q, heads), q_places), rotate(split(k, heads), k_places)
+def attend_rotary(q: Tensor, k: Tensor, v: Tensor, q_positions: Tensor, k_positions: Tensor, heads: int) -> Tensor:
+    """Return the attention [B, N, C] of [B, N, C] to [B, M, C], with queries and keys turned by their positions."""
+    q, k = rotate(split(q, heads), q_positions), rotate(split(k, heads), k_positions)
     return functional.scaled_dot_product_attention(q, k, split(v, heads)).transpose(1, 2).flatten(2)
 
 
 def split(x: Tensor, heads: int) -> Tensor:
-    """[B, N, C] -> [B, heads, N, C / heads]."""
+    """Return [B, heads, N, C / heads] from [B, N, C]."""
     return x.unflatten(-1, (heads, -1)).transpose(1, 2)
 
 
@@ -52,11 +52,13 @@ class SelfAttention(nn.Module):
         self.heads = heads
         self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
 
-    def forward(self, x: Tensor, places: Tensor | None = None) -> Tensor:
-        """[B, N, C] -> [B, N, C]; `places` [N, 2] turn queries and keys."""
+    def forward(self, x: Tensor, positions: Tensor | None = None) -> Tensor:
+        """Return [B, N, C] from [B, N, C]; `positions` [N, 2] turn queries and keys."""
         q, k, v = self.qkv(x).chunk(3, dim=-1)
         heads = self.heads
-        out: Tensor = attend(q, k, v, heads) if places is None else attend_placed(q, k, v, places, places, heads)
+        out: Tensor = (
+            attend(q, k, v, heads) if positions is None else attend_rotary(q, k, v, positions, positions, heads)
+        )
         out = self.proj(out)
         return out
 
@@ -69,7 +71,7 @@ class Mlp(nn.Module):
         self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., C] -> [..., C]."""
+        """Return [..., C] from [..., C]."""
         out: Tensor = self.fc2(functional.gelu(self.fc1(x)))
         return out
 
@@ -82,15 +84,15 @@ class Block(nn.Module):
         self.norm1, self.attn = nn.LayerNorm(width, eps=eps), SelfAttention(width, heads)
         self.norm2, self.mlp = nn.LayerNorm(width, eps=eps), Mlp(width)
 
-    def forward(self, x: Tensor, places: Tensor | None = None) -> Tensor:
-        """[B, N, C] -> [B, N, C]."""
-        x = x + self.attn(self.norm1(x), places)
+    def forward(self, x: Tensor, positions: Tensor | None = None) -> Tensor:
+        """Return [B, N, C] from [B, N, C]."""
+        x = x + self.attn(self.norm1(x), positions)
         out: Tensor = x + self.mlp(self.norm2(x))
         return out
 
 
 def initialize(blocks: nn.ModuleList) -> None:
-    """Xavier weights; what is added to the residual stream starts smaller, by the root of the number of additions."""
+    """Set Xavier weights; layers that add to the residual stream are smaller by the root of the number of additions."""
     for module in blocks.modules():
         if isinstance(module, nn.Linear):
             nn.init.xavier_uniform_(module.weight)
@@ -102,5 +104,5 @@ def initialize(blocks: nn.ModuleList) -> None:
 
 
 def grid(rows: int, columns: int, device: torch.device) -> Tensor:
-    """Places [rows * columns, 2] of patches (row, column), row by row."""
+    """Return the positions [rows * columns, 2] of patches (row, column), row by row."""
     return torch.cartesian_prod(torch.arange(rows, device=device), torch.arange(columns, device=device))

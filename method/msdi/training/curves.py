@@ -1,4 +1,4 @@
-"""How a training went: rows of a CSV file, and plots of them."""
+"""The course of a training: rows of a CSV file, and plots of them."""
 
 from __future__ import annotations
 

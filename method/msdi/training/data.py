@@ -1,9 +1,9 @@
-"""What MSDI learns from: batches of windows of spikes with their images, points and cameras, drawn from bursts.
+"""Training batches of MSDI: windows of spikes with their images, points and cameras, drawn from bursts.
 
-Everything that can vary without another rendering is drawn anew at every use: which views, in which order (the first
-one's frame is that of the points), the sensors' noise, phases and maps, the brightness, the direction of time, and
-whether the world is seen in a mirror. All of it is exact: an integrator's spikes played backwards are those of one that
-saw the light backwards, and a mirrored rig is a rig.
+Everything that can vary without another rendering is random at every use: the views and their order (the first one's
+frame is that of the points), the sensors' noise, phases and maps, the brightness, the direction of time, and whether
+the world is mirrored. All of it is exact: an integrator's spikes played backwards are those of one that saw the light
+backwards, and a mirrored rig is a rig.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Batch:
     """B samples of V views, T ticks, H x W pixels."""
 
     spikes: NDArray[np.uint8]  # [B, V, T, H, W] of 0 and 1
-    rate: Float32  # [B, V, H, W] truth: spikes per tick at the start of the middle tick, at most the 1 that can be told
-    points: Float32  # [B, V, H, W, 3] what the pixel's centre sees, in view 0's frame, metres; NaN where it is nothing
-    moving: NDArray[np.bool_]  # [B, V, H, W] where something moves, or its shadow, or near it
+    rate: Float32  # [B, V, H, W] truth: spikes per tick at the start of the middle tick, at most 1
+    points: Float32  # [B, V, H, W, 3] what the pixel's centre sees, in view 0's frame, metres; NaN if nothing
+    moving: NDArray[np.bool_]  # [B, V, H, W] pixels of moving objects, of their shadows, and near them
     sensitivity: Float32  # [B, V, H, W] of the pixels, mean 1: n(x, y)
     dark: Float32  # [B, V, H, W] spikes per tick in the dark
     intrinsics: Float32  # [B, V, 3, 3]
@@ -56,11 +56,11 @@ class Bursts:
             group += [(f, number) for number in range(len(f))]
 
     def __len__(self) -> int:
-        """Number of bursts."""
+        """Return the number of bursts."""
         return sum(map(len, self._groups.values()))
 
     def draw(self, samples: int, views: int, ticks: int, rng: np.random.Generator) -> Batch:
-        """A batch of randomly chosen and varied bursts, all of one image size."""
+        """Return a batch of randomly chosen and varied bursts, all of one image size."""
         groups = list(self._groups.values())
         shares = np.array([len(g) for g in groups]) / len(self)
         group = groups[int(rng.choice(len(groups), p=shares))]
@@ -72,9 +72,9 @@ class Bursts:
         return _stacked(drawn)
 
     def fixed(self, most: int, views: int, ticks: int) -> list[Batch]:
-        """At most `most` bursts, evenly chosen over the files, one a batch, as they are: the first `views` of each.
+        """Return at most `most` bursts, evenly chosen over the files, one a batch, with the first `views` of each.
 
-        The same for the same files; only the sensors' noise and phases are drawn, from each burst's number.
+        The same files give the same batches; the sensors' noise and phases are seeded by each burst's number.
         """
         every = [pair for group in self._groups.values() for pair in group]
         picked = np.unique(np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int))
@@ -86,7 +86,7 @@ class Bursts:
         return found
 
     def _sample(self, burst: Burst, file: BurstFile, ticks: int, rng: np.random.Generator) -> Batch:
-        """A batch of one sample without the first axis."""
+        """Return a batch of one sample without the first axis."""
         rates = burst.keys * np.float32(self.gain)
         pixels = Pixels(rates, burst.gain, burst.dark, file.facts.photons_per_spike)
         relative = burst.w2c @ np.linalg.inv(burst.w2c[0])
@@ -110,14 +110,14 @@ def check_ticks(ticks: int) -> None:
 
 
 def chosen(burst: Burst, views: NDArray[np.int64]) -> Burst:
-    """Some views of a burst, in this order."""
+    """Return some views of a burst, in this order."""
     b = burst
     images = b.keys[:, views], b.depth[views], b.moving[views]
     return Burst(*images, w2c=b.w2c[views], K=b.K[views], gain=b.gain[views], dark=b.dark[views])
 
 
 def varied(burst: Burst, rng: np.random.Generator) -> Burst:
-    """A burst with other sensors and another brightness, perhaps backwards in time, perhaps in a mirror."""
+    """Return a burst with random sensors and brightness, at random backwards in time, at random mirrored."""
     brightness = np.float32(np.exp(rng.uniform(np.log(_DIMMEST), np.log(_BRIGHTEST))))
     backwards, mirror = rng.random(2) < 0.5
     keys = burst.keys[::-1] if backwards else burst.keys
@@ -128,7 +128,7 @@ def varied(burst: Burst, rng: np.random.Generator) -> Burst:
 
 
 def mirrored(burst: Burst) -> Burst:
-    """What the mirrored rig sees of the mirrored world."""
+    """Return the burst of the mirrored rig in the mirrored world."""
     width = burst.depth.shape[-1]
     K = burst.K.copy()
     K[:, 0, 2] = width - K[:, 0, 2]
@@ -137,7 +137,7 @@ def mirrored(burst: Burst) -> Burst:
 
 
 def points_of(depth: Float32, K: Float64, w2c: Float64) -> Float32:
-    """Points [V, H, W, 3] that pixel centres see, in the world's frame, from depths [V, H, W]; NaN where it is inf."""
+    """Return the world points [V, H, W, 3] that pixel centres see, from depths [V, H, W]; inf gives NaN."""
     _, height, width = depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     pixels = np.stack([u, v, np.ones_like(u)], axis=-1)  # [H, W, 3]

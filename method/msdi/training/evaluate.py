@@ -1,4 +1,4 @@
-"""How good MSDI is on data that it was not trained on: images, points, confidence and poses, each against the truth.
+"""Scores of MSDI on data that it was not trained on: images, points, confidence and poses, against the truth.
 
 Names and units of `Scores.measured`:
 
@@ -7,7 +7,7 @@ Names and units of `Scores.measured`:
 - `point_error`, `point_error_median`: |X / z - Xgt / zgt| of all pixels that see something, z the mean distance of a
   sample's points; so 0.1 is a tenth of the scene's size. `point_error_confident`: of the half that is most certain.
 - `confidence_rank`: Spearman's correlation of the expected error, alpha / C, with the true one; 1 is a perfect order.
-  (Of all C, alpha / C = error makes the loss C error - alpha log C smallest: this is what C says.)
+  (The loss C error - alpha log C is smallest at alpha / C = error, so this is the error that C predicts.)
 - `calibration`: mean |ln(true / expected error)| over ten groups of equal size by expected error; 0 is calibrated.
 - `rotation_deg`, `direction_deg`: medians over all views but the first; a view without a pose counts as 180 degrees.
 - `rra_5`, `rta_5`: shares of those views within 5 degrees. `posed`: share that has a pose at all.
@@ -35,24 +35,24 @@ from spike4dgs.method.msdi.training.data import Batch
 from spike4dgs.method.msdi.training.losses import ALPHA, normalized
 
 GROUPS = 10
-_POINTS = 10_000  # of a sample that are looked at
+_POINTS = 10_000  # pixels of a sample that are compared
 _CLOSE_DEG = 5.0
 _SMALLEST = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """What was measured."""
+    """Scores of a network."""
 
     measured: dict[str, float]  # see the module
     calibration: Float64 | None  # [GROUPS, 2] mean expected and mean true error, by rising expected error
 
 
 def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
-    """Scores of the network on batches; intrinsics and sensors are known."""
+    """Return the scores of the network on batches; intrinsics and sensors are known."""
     was_training = network.training
     network.eval()
-    pictures, points, poses = [], [], []
+    images, points, poses = [], [], []
     with torch.inference_mode():
         for batch in batches:
             spikes, intrinsics, sensitivity, dark = (
@@ -60,7 +60,7 @@ def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
             )
             found = network(spikes, intrinsics, Sensors(sensitivity, dark))
             raw = network.images(spikes.flatten(0, 1)).unflatten(0, spikes.shape[:2])
-            pictures += _images(found.images, raw, batch)
+            images += _images(found.images, raw, batch)
             points.append(_point_errors(found, batch))
             poses += _pose_errors(found, batch)
     network.train(was_training)
@@ -68,7 +68,7 @@ def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
     groups = calibrate(expected, true)
     rotation, direction = np.array(poses).T
     measured = {
-        **_means(pictures),
+        **_means(images),
         "point_error": float(true.mean()),
         "point_error_median": float(np.median(true)),
         "point_error_confident": float(true[expected <= np.median(expected)].mean()),
@@ -84,19 +84,19 @@ def evaluate(network: Msdi, batches: Iterable[Batch], device: str) -> Scores:
 
 
 def calibrate(expected: Float64, true: Float64) -> Float64:
-    """Mean expected and true errors [GROUPS, 2] of groups of equal size, by rising expected error [N]."""
+    """Return the mean expected and true errors [GROUPS, 2] of groups of equal size, by rising expected error [N]."""
     order = np.argsort(expected, kind="stable")
     parts = np.array_split(order, GROUPS)
     return np.array([[max(float(x[part].mean()), _SMALLEST) for x in (expected, true)] for part in parts])
 
 
 def tfp(spikes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Spikes per tick [...] of windows [..., T, H, W], T odd: the mean of the T - 1 ticks around the instant."""
+    """Return spikes per tick of windows [..., T, H, W], T odd: the mean of the T - 1 ticks around the instant."""
     return np.asarray(spikes[..., :-1, :, :].mean(axis=-3), np.float32)
 
 
 def _images(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float]]:
-    """Scores of each view."""
+    """Return the scores of each view."""
     mean = tfp(batch.spikes)
     flat = (mean - batch.dark) / batch.sensitivity
     made = {"": images.cpu().numpy(), "raw_": raw.cpu().numpy(), "tfp_": mean, "tfp_flat_": flat}
@@ -114,13 +114,13 @@ def _images(images: Tensor, raw: Tensor, batch: Batch) -> list[dict[str, float]]
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each name over the rows that have it."""
+    """Return the mean of each name over the rows that have it."""
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
 
 
 def _point_errors(found: Estimate, batch: Batch) -> Float64:
-    """Expected and true errors [N, 2] of pixels that see something, evenly chosen."""
+    """Return the expected and true errors [N, 2] of pixels that see something, evenly chosen."""
     truth = torch.from_numpy(batch.points)
     counted = truth.isfinite().all(dim=-1)
     off = normalized(found.points.cpu(), counted) - normalized(truth.nan_to_num(1.0), counted)
@@ -130,7 +130,7 @@ def _point_errors(found: Estimate, batch: Batch) -> Float64:
 
 
 def _pose_errors(found: Estimate, batch: Batch) -> list[tuple[float, float]]:
-    """Errors of rotation and of the direction to the camera in degrees, of all views but each sample's first."""
+    """Return the errors in degrees, of rotation and of direction to the camera, of all but each sample's first view."""
     errors = []
     for views, truth in zip(poses_of(found, batch.intrinsics.astype(np.float64)), batch.w2c, strict=True):
         for view, true in zip(views[1:], truth[1:], strict=True):
@@ -145,7 +145,7 @@ def _pose_errors(found: Estimate, batch: Batch) -> list[tuple[float, float]]:
 
 
 def _rank_correlation(a: Float64, b: Float64) -> float:
-    """Spearman's; 0 where one of them is constant."""
+    """Return Spearman's correlation; 0 if one of them is constant."""
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return 0.0
     return float(spearmanr(a, b).statistic)

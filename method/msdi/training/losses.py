@@ -1,4 +1,4 @@
-"""What MSDI is trained with: L1 on images, and DUSt3R's confidence-weighted regression of points."""
+"""Losses of MSDI's training: L1 on images, and DUSt3R's confidence-weighted regression of points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SMALLEST = 1e-8  # of a mean distance
 
 
 def image_loss(images: Tensor, truth: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Mean |image - truth| over the pixels that count: all, or those of `valid` (bool); 0 where there is none.
+    """Return the mean |image - truth| over the pixels that count: all, or those of `valid` (bool); 0 if there is none.
 
     `images` and `truth` have the same shape, in spikes per tick. Pixels whose truth is not finite never count.
     """
@@ -21,12 +21,12 @@ def image_loss(images: Tensor, truth: Tensor, valid: Tensor | None = None) -> Te
 
 
 def point_loss(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor) -> Tensor:
-    """DUSt3R's loss (eqs. 3 and 4 there) over V views: mean of C |X / z - Xgt / zgt| - alpha log C.
+    """Return DUSt3R's loss (eqs. 3 and 4 there) over V views: the mean of C |X / z - Xgt / zgt| - alpha log C.
 
     `points` and `truth` [B, V, H, W, 3] are in view 0's frame; `confidence` C > 1 and `valid` (bool) are [B, V, H, W].
     z and zgt are the mean distances of a sample's valid points to the origin, over all its views together: each
     network output may have a scale of its own, and the views of a sample share one. The mean is over the valid pixels
-    of the batch; 0 where there is none. Points whose truth is not finite never count.
+    of the batch; 0 if there is none. Points whose truth is not finite never count.
     """
     counted = valid & truth.isfinite().all(dim=-1)
     seen = truth.where(counted[..., None], torch.ones((), dtype=truth.dtype, device=truth.device))
@@ -35,7 +35,7 @@ def point_loss(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor)
 
 
 def normalized(points: Tensor, counted: Tensor) -> Tensor:
-    """Points [B, V, H, W, 3] over the mean distance to the origin of those of their sample that count [B, V, H, W]."""
+    """Return points [B, V, H, W, 3] over their sample's mean distance to the origin of the `counted` [B, V, H, W]."""
     distance = torch.linalg.vector_norm(points, dim=-1).where(counted, 0.0)
     mean = distance.sum(dim=(1, 2, 3)) / counted.sum(dim=(1, 2, 3)).clamp(min=1)
     return points / mean.clamp(min=_SMALLEST)[:, None, None, None, None]

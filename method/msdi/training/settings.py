@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from spike4dgs.method.gaussians.optimizer import WarmCosine
 
-PUBLISHED: dict[str, float] = {"rate": 1e-4}  # all that the publication says of its training, besides the losses
+PUBLISHED: dict[str, float] = {"lr_points": 1e-4}  # the publication states no more of its training than the losses
 
 
 @dataclass(frozen=True)
@@ -16,14 +16,14 @@ class TrainingSettings:
     steps: int = 20_000
     views: int = 8  # of a step: samples times views of a sample
     most_views: int = 8  # of a sample; at least two
-    rate: float = PUBLISHED["rate"]  # Adam's, after the warm-up; it falls to nothing with the cosine
-    image_rate: float = 1e-3  # the same of extractor and generator, which are small
+    lr_points: float = PUBLISHED["lr_points"]  # Adam's, after the warm-up; it falls to 0 with the cosine
+    lr_images: float = 1e-3  # the same of extractor and generator, which are small
     warm_up: int = 500  # steps
-    unknown_share: float = 0.2  # of the steps do not tell the intrinsics
-    raw_share: float = 0.2  # of the steps do not tell the sensors
+    unknown_share: float = 0.2  # of the steps, without intrinsics
+    raw_share: float = 0.2  # of the steps, without sensors
     score_every: int = 1000  # steps
 
-    def rates(self, step: int) -> dict[str, float]:
-        """Adam's learning rates of the two groups at a step."""
-        peaks = {"images": self.image_rate, "points": self.rate}
+    def learning_rates(self, step: int) -> dict[str, float]:
+        """Return Adam's learning rates of the two groups at a step."""
+        peaks = {"images": self.lr_images, "points": self.lr_points}
         return {name: WarmCosine(peak, self.warm_up, self.steps).at(step) for name, peak in peaks.items()}

@@ -1,11 +1,11 @@
 """Train MSDI on training bursts: `train-msdi`.
 
-Loss: L1 of the images in radiance, which teaches extractor and generator, and DUSt3R's confidence-weighted regression
-of points (`losses`), which teaches everything behind them. Each step has a
-fixed number of views: few samples of many views, or many of few.
+Loss: L1 of the images in radiance, which trains extractor and generator, and DUSt3R's confidence-weighted regression of
+points (`losses`), which trains everything behind them. Each step has a fixed number of views: few samples of many
+views, or many of few.
 
-Everything random is drawn from (seed, step): on one machine, with the same data, a killed run goes on from its
-checkpoint as if it had never stopped.
+All randomness comes from (seed, step): on one machine, with the same data, a killed run continues from its checkpoint
+with the bits of a run that never stopped.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _SCORED_BURSTS = 36  # of the hidden ones
 
 @dataclass(frozen=True)
 class StepLosses:
-    """Of one step."""
+    """Losses of one step."""
 
     total: float
     image_l1: float  # radiance
@@ -64,21 +64,21 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = Msdi(config).to(device).train()
-        pictures: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
-        own = {id(p) for p in pictures}
+        images: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
+        own = {id(p) for p in images}
         points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
-        self.adam = make_adam({"images": pictures, "points": points}, (0.9, 0.999))
+        self.adam = make_adam({"images": images, "points": points}, (0.9, 0.999))
         self.step = 0
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step, a function of the seed and the step."""
+        """Return the batch of a step, a function of the seed and the step."""
         rng = np.random.default_rng([self.seed, step])
         views = int(rng.integers(2, min(self.settings.most_views, self.data.views) + 1))
         return self.data.draw(max(1, self.settings.views // views), views, self.network.config.ticks, rng)
 
     def train_step(self) -> StepLosses:
-        """One step."""
+        """Train for one step and return its losses."""
         batch = self._take(self.step)
         spikes, rate, points, intrinsics, sensitivity, dark = (
             torch.from_numpy(a).to(self.device, non_blocking=True)
@@ -93,29 +93,29 @@ class Training:
             found = self.network(spikes, intrinsics if known else None, sensors)
         image_l1 = image_loss(found.images, rate) / batch.gain
         of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
-        total = image_l1 + of_points  # their parameters are not the same ones: there is nothing to weigh
+        total = image_l1 + of_points  # they share no parameters: there is nothing to weigh
         self.adam.zero_grad(set_to_none=True)
         total.backward()
-        rates, norms = self.settings.rates(self.step), []
+        learning_rates, norms = self.settings.learning_rates(self.step), []
         for group in self.adam.param_groups:
-            group["lr"] = rates[group["name"]]
+            group["lr"] = learning_rates[group["name"]]
             norms.append(torch.nn.utils.clip_grad_norm_(group["params"], 1.0))
-        if all(norm.isfinite() for norm in norms):  # else it is left out: one bad sample must not undo the network
+        if all(norm.isfinite() for norm in norms):  # else the step is skipped: one bad sample must not ruin the network
             self.adam.step()
         self.step += 1
         return StepLosses(total.item(), image_l1.item(), of_points.item())
 
     def save(self, path: Path, key: str) -> None:
-        """Write everything needed to go on."""
+        """Write everything needed to continue."""
         save_training(path, self.step, self.network, self.adam, key)
 
     def resume(self, path: Path, key: str) -> None:
-        """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
+        """Continue from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
         self.step = resume_training(path, self.network, self.adam, key) or self.step
 
 
 def _ahead(make: Callable[[int], Batch], steps: int) -> Callable[[int], Batch]:
-    """`make` for rising steps, with the next batches made by other threads while the caller works on one."""
+    """Return `make` for rising steps; other threads make the next batches while the caller uses one."""
     pool = ThreadPoolExecutor(_PREPARERS)
     waiting: dict[int, Future[Batch]] = {}
 
@@ -136,26 +136,26 @@ def train_msdi(
     start: Path | None = None,
     steps: int = 20_000,
     views: int = 8,
-    rate: float = PUBLISHED["rate"],
+    rate: float = PUBLISHED["lr_points"],
     device: str = "auto",
     seed: int = 0,
 ) -> int:
-    """Train MSDI on what `make-msdi-data` rendered. A killed run goes on where it was with the same command.
+    """Train MSDI on bursts of `make-msdi-data`. The same command continues a killed run where it stopped.
 
     OUT/msdi-CONFIG.safetensors can be used at any time: set SPIKE4DGS_MSDI to its path. OUT/losses.csv, scores.csv and
-    curves.png show the course, calibration.png what the confidence is worth, README.md is the model card. Shards that
-    were added to DATA since the last start are used from the next start on.
+    curves.png show the course, calibration.png how well the confidence is calibrated, README.md is the model card.
+    Shards added to DATA are used from the next start on.
 
     Args:
         data: Folder of shards; those of the hidden variants are only scored.
-        out: Folder for everything that is written.
+        out: Folder for all output.
         config: small, or paper (a GPU's work).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
         steps: Steps.
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
-        rate: Adam's learning rate after the warm-up, of what makes points.
+        rate: Adam's learning rate, after the warm-up, of the layers that make points.
         device: auto, cpu or cuda.
-        seed: Seed of the first weights and of all that is drawn.
+        seed: Seed of the first weights and of all random choices.
     """
     if config not in CONFIGS:
         raise problem("--config", f"one of {', '.join(CONFIGS)}", repr(config), "correct the name")
@@ -169,19 +169,27 @@ def train_msdi(
         raise problem(data, expected, ", ".join(wrong), "remove them: they are kept for tests")
     if not learned:
         raise problem(data, "shards to train on", "hidden variants only", "make more with `spike4dgs make-msdi-data`")
-    settings = TrainingSettings(steps=steps, views=views, rate=rate, warm_up=min(500, max(1, steps // 10)))
+    settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     training = Training(Bursts(learned), CONFIGS[config], settings, choose_device(device), seed)
     if start:
         start_from(training.network, start)
-    key = sha256_json([asdict(settings), config, seed, sha256_file(start) if start else None])
+    key = checkpoint_key(settings, config, seed, sha256_file(start) if start else None)
     size = sum(p.numel() for p in training.network.parameters())
     print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
     _Run(training, hidden, key, out).run()
     return 0
 
 
+def checkpoint_key(settings: TrainingSettings, config: str, seed: int, start_sha256: str | None) -> str:
+    """Return the hash that ties a checkpoint to its training."""
+    # Checkpoints of earlier versions have the learning rates under these names.
+    names = {"lr_points": "rate", "lr_images": "image_rate"}
+    facts = {names.get(name, name): value for name, value in asdict(settings).items()}
+    return sha256_json([facts, config, seed, start_sha256])
+
+
 def start_from(network: Msdi, path: Path) -> None:
-    """Take the weights of an earlier training, or what a file of Fast3R or DUSt3R has, in place.
+    """Take the weights of an earlier training, or those of a file of Fast3R or DUSt3R, in place.
 
     Raises UserError for a damaged file and for the weights of something else.
     """
@@ -207,7 +215,7 @@ class _Run:
 
     @property
     def checkpoint(self) -> Path:
-        """The file to go on from."""
+        """The file to continue from."""
         return self.out / "checkpoint.safetensors"
 
     def run(self) -> None:
@@ -258,7 +266,7 @@ class _Run:
 
 
 def _note_data(path: Path, files: list[BurstFile], *, fresh: bool) -> tuple[str, ...]:
-    """What is trained on, as ID@SHA256, with what earlier starts of the same training had; kept in a file."""
+    """Return the training data as ID@SHA256, with those of earlier starts of the same training; keep them in a file."""
     names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files}
     if path.is_file() and not fresh:
         names |= set(read_json(path, "what was trained on")["shards"])

@@ -19,10 +19,16 @@ from spike4dgs.method.msdi.training.curves import Curve
 from spike4dgs.method.msdi.training.data import Batch, Bursts
 from spike4dgs.method.msdi.training.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.training.losses import ALPHA
-from spike4dgs.method.msdi.training.train import Training, TrainingSettings, start_from, train_msdi
+from spike4dgs.method.msdi.training.train import (
+    Training,
+    TrainingSettings,
+    checkpoint_key,
+    start_from,
+    train_msdi,
+)
 from spike4dgs.method.msdi.weights import load_network, read_card
 
-FAST = TrainingSettings(steps=150, views=4, most_views=3, rate=4e-3, warm_up=10)
+FAST = TrainingSettings(steps=150, views=4, most_views=3, lr_points=4e-3, warm_up=10)
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +80,12 @@ def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(data: Burst
     same_weights(whole, second)
     with pytest.raises(UserError, match="another fit's"):
         second.resume(tmp_path / "c.safetensors", "another key")
+
+
+def test_checkpoints_of_earlier_versions_are_resumed() -> None:
+    """The key is that of the version whose settings had other names."""
+    key = checkpoint_key(TrainingSettings(), "small", 0, None)
+    assert key == "8d12cfd8bc72a85ee8cf98c88de92056ffe5b97400ac9f79191fd92c1ce9d67d"
 
 
 def test_batches_have_a_steady_number_of_views(data: Bursts) -> None:
