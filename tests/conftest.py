@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,3 +13,14 @@ from small_scenes import write_small_scene
 @pytest.fixture
 def small_scene(tmp_path: Path) -> Path:
     return write_small_scene(tmp_path / "scene")
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with car-0-tiny, rendered by Mitsuba in one process of its own, and its report with the audit."""
+    out = tmp_path_factory.mktemp("tiny") / "data"
+    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), "--audit"]
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
