@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import posixpath
 import re
@@ -23,6 +24,7 @@ PAGES = {  # files outside docs/ that have a page on the site
 _TEXT_ONLY = "    options: {members: false, show_root_heading: false, show_root_toc_entry: false}\n"
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
+_NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
 _MODULES = re.compile(r"^<!-- modules of (\w+) -->$", re.MULTILINE)
 
 
@@ -43,8 +45,9 @@ def on_config(config: Any, **kwargs: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand `<!-- modules of ROOM -->` and `<!-- include FILE [SECTION] -->`."""
+    """Expand `<!-- include FILE [SECTION] -->`, `<!-- names of ROOM -->` and `<!-- modules of ROOM -->`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
+    markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
     return _MODULES.sub(lambda found: module_list(found[1]), markdown)
 
 
@@ -72,6 +75,32 @@ def included(name: str, section: str | None, page: str) -> str:
     return _LINK.sub(moved, text)
 
 
+def name_table(room: str) -> str:
+    """Return a table of the names that a room exports: each with a link and the first line of its docstring."""
+    rows = ["| name | |", "|---|---|"]
+    for module, names in _exports(room):
+        path = ROOT / room / module.replace(".", "/")
+        source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
+        documented = {
+            node.name: (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
+            for node in ast.parse(source).body
+            if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        }
+        for name in names:
+            text, target = documented.get(name), f"spike4dgs.{room}.{module}"
+            link = f"[{target}.{name}]" if text else f"(#{target})" if path.is_dir() else f"[{target}]"
+            rows.append(f"| [`{name}`]{link} | {text or f'defined in `{target}`'} |")
+    return "\n".join(rows)
+
+
+def _exports(room: str) -> list[tuple[str, tuple[str, ...]]]:
+    """Return (module, names) as the room's `__init__` passes them to `lazy_names`."""
+    for node in ast.walk(ast.parse((ROOT / room / "__init__.py").read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "lazy_names":
+            return list(ast.literal_eval(node.args[1]).items())
+    return []
+
+
 def module_list(room: str) -> str:
     """Return the mkdocstrings blocks of all public modules of a room, folder by folder."""
     blocks = []
@@ -79,7 +108,7 @@ def module_list(room: str) -> str:
         folders[:] = sorted(name for name in folders if name != "__pycache__" and _has_source(Path(folder) / name))
         package = ".".join(["spike4dgs", *Path(folder).relative_to(ROOT).parts])
         if package.count(".") > 1:
-            blocks.append(f"## `{package}`\n\n::: {package}\n{_TEXT_ONLY}")
+            blocks.append(f"## `{package}` {{ #{package} }}\n\n::: {package}\n{_TEXT_ONLY}")
         for name in sorted(files):
             module = name.removesuffix(".py")
             if name.endswith(".py") and not module.startswith("__"):

@@ -3,11 +3,15 @@
 import ast
 import re
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from spike4dgs.benchmark.cli import COMMANDS, SPEED
+from spike4dgs.benchmark.method import FitRequest, check_protocol
+from spike4dgs.benchmark.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -125,3 +129,16 @@ def test_the_citation_is_complete() -> None:
     paper = citation["preferred-citation"]
     assert {"type", "title", "authors", "year"} <= paper.keys()
     assert all({"family-names", "given-names"} <= author.keys() for author in paper["authors"])
+
+
+def test_the_tutorials_method_fits_and_renders(small_scene: Path) -> None:
+    code = next(c for _, c in _FENCE.findall((DOCS / "tutorial.md").read_text()) if c.startswith("# my_methods.py"))
+    names: dict[str, Any] = {}
+    exec(code, names)
+    scene = open_scene(small_scene)
+    (method,) = names["METHODS"].values()
+    check_protocol(method, "the tutorial")
+    camera = scene.cameras[scene.test[0]]
+    image = method.fit(scene.training, FitRequest()).render(camera, 0.0)
+    assert image.shape == (camera.height, camera.width)
+    assert image.dtype == np.float32
