@@ -1,10 +1,12 @@
-"""The import rule of the rooms, enforced from the source: who may import whom."""
+"""The rules of the tree, enforced from the source: who may import whom, between the rooms and inside each of them."""
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -17,13 +19,37 @@ MAY_IMPORT = {
     "baselines": {"benchmark", "method"},
     "leaderboard": {"benchmark"},
 }
+# The modules and folders of each room, low to high: each imports only those before it.
+ORDER = {
+    "benchmark": "errors lazy files locks schemas environment weights spikes scene metrics method results reports runs "
+    "cli speed",
+    "generators": "profiles sensor worlds rig conventional events recorder rendering bursts streams tasks ground_truth "
+    "audit reports scene_maker make_dataset",
+    "method": "torch_state settings model_files splat speed observations gaussians motion supervision checkpoint msdi "
+    "initialization images pose_refinement trainer_settings saved_names fitted_model schedule trainer fit tracking "
+    "radiance_field saved_model viewing",
+    "baselines": "spike_to_image nearest_view initialization held_out_pose recipes pose_report inspect "
+    "export_nerfstudio speed",
+    "leaderboard": "entry rank verify submit_command",
+}
+MOST_MODULES = 13  # in a folder; `__init__` does not count
+MOST_LINES = 300  # in a module
 # The command line's table of import strings is the one place that names all rooms.
 COMPOSITION_ROOT = "benchmark/cli.py"
 SOURCES = sorted(path for room in MAY_IMPORT for path in (ROOT / room).rglob("*.py"))
+FOLDERS = sorted({path.parent for path in SOURCES})
 
 
-def imported(source: str, package: str) -> Iterator[tuple[int, str]]:
-    """(line, module) of every import at any depth, and of every string that names one of our modules."""
+def name_of(path: Path) -> str:
+    """Return a module's dotted name without the distribution's, such as "method.splat.cpu"; a folder's for __init__."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = {name_of(path): path for path in SOURCES}
+
+
+def imported(source: str, package: str, strings: bool = True) -> Iterator[tuple[int, str]]:
+    """Yield (line, module) of every import at any depth, and with `strings` of every string that names our modules."""
     tree = ast.parse(source)
     docstrings = {
         id(node.body[0].value)
@@ -40,13 +66,13 @@ def imported(source: str, package: str) -> Iterator[tuple[int, str]]:
             base = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
             module = ".".join(filter(None, (base, node.module)))
             yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+        elif strings and isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             if re.fullmatch(r"spike4dgs(\.\w+)+(:\w+)?", node.value):
                 yield node.lineno, node.value
 
 
 def violations(source: str, package: str) -> list[tuple[int, str]]:
-    """Imports that the room of `package` may not make."""
+    """Return the imports that the room of `package` may not make."""
     room = package.split(".")[1]
     allowed = MAY_IMPORT[room] | {room}
     ours = [
@@ -94,6 +120,100 @@ def test_the_command_line_itself_imports_only_its_own_room() -> None:
 )
 def test_the_check_itself_sees_what_it_should(source: str, package: str, caught: bool) -> None:
     assert bool(violations(source, package)) == caught
+
+
+def imports_of(module: str) -> set[str]:
+    """Return our modules that a module imports, by their names in MODULES. Strings do not count here."""
+    path = MODULES[module]
+    package = ".".join(("spike4dgs", *path.relative_to(ROOT).parts[:-1]))
+    statements = imported(path.read_text(encoding="utf-8"), package, strings=False)
+    ours = [name.removeprefix("spike4dgs.").split(".") for _, name in statements if name.startswith("spike4dgs.")]
+    prefixes = ([".".join(parts[:n]) for n in range(len(parts), 0, -1)] for parts in ours)
+    return {next(name for name in longest_first if name in MODULES) for longest_first in prefixes}
+
+
+def arrows(folder: str, imports: Mapping[str, Iterable[str]]) -> dict[tuple[str, str], str]:
+    """Return the arrows between the children of a folder: (importing, imported) -> the modules, for the message."""
+    found = {}
+    for module, targets in imports.items():
+        for target in targets:
+            if module.startswith(f"{folder}.") and target.startswith(f"{folder}."):
+                a, b = (name.removeprefix(f"{folder}.").partition(".")[0] for name in (module, target))
+                if a != b:
+                    found[a, b] = f"{module} imports {target}"
+    return found
+
+
+def circle(found: Mapping[tuple[str, str], str]) -> list[str]:
+    """Return the imports along a circle of arrows, or an empty list."""
+    sorter: TopologicalSorter[str] = TopologicalSorter()
+    for a, b in found:
+        sorter.add(a, b)
+    try:
+        sorter.prepare()
+    except CycleError as e:  # in the order imported, importing
+        return [found[b, a] for a, b in zip(e.args[1], e.args[1][1:], strict=False)]
+    return []
+
+
+def upward(found: Mapping[tuple[str, str], str], order: Sequence[str]) -> list[str]:
+    """Return the imports that go from a lower child to a higher one."""
+    return [text for (a, b), text in found.items() if order.index(a) < order.index(b)]
+
+
+EVERY_IMPORT = {module: imports_of(module) for module in MODULES}
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_what_a_folder_holds_imports_without_a_circle(folder: Path) -> None:
+    name = name_of(folder / "__init__.py")
+    assert not circle(arrows(name, EVERY_IMPORT))
+    inside = [m for m in MODULES if m.startswith(f"{name}.")]
+    assert not [m for m in inside if name in EVERY_IMPORT[m]], "a module imports the folder that holds it"
+
+
+@pytest.mark.parametrize("room", ORDER)
+def test_inside_a_room_arrows_go_down(room: str) -> None:
+    order = ORDER[room].split()
+    children = {m.split(".")[1] for m in MODULES if m.startswith(f"{room}.")}
+    assert sorted(order) == sorted(children), "ORDER lists every module and folder of the room"
+    assert not upward(arrows(room, EVERY_IMPORT), order)
+
+
+def test_the_arrows_themselves_are_seen() -> None:
+    imports = {"r.a": ["r.b.x"], "r.b.x": ["r.b.y"], "r.b.y": ["r.c"], "r.c": []}
+    assert set(arrows("r", imports)) == {("a", "b"), ("b", "c")}
+    assert set(arrows("r.b", imports)) == {("x", "y")}
+    assert not circle(arrows("r", imports)) and not upward(arrows("r", imports), ("c", "b", "a"))
+    assert upward(arrows("r", imports), ("b", "c", "a")) == ["r.b.y imports r.c"]
+    found = circle(arrows("r", imports | {"r.c": ["r.a"]}))
+    assert sorted(found) == ["r.a imports r.b.x", "r.b.y imports r.c", "r.c imports r.a"]
+    assert "benchmark.errors" in EVERY_IMPORT["benchmark.files"]
+    assert "method.splat" not in EVERY_IMPORT["baselines.recipes"], "a name resolves to the module that it is in"
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_a_folder_is_small_and_is_part_of_the_distribution(folder: Path) -> None:
+    assert sum(path.stem != "__init__" for path in folder.glob("*.py")) <= MOST_MODULES
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    assert ".".join(("spike4dgs", *folder.relative_to(ROOT).parts)) in packages
+    assert (folder / "__init__.py").is_file()
+
+
+def test_the_distribution_lists_no_folder_that_is_gone() -> None:
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    assert sorted(packages) == sorted(".".join(("spike4dgs", *f.relative_to(ROOT).parts)) for f in FOLDERS)
+
+
+def test_no_module_is_too_long() -> None:
+    lengths = {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in MODULES.items()}
+    assert not {name: n for name, n in lengths.items() if n > MOST_LINES}
+
+
+def test_tests_mirror_the_tree() -> None:
+    tests = ROOT / "tests"
+    folders = {path.parent.relative_to(tests) for path in tests.rglob("test_*.py")} - {Path()}
+    assert not [folder.as_posix() for folder in folders if ROOT / folder not in FOLDERS]
 
 
 def test_every_folder_with_source_is_a_known_room() -> None:
