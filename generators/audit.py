@@ -1,8 +1,8 @@
-"""`make-dataset --audit`: how far the radiance that the sensors saw is from what a full rendering says.
+"""`make-dataset --audit`: the error of the radiance that the sensors received, against full renderings.
 
-At random ticks, mostly between keys, some views are rendered whole by Mitsuba's own loop with four times the samples of
-a key and compared with the interpolated radiance of that instant; and some ground-truth frames with renderings of four
-times their samples. The reference has noise too, which is counted as error.
+At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with four times the samples of
+a key; they are compared with the interpolated radiance of that instant. Some ground-truth frames are compared with
+renderings of four times their samples. The noise of the reference counts as error too.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from spike4dgs.generators.rendering.render import MultiViewRenderer
 from spike4dgs.generators.tasks import cameras_of, held_out_view, world_of
 
 _TICKS, _VIEWS, _FRAMES = 4, 3, 3
-_MORE = 4  # times the samples
+_MORE = 4  # times the samples of a key or of ground truth
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker
 
 
 def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, Any]:
-    """The report: errors at random ticks ("ticks") and of ground truth ("ground_truth"), one by one and in total.
+    """Return the report: errors at random ticks ("ticks") and of ground truth ("ground_truth"), each and in total.
 
     Errors: PSNR (dB, range 1, clipped like the scores), mean and 99.9th percentile of the relative error in percent,
-    mean absolute error; over the whole image and where something moves or is lit differently.
+    mean absolute error; over the whole image, and over the pixels with motion or changing light.
     """
     rng = np.random.default_rng([job.seed, 7])
     ticks = sorted(int(t) for t in rng.choice(job.n_ticks, min(_TICKS, job.n_ticks), replace=False))
@@ -63,7 +63,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
 
 
 def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArray[np.bool_]) -> dict[str, float]:
-    """Errors of one image [H, W] against the truth; `moving` [H, W] is where `*_moving` look."""
+    """Return the errors of one image [H, W] against the truth; those named `*_moving` are over `moving` [H, W]."""
     found: dict[str, float] = {}
     for suffix, where in (("", np.ones(moving.shape, bool)), ("_moving", moving)):
         if not where.any():
@@ -81,6 +81,6 @@ def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArr
 
 
 def _total(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Means over the rows."""
+    """Return the means over the rows."""
     keys = [k for k in rows[0] if isinstance(rows[0][k], float)]
     return {k: round(float(np.mean([r[k] for r in rows if k in r])), 5) for k in keys}

@@ -1,8 +1,8 @@
-"""A conventional camera before the same scene: 60 frames a second, each the mean radiance over its exposure: real blur.
+"""A conventional 60 fps camera of the same scene: each frame is the mean radiance over its exposure (real blur).
 
-The mean is exact for the simulator's curve between keys (see `sensor`) up to its clamp: the curve's integral over whole
-key intervals is their trapezoid plus (m1 - m2) n / 12, and an exposure that begins or ends inside an interval takes the
-ticks' own means.
+The mean is exact for the simulator's curve between keys (see `sensor.model`) up to its clamp: the curve's integral over
+whole key intervals is their trapezoid plus (m1 - m2) n / 12, and an exposure that begins or ends inside an interval
+uses the mean radiance of each tick.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def exposures(
 ) -> Iterator[tuple[int, Float32]]:
     """Yield (tick at which the exposure begins, mean radiance [H, W]) of each frame whose exposure fits into the clip.
 
-    `keys` are read in ascending order, and every exposure's keys once. A clip shorter than one exposure has none.
+    `keys` are read in ascending order, each exposure's keys once. A clip shorter than one exposure has no frame.
     """
     length = round(EXPOSURE_S * rate_hz)
     frame = 0
@@ -32,7 +32,7 @@ def exposures(
 
 
 def _mean(keys: Sequence[Float32], key_ticks: Sequence[int], start: int, end: int) -> Float32:
-    """Mean radiance of ticks start .. end - 1."""
+    """Return the mean radiance of ticks start .. end - 1."""
     ticks = np.asarray(key_ticks)
     k = int(np.searchsorted(ticks, start, side="right")) - 1
     last = len(ticks) - 1
@@ -51,7 +51,7 @@ def _mean(keys: Sequence[Float32], key_ticks: Sequence[int], start: int, end: in
 
 
 def _integral(p1: np.ndarray, p2: np.ndarray, m1: np.ndarray, m2: np.ndarray, u: float) -> np.ndarray:
-    """Of the cubic through p1 and p2 with tangents m1 and m2, from 0 to u."""
+    """Return the integral of the cubic through p1 and p2 with tangents m1 and m2, from 0 to u."""
     d = p2 - p1
     a2, a3 = 3 * d - 2 * m1 - m2, m1 + m2 - 2 * d
     return np.asarray(u * (p1 + u * (m1 / 2 + u * (a2 / 3 + u * a3 / 4))))

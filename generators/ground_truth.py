@@ -19,7 +19,7 @@ _MASK_CHANGE = 0.1  # relative change of radiance that counts as moving light
 
 
 def mask_file(scene: Path, target: Target) -> Path:
-    """The moving region of a target: the file that `write_truth` writes last."""
+    """Return the path of a target's moving region: the file that `write_truth` writes last."""
     return scene / f"masks/{target.name}.png"
 
 
@@ -27,10 +27,10 @@ def write_truth(
     scene: Path,
     target: Target,
     truth: Truth,
-    still: NDArray[np.float32],
+    background: NDArray[np.float32],
     light_range: Callable[[], tuple[NDArray[np.float32], NDArray[np.float32]]],
 ) -> None:
-    """Write image, geometry and mask of one target. `still` [H, W] is the gray background of its camera.
+    """Write image, geometry and mask of one target. `background` [H, W] is the gray background of its camera.
 
     `light_range` returns the smallest and largest radiance [H, W] of each pixel over the clip.
     """
@@ -39,18 +39,21 @@ def write_truth(
     write_geometry(scene / f"geometry/{target.name}.exr", truth.depth, truth.ids, truth.flow, t_us)
     low, high = light_range()
     varies = high - low > _MASK_CHANGE * high
-    write_mask(mask_file(scene, target), moving_region(truth.mask, gray(truth.rgb), still, varies))
+    write_mask(mask_file(scene, target), moving_region(truth.mask, gray(truth.rgb), background, varies))
 
 
 def moving_region(
-    object_mask: NDArray[np.bool_], image: NDArray[np.float32], still: NDArray[np.float32], varies: NDArray[np.bool_]
+    object_mask: NDArray[np.bool_],
+    image: NDArray[np.float32],
+    background: NDArray[np.float32],
+    varies: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """The moving region [H, W] of a ground-truth image: where the `*_dynamic` metrics look.
+    """Return the moving region [H, W] of a ground-truth image, over which the `*_dynamic` metrics are computed.
 
-    Pixels that see a moving thing, grown by 2 px, and pixels whose light it changes: its shadow, or its light on other
-    things, where the radiance differs by more than 10 % from the background `still` and also `varies` that much over
-    the clip (the shadow of a disc that turns in place does not). Specks under 2 px are dropped.
+    It has two parts. The first is the moving objects' pixels, grown by 2 px. The second is the pixels whose light the
+    objects change by shadow or reflection: their radiance differs from `background` by more than 10 % and also `varies`
+    as much over the clip (the shadow of a disc that turns about its axis does not). Specks under 2 px are dropped.
     """
-    lit = (np.abs(image - still) > _MASK_CHANGE * still) & varies
+    lit = (np.abs(image - background) > _MASK_CHANGE * background) & varies
     grown = binary_dilation(object_mask, np.ones((3, 3)), iterations=_MASK_GROW_PX)
     return np.asarray(grown | binary_opening(lit, np.ones((2, 2))))

@@ -46,29 +46,28 @@ def make_dataset(
 ) -> int:
     """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
 
-    A killed run goes on where it was when the same command is given again. A scene that is there already is checked
-    and kept. OUT/ID.report.json tells what the stages took. Equal arguments give equal bytes, with any number of
-    workers.
+    Give the same command again to resume a killed run. Existing scenes are checked and kept. OUT/ID.report.json lists
+    the time of each stage. Equal arguments give equal bytes, with any number of workers.
 
     Args:
         worlds: Names of worlds, such as car turntable.
         all: Make all worlds.
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
         out: Folder in which the scene folders appear.
-        seed: Seed of everything random: the world's details, the rendering, the sensors.
+        seed: Seed of all random numbers: the world's details, the rendering, the sensors.
         variant: Variant of the world; 0 is the public benchmark.
         seconds: Length of the clip if not the profile's, in whole milliseconds.
         gain_map: Give every pixel its own sensitivity.
         dark_map: Give every pixel its own dark rate.
-        shot_noise: Let photons arrive at random.
-        adaptive_keys: Render a pixel as often as its motion asks; else every pixel that changes at every tick (slow).
+        shot_noise: Simulate the random arrival of photons.
+        adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
         sub_ticks: Render instants inside a tick where the motion in one tick is too large.
         whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
         workers: Processes that render.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
         device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
         audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
-        replace: Make scenes again that are there with other settings or damaged.
+        replace: Make damaged scenes, and scenes with other settings, again.
     """
     from rich.console import Console
 
@@ -99,7 +98,7 @@ def make_dataset(
             note = "; pass --replace to make and audit it again" if audit else ""
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     if todo:
-        pick_variant()  # if it cannot render, say so before anything is written
+        pick_variant()  # fails here, before anything is written, if it cannot render
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
@@ -146,9 +145,9 @@ def _names() -> str:
 
 
 def _is_done(job: Job, out: Path, replace: bool) -> bool:
-    """Whether the scene is there, whole, with these settings.
+    """Return whether the scene exists, complete and with these settings.
 
-    Raises UserError where something else has its name, and, unless `replace`, for a damaged scene or other settings.
+    Raises UserError where another folder has its name, and, unless `replace`, for a damaged scene or other settings.
     """
     from spike4dgs.benchmark.files import read_json
     from spike4dgs.benchmark.scene.manifest import read_manifest
@@ -159,7 +158,7 @@ def _is_done(job: Job, out: Path, replace: bool) -> bool:
         return False
     meta = read_json(folder / "scene.json", "a scene") if (folder / "scene.json").is_file() else {}
     if meta.get("schema") != SCHEMA or meta.get("id") != job.id:
-        raise problem(folder, f"scene {job.id} or nothing", "something else", "move it away or choose another --out")
+        raise problem(folder, f"scene {job.id} or nothing", "other files", "move them away or choose another --out")
     if replace:
         return False
     source = meta.get("source", {})
@@ -174,7 +173,7 @@ def _is_done(job: Job, out: Path, replace: bool) -> bool:
 
 @contextmanager
 def _stages(console: Any, title: str) -> Iterator[Any]:
-    """Show stages with their remaining time: bars on a terminal, now and then a line elsewhere."""
+    """Show stages with their remaining time: bars on a terminal, a line from time to time elsewhere."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as Left
 

@@ -1,4 +1,4 @@
-"""How large a scene is and how carefully it is rendered: one table, and what one scene is asked for."""
+"""Sizes and sampling of scenes: the table of profiles, and the settings of one scene."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Profile:
     width: int
     height: int
     seconds: float
-    spp: int  # of key frames, inside the region that changes
+    spp: int  # of key frames, in the pixels that change
     background_spp: int
-    target_spp: int  # of ground truth, inside the region that changes
-    max_key_px: float  # that a point of the image may move between two of its keys
+    target_spp: int  # of ground truth, in the pixels that change
+    max_key_px: float  # largest motion of an image point between two of its keys
     sparse_every: int  # ticks between the ground-truth frames of the cameras that are not held out
 
 
@@ -35,7 +35,7 @@ PROFILES: dict[str, Profile] = {
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to make."""
+    """Settings of one scene to make."""
 
     world: str
     variant: int
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def id(self) -> str:
-        """Such as `car-0-small`; a length that is not the profile's is added: `car-0-paper-500ms`."""
+        """Id such as `car-0-small`; with a length that is not the profile's, such as `car-0-paper-500ms`."""
         usual = self.seconds == self.profile.seconds
         return f"{self.world}-{self.variant}-{self.profile_name}" + ("" if usual else f"-{self.seconds * 1000:g}ms")
 
@@ -63,7 +63,7 @@ class Job:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that decides about the bytes of the scene, except the versions of the programs."""
+        """All settings that determine the bytes of the scene, except the versions of the programs."""
         profile = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self.profile).items()}
         return {
             "kind": "mitsuba",
@@ -88,5 +88,5 @@ class Job:
 
     @property
     def sparse_ticks(self) -> range:
-        """Those of them at which all other cameras have ground truth too."""
+        """Ticks among `target_ticks` at which all other cameras have ground truth too."""
         return range(self.profile.sparse_every, self.target_ticks.stop, self.profile.sparse_every)

@@ -14,7 +14,7 @@ HELD_OUT_VIEW = 4
 
 
 def cameras(scene: WorldScene, width: int, height: int, views: Sequence[int] = tuple(range(9))) -> tuple[Camera, ...]:
-    """Cameras `cam_00` .. `cam_08` of the array (or the `views` of it), in the order asked for.
+    """Return cameras `cam_00` .. `cam_08` of the array, or only `views` of it, in the given order.
 
     The focal length scales with `width`, so the field of view is the same at every resolution.
     Raises UserError for a view outside 0..8 or an empty image.

@@ -1,9 +1,9 @@
-"""From a world to a whole scene folder, in stages that each resume: key frames, ground truth, streams, description.
+"""Making a whole scene folder from a world, in stages that each resume: key frames, ground truth, streams, description.
 
-Work in progress lives in OUT/.work/ID/ (key frames, and the growing scene in scene/) and is one rename away from
-OUT/ID/, so a scene folder is whole or absent. Every file of a stage is written atomically and is a function of the
-settings alone; a resumed scene therefore equals an uninterrupted one byte for byte. Nothing that varies between runs,
-such as a time of day or a duration, enters the scene.
+Work in progress is in OUT/.work/ID/ (key frames, and the growing scene in scene/). A single rename moves it to OUT/ID/,
+so a scene folder is complete or absent. Every file of a stage is written atomically and is a function of the settings
+alone, so a resumed scene equals an uninterrupted one byte for byte. Values that differ between runs, such as a time of
+day or a duration, do not enter the scene.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import streams, tasks
 from spike4dgs.generators.audit import audit
@@ -39,10 +40,9 @@ from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
-from spike4dgs.generators.rendering.render import Still
+from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.reports.contact_sheet import contact_sheet
 from spike4dgs.generators.reports.preview import preview
-from spike4dgs.generators.sensor.model import Sensor
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 LICENCE = "CC0-1.0"
@@ -66,13 +66,13 @@ class Maker:
     run: Run = here
     with_audit: bool = False
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of each stage in this process
-    audit: dict[str, Any] | None = None  # what the audit found
+    audit: dict[str, Any] | None = None  # the report of `audit`
 
     def make(self) -> Path:
-        """Make or resume the scene, then move it to OUT/ID, over a scene that may be there. Returns OUT/ID."""
+        """Make or resume the scene, then move it to OUT/ID, replacing an existing scene. Return OUT/ID."""
         with _alone(self._work.with_name(f"{self.job.id}.lock")):
             self._open_work()
-            self._timed("background", self._render_stills)
+            self._timed("background", self._render_static)
             self._timed("key frames", self._render_keys)
             self._timed("ground truth", self._render_targets)
             self._timed("streams", self._simulate)
@@ -86,7 +86,7 @@ class Maker:
         work()
         self.seconds[stage] = round(time.perf_counter() - start, 2)
 
-    # ------------------------------------------------------------ what everything follows from
+    # ------------------------------------------------------------ inputs of all stages
 
     @cached_property
     def world(self) -> WorldScene:
@@ -100,7 +100,7 @@ class Maker:
 
     @cached_property
     def plan(self) -> KeyPlan:
-        """At which ticks which pixels are rendered."""
+        """The ticks at which each pixel is rendered."""
         return tasks.plan_of(self.job)
 
     @property
@@ -118,7 +118,7 @@ class Maker:
 
     @cached_property
     def targets(self) -> tuple[Target, ...]:
-        """Every image of ground truth: each millisecond at the held-out camera, now and then at the others."""
+        """All ground-truth images: each millisecond at the held-out camera, sparse ticks at the others."""
         held_out = tasks.held_out_view(self.job)
         dense, sparse = self.job.target_ticks, self.job.sparse_ticks
         return tuple(Target(c.id, t) for v, c in enumerate(self.cameras) for t in (dense if v == held_out else sparse))
@@ -159,14 +159,14 @@ class Maker:
             + len(self.targets) * pixels * _BYTES_PER_TRUTH_PIXEL
         )
 
-    def _render_stills(self) -> None:
+    def _render_static(self) -> None:
         path = self._work / "targets.npz"  # written last
-        if self.store.has_still and path.is_file():
+        if self.store.has_static and path.is_file():
             return
         for _ in self.watch("background", range(1), 1):
-            (stills,) = self.run(tasks.RenderStills(self.job), [None])
-            self.store.set_still(stills.still)
-            write_arrays(path, {"first": stills.target_first, "points": stills.points})
+            (static,) = self.run(tasks.RenderStatic(self.job), [None])
+            self.store.set_static(static.views)
+            write_arrays(path, {"first": static.target_first, "points": static.points})
 
     def _render_keys(self) -> None:
         missing = self.store.missing(self.plan)
@@ -174,7 +174,7 @@ class Maker:
             return
 
         def keys() -> Iterator[int]:
-            for chunk in self.run(tasks.RenderKeys(self.job, self.store.still()), chunked(missing)):
+            for chunk in self.run(tasks.RenderKeys(self.job, self.store.static()), chunked(missing)):
                 for tick, arrays in chunk:
                     self.store.put(tick, arrays)
                     yield tick
@@ -186,12 +186,12 @@ class Maker:
         missing = {t for t in self.targets if not mask_file(self._scene, t).is_file()}
         if not missing:
             return
-        still = Still(self.store.still().background, read_arrays(self._work / "targets.npz", "first")["first"])
+        static = StaticViews(self.store.static().background, read_arrays(self._work / "targets.npz", "first")["first"])
         light_range = lru_cache(maxsize=None)(lambda view: self.store.range(view, self.plan))
 
         def truths() -> Iterator[Target]:
             ticks = chunked(sorted({t.tick for t in missing}), 2)
-            for chunk in self.run(tasks.RenderTargets(self.job, still), ticks):
+            for chunk in self.run(tasks.RenderTargets(self.job, static), ticks):
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
                     if target in missing:
@@ -207,7 +207,7 @@ class Maker:
             streams.write_camera(self._scene, self.job, self.cameras[view], self.store, view, self.plan)
 
     def _describe(self) -> None:
-        for part in self._scene.rglob(".*.part*"):  # what a killed process left behind
+        for part in self._scene.rglob(".*.part*"):  # left behind by a killed process
             part.unlink()
         job, held_out = self.job, self.cameras[tasks.held_out_view(self.job)].id
         splits = standard_splits(self.cameras, held_out)
@@ -224,7 +224,7 @@ class Maker:
                 splits=splits,
                 rate_hz=float(RATE_HZ),
                 n_ticks=job.n_ticks,
-                radiance_gain=Sensor().radiance_gain,
+                radiance_gain=SENSOR.radiance_gain,
                 targets=tuple(t for t in self.targets if t.camera in scored),
                 sensor=streams.sensor_facts(job),
                 source={
@@ -234,7 +234,7 @@ class Maker:
                     "versions": self._versions,
                 },
                 points=self._points,
-                extras=streams.extras(job) | {"instances": self._things},
+                extras=streams.extras(job) | {"instances": self._object_names},
             ),
         )
         clip, scene = self.store.instants(tasks.held_out_view(job), self.plan), open_scene(self._scene)
@@ -261,9 +261,9 @@ class Maker:
         return read_arrays(self._work / "targets.npz", "points")["points"]
 
     @property
-    def _things(self) -> dict[str, str]:
-        """Names of the moving things by their number in the geometry files."""
-        return {str(k): name for k, name in enumerate(self.world.thing_names, start=1)}
+    def _object_names(self) -> dict[str, str]:
+        """Names of the moving objects by their number in the geometry files."""
+        return {str(k): name for k, name in enumerate(self.world.object_names, start=1)}
 
 
 @contextmanager

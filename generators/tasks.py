@@ -1,8 +1,8 @@
-"""The rendering of a scene in units that any process can do: each is a function of a few arguments, and returns arrays.
+"""The rendering of a scene in units for any process: each is a function of a few arguments and returns arrays.
 
-A task object travels to its worker once and is then called for one chunk of ticks after another; what it has loaded
-(the world, Mitsuba's scene) stays with it there. Nothing is read from or written to disk, so that a worker on another
-machine needs no common file system.
+A task object is sent to its worker once and is then called for one chunk of ticks after another; it keeps what it has
+loaded (the world, Mitsuba's scene) between calls. It neither reads nor writes files, so a worker on another machine
+needs no common file system.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
-from spike4dgs.generators.rendering.render import MultiViewRenderer, Still
+from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
 from spike4dgs.generators.rig import HELD_OUT_VIEW, cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
@@ -27,32 +27,32 @@ _POINTS_PER_VIEW = 250  # of the sparse model
 
 @lru_cache(maxsize=1)
 def world_of(job: Job) -> WorldScene:
-    """The world as a job builds it."""
+    """Return the world as a job builds it."""
     return WORLDS[job.world].build(job.seed, job.variant, job.seconds)
 
 
 @lru_cache(maxsize=1)
 def cameras_of(job: Job) -> tuple[Camera, ...]:
-    """The cameras of a job's profile."""
+    """Return the cameras of a job's profile."""
     p = job.profile
     return cameras(world_of(job), p.width, p.height, p.views)
 
 
 @lru_cache(maxsize=1)
 def plan_of(job: Job) -> KeyPlan:
-    """At which ticks a job renders which pixels."""
+    """Return the plan of a job: which pixels are rendered at which ticks."""
     motion = {"adaptive": job.adaptive, "sub_ticks": job.sub_ticks}
     return key_plan(world_of(job), cameras_of(job), job.n_ticks, RATE_HZ, job.profile.max_key_px, **motion)
 
 
 def held_out_view(job: Job) -> int:
-    """Index of the held-out camera among the job's."""
+    """Return the index of the held-out camera among the job's."""
     return job.profile.views.index(HELD_OUT_VIEW)
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Its fields travel; what it has cached stays behind."""
+    """A task: its fields are sent to the worker, its cached values are not."""
 
     job: Job
 
@@ -63,33 +63,33 @@ class _Task:
         self.__dict__.update(state)
 
 
-class Stills(NamedTuple):
-    """What is rendered once for a scene."""
+class StaticParts(NamedTuple):
+    """Images and points that are rendered once for a scene."""
 
-    still: Still
-    target_first: NDArray[np.float32]  # [C, H, W, 3], what does not move with the noise of ground truth
-    points: NDArray[np.float64]  # [N, 3] on still surfaces, for the sparse model
+    views: StaticViews
+    target_first: NDArray[np.float32]  # [C, H, W, 3], the static background with the noise of ground truth
+    points: NDArray[np.float64]  # [N, 3] on static surfaces, for the sparse model
 
 
 @dataclass(frozen=True, eq=False)
-class RenderStills(_Task):
-    """Renders what does not move. Called with anything."""
+class RenderStatic(_Task):
+    """Renders the static background; the argument of the call is ignored."""
 
-    def __call__(self, chunk: object) -> Stills:
-        """The result."""
+    def __call__(self, chunk: object) -> StaticParts:
+        """Return the static parts of the scene."""
         p = self.job.profile
         renderer = MultiViewRenderer(
             world_of(self.job), cameras_of(self.job), seed=self.job.seed, spp=p.spp, background_spp=p.background_spp
         )
-        first = _target_renderer(self.job, cameras_of(self.job), None).still_on(renderer.still.background).first
-        return Stills(renderer.still, first, _surface_points(renderer))
+        first = _target_renderer(self.job, cameras_of(self.job), None).static_on(renderer.static.background).first
+        return StaticParts(renderer.static, first, _surface_points(renderer))
 
 
 @dataclass(frozen=True, eq=False)
 class RenderKeys(_Task):
-    """Renders key frames. Called with ticks; returns (tick, what `KeyStore.put` takes) for each."""
+    """Renders key frames. Called with ticks; returns a pair (tick, arrays for `KeyStore.put`) for each."""
 
-    still: Still
+    static: StaticViews
 
     @cached_property
     def _renderer(self) -> MultiViewRenderer:
@@ -100,12 +100,12 @@ class RenderKeys(_Task):
             seed=job.seed,
             spp=p.spp,
             background_spp=p.background_spp,
-            still=self.still,
+            static=self.static,
             whole_frames=job.whole_frames,
         )
 
     def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
-        """The keys of `ticks`."""
+        """Return the keys of `ticks`."""
         return [(tick, self._renderer.key_arrays(tick, plan_of(self.job))) for tick in ticks]
 
 
@@ -115,7 +115,7 @@ class Truth(NamedTuple):
     view: int
     tick: int
     rgb: NDArray[np.float32]  # [H, W, 3]
-    mask: NDArray[np.bool_]  # [H, W] sees a moving thing
+    mask: NDArray[np.bool_]  # [H, W] where a moving object is visible
     depth: NDArray[np.float32]  # [H, W]
     ids: NDArray[np.uint32]  # [H, W]
     flow: NDArray[np.float32]  # [H, W, 2] px within the next millisecond
@@ -125,19 +125,19 @@ class Truth(NamedTuple):
 class RenderTargets(_Task):
     """Renders ground truth. Called with ticks; returns it for the held-out camera, at sparse ticks for all cameras."""
 
-    still: Still  # its first part has the noise of ground truth
+    static: StaticViews  # its first part has the noise of ground truth
 
     @cached_property
     def _every_view(self) -> MultiViewRenderer:
-        return _target_renderer(self.job, cameras_of(self.job), self.still)
+        return _target_renderer(self.job, cameras_of(self.job), self.static)
 
     @cached_property
     def _held_out(self) -> MultiViewRenderer:
         view = held_out_view(self.job)
-        return _target_renderer(self.job, cameras_of(self.job)[view : view + 1], self.still.views([view]))
+        return _target_renderer(self.job, cameras_of(self.job)[view : view + 1], self.static.views([view]))
 
     def __call__(self, ticks: Sequence[int]) -> list[Truth]:
-        """The ground truth of `ticks`."""
+        """Return the ground truth of `ticks`."""
         return [truth for tick in ticks for truth in self._at(tick)]
 
     def _at(self, tick: int) -> list[Truth]:
@@ -148,8 +148,8 @@ class RenderTargets(_Task):
         return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 
-def _target_renderer(job: Job, views: Sequence[Camera], still: Still | None) -> MultiViewRenderer:
-    """Other random numbers than the keys', so that noise in the streams is not noise in the truth."""
+def _target_renderer(job: Job, views: Sequence[Camera], static: StaticViews | None) -> MultiViewRenderer:
+    """Return a renderer with other random numbers than the keys', so that streams and truth do not share noise."""
     p = job.profile
     background_spp = max(p.background_spp, p.target_spp)
     return MultiViewRenderer(
@@ -159,12 +159,12 @@ def _target_renderer(job: Job, views: Sequence[Camera], still: Still | None) -> 
         spp=p.target_spp,
         background_spp=background_spp,
         color=True,
-        still=still,
+        static=static,
     )
 
 
 def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:
-    """Points [N, 3] on still surfaces at t = 0: a coarse grid of every view's pixels, for the sparse model."""
+    """Return points [N, 3] on static surfaces at t = 0, a coarse grid of every view's pixels, for the sparse model."""
     depths, moving = renderer.depths(0.0), renderer.object_masks(0.0)
     found = []
     for camera, depth, mask in zip(renderer.cameras, depths, moving, strict=True):

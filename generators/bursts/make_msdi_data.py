@@ -1,6 +1,6 @@
 """`make-msdi-data`: training bursts of many variants of the worlds, seen by many rigs, at low resolution.
 
-The shards' format is that of `benchmark.bursts`. A shard is a function of its settings alone.
+The format of the shards is in `benchmark.scene.bursts`. A shard is a function of its settings alone.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 DURATION_S = 0.1  # of the clips that the instants are drawn from
 VIEWS = 9
-_NEAREST = 0.35  # of the distance to the target: still surfaces closer than this stand in a camera's way
-_LEAST_SEEN = 0.5  # share of a camera's pixels that must see something
+_NEAREST = 0.35  # of the distance to the target: closer static surfaces block a camera's view
+_LEAST_SEEN = 0.5  # least share of a camera's pixels with a surface
 
 
 @dataclass(frozen=True)
 class MakeBursts:
-    """Renders the shard of a (world, variant); travels to worker processes."""
+    """Renders the shard of a (world, variant); can be sent to worker processes."""
 
     rigs: int
     instants: int  # of each rig
@@ -51,14 +51,14 @@ class MakeBursts:
     seed: int
 
     def facts(self, world: str, variant: int) -> BurstFacts:
-        """What the shard says of itself. A hidden one needs fewer rigs: it is scored, not learned."""
+        """Return the metadata of a shard. A hidden one needs fewer rigs: it is scored, not used for training."""
         rigs = max(1, self.rigs // 2) if variant in HIDDEN_VARIANTS else self.rigs
         size = self.width, self.height
         sampling = VIEWS, rigs, self.instants, self.spp
         return BurstFacts(world, variant, self.seed, *size, *sampling, SENSOR.radiance_gain, SENSOR.photons_per_spike)
 
     def __call__(self, chunk: tuple[str, int]) -> tuple[BurstFacts, Arrays]:
-        """The shard's facts and arrays."""
+        """Return the shard's facts and arrays."""
         from spike4dgs.generators.worlds import WORLDS
 
         name, variant = chunk
@@ -66,15 +66,15 @@ class MakeBursts:
         world = WORLDS[name].build(self.seed, variant, DURATION_S)
         rng = np.random.default_rng([self.seed, variant, *f"{name} bursts".encode()])
         map_seed = int(rng.integers(1 << 31))
-        rigs, stills = [], []
+        rigs, backgrounds = [], []
         for _ in range(facts.rigs):
             renderer = self._renderer(world, rng)
             rigs.append([renderer.burst(tick, map_seed) for tick in _instants(facts.instants, rng)])
-            stills.append((renderer.still, renderer.still_depth))
-        return facts, stack_bursts(rigs, stills)
+            backgrounds.append((renderer.background, renderer.background_depth))
+        return facts, stack_bursts(rigs, backgrounds)
 
     def _renderer(self, world: WorldScene, rng: np.random.Generator) -> BurstRenderer:
-        """A renderer for a rig with a free view; the more tries it takes, the closer to the world's own rig."""
+        """Return a renderer for a rig with a free view; each further attempt is closer to the world's own rig."""
         from spike4dgs.generators.bursts.render import BurstRenderer
         from spike4dgs.generators.bursts.rig_jitter import jittered_cameras
 
@@ -83,15 +83,15 @@ class MakeBursts:
             cameras = jittered_cameras(world, self.width, self.height, rng, amount)
             renderer = BurstRenderer(world, cameras, seed=int(rng.integers(1 << 31)), spp=self.spp)
             away = float(np.linalg.norm(cameras[VIEWS // 2].center - np.array(world.rig.target)))
-            near = np.quantile(renderer.still_depth, 0.02, axis=(1, 2), method="lower")
-            seen = np.isfinite(renderer.still_depth).mean(axis=(1, 2))
+            near = np.quantile(renderer.background_depth, 0.02, axis=(1, 2), method="lower")
+            seen = np.isfinite(renderer.background_depth).mean(axis=(1, 2))
             if amount < 0.1 or (near.min() > _NEAREST * away and seen.min() > _LEAST_SEEN):
                 return renderer
             amount *= 0.8
 
 
 def _instants(count: int, rng: np.random.Generator) -> list[int]:
-    """Ticks, one drawn from each of `count` equal parts of the clip."""
+    """Return ticks, one drawn from each of `count` equal parts of the clip."""
     first, last = REACH, round(DURATION_S * RATE_HZ) - REACH
     edges = np.linspace(first, last, count + 1).astype(int)
     return [int(rng.integers(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
@@ -112,21 +112,21 @@ def make_msdi_data(
     scheduler: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
-    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, those of the three hidden variants included.
+    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
 
-    A shard that is there is kept, so a killed run goes on where it was, and a larger --variants adds to what is there.
-    Equal arguments give equal bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
+    Existing shards are kept: a killed run resumes, and a larger --variants adds shards. Equal arguments give equal
+    bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
 
     Args:
-        worlds: Names of worlds; none is all of them.
+        worlds: Names of worlds; all, if none is named.
         out: Folder for the shards.
         variants: Training variants of each world.
-        rigs: Rigs of nine cameras in each training variant; hidden variants have half of it.
+        rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
         instants: Instants of each rig.
         width: Width of the images in pixels.
         height: Height of the images in pixels.
-        spp: Samples per pixel of what moves, a power of two; what stands still gets twice as many.
-        seed: Seed of everything random.
+        spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.
+        seed: Seed of all random numbers.
         workers: Processes that render; one uses all cores.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
         device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
@@ -147,7 +147,7 @@ def make_msdi_data(
     numbers = [*HIDDEN_VARIANTS, *range(FIRST_TRAINING_VARIANT, FIRST_TRAINING_VARIANT + variants)]
     shards = [(world, variant) for variant in numbers for world in dict.fromkeys(worlds) or WORLDS]
     todo = [shard for shard in shards if not _is_done(out, make.facts(*shard))]
-    print(f"{len(shards)} shards, {len(shards) - len(todo)} of them there", flush=True)
+    print(f"{len(shards)} shards, {len(shards) - len(todo)} of them exist", flush=True)
     with executor(workers, scheduler) as run:
         _write_all(run(make, todo), len(todo), out)
     return 0
@@ -165,7 +165,7 @@ def _write_all(made: Iterator[tuple[BurstFacts, Arrays]], count: int, out: Path)
 
 
 def _is_done(out: Path, facts: BurstFacts) -> bool:
-    """Whether the shard is there. Raises UserError where it was made with other settings."""
+    """Return whether the shard exists. Raises UserError where it was made with other settings."""
     path = burst_path(out, facts.world, facts.variant)
     if not path.is_file():
         return False

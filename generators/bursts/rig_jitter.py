@@ -1,6 +1,6 @@
-"""Rigs that resemble a world's own: another standpoint, another lens, other distances, and cameras a little off place.
+"""Rigs that resemble a world's own: another viewpoint, lens and distances, and cameras slightly out of position.
 
-A network that learns from one rig learns that rig by heart; so the worlds' own rigs are not among what it sees.
+A network that is trained on one rig memorises that rig, so the worlds' own rigs are not in the training data.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _DISTANCE, _SPACING, _FOV = 1.3, 2.0, 1.2  # largest factor; the smallest is its
 _TARGET = 0.06  # sd of the target's shift, in distances
 _TOE_IN = (0.4, 1.0)
 _ROLL_DEG = 6.0
-_SHAKEN = 0.5  # share of the rigs whose cameras are off their places, each for itself
+_SHAKEN = 0.5  # share of the rigs whose cameras are out of position, each independently
 _SHIFT, _TURN_DEG = 0.15, 1.0  # sd of a camera's shift in spacings, and of its turn about each axis
 
 
 def jittered_spec(rig: RigSpec, rng: np.random.Generator, amount: float) -> RigSpec:
-    """A rig drawn around `rig`; `amount` 1 is all of the ranges above, 0 none."""
+    """Return a random rig around `rig`; `amount` scales the ranges above: 1 is all of them, 0 none."""
     target, center = np.array(rig.target), np.array(rig.center)
     arm = center - target
     distance = float(np.linalg.norm(arm))
@@ -54,7 +54,7 @@ def jittered_spec(rig: RigSpec, rng: np.random.Generator, amount: float) -> RigS
 def jittered_cameras(
     world: WorldScene, width: int, height: int, rng: np.random.Generator, amount: float = 1.0
 ) -> tuple[Camera, ...]:
-    """Nine cameras of a rig drawn around the world's own."""
+    """Return nine cameras of a random rig around the world's own."""
     spec = jittered_spec(world.rig, rng, amount)
     roll = np.radians(amount * rng.uniform(-_ROLL_DEG, _ROLL_DEG))
     shaken = amount * float(rng.random() < _SHAKEN)

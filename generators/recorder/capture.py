@@ -1,7 +1,7 @@
-"""Capture: one thread for each camera, reads in flight from before the trigger to the last tick, losses on record.
+"""Capture: one thread for each camera, reads in flight from before the trigger to the last tick, losses recorded.
 
-States: OPEN (devices opened), ARMED (every camera has proven a block), TRIGGERED (recording), DRAIN (the wanted ticks
-are in; what is still on its way is read and dropped), CLOSED.
+States: OPEN (devices opened), ARMED (every camera has delivered a block), TRIGGERED (recording), DRAIN (all ticks have
+arrived; the remaining data are read and dropped), CLOSED.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ __all__ = ["STATES", "CameraClip", "CameraStats", "Clip", "Rate", "Sink", "captu
 
 OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = STATES = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
 
-_LOOK_S = 0.005  # how often this thread looks at the others
-# Counters that one trigger has set differ by what a camera sends before the last one is started; others by anything.
+_POLL_S = 0.005  # interval at which this thread checks the others
+# Counters set by one trigger differ by what a camera sends before the last one is started; others differ by anything.
 _SKEW_S = 0.1
 _SPARE_SLOTS = 8  # each short read takes a whole slot
 
@@ -51,19 +51,19 @@ def capture(
 ) -> Clip:
     """Record `seconds` of every camera of `links` (camera id -> opened link); the links are closed in any case.
 
-    Each camera is rehearsed first: started, it must deliver a block, and is stopped again. Then secondaries are started
-    before the primary, and every camera's first byte begins its first frame. Where a camera cannot be stopped, all go
-    on from the rehearsal, and tick 0 is the first whole frame after TRIGGERED.
+    A rehearsal comes first: each camera is started, must deliver a block, and is stopped again. Then the secondaries
+    are started before the primary, and every camera's first byte begins its first frame. Where a camera cannot be
+    stopped, all cameras continue from the rehearsal, and tick 0 is the first whole frame after TRIGGERED.
 
-    Without `sink` everything stays in memory and `frames` are views of it. With it (continuous mode) whole frames are
-    handed on while the capture runs, and a sink that is too slow costs ticks, which are recorded as gaps.
+    Without `sink` all frames stay in memory and `frames` are views of it. With it (continuous mode) whole frames are
+    passed on during the capture. A sink that is too slow loses ticks, which are recorded as gaps.
 
     A camera that fails after the trigger stops alone, and the rest of its clip is a gap: after a stall, too much data
     (babble), unplugging, `timeout_ms` without data, or, without tags, a short read in the middle of a frame. A short
-    read between frames, or with tags, loses nothing by itself, and is counted.
+    read between frames, or with tags, loses no data by itself, and is counted.
 
-    `stop`, when set, ends the capture early with what there is, as does the first KeyboardInterrupt. Raises UserError
-    where a camera cannot be armed, or where nothing was captured; what the sink raises is passed on.
+    `stop`, when set, ends the capture early and keeps the data so far, as does the first KeyboardInterrupt. Raises
+    UserError where a camera cannot be armed, or where no tick was captured; errors of the sink are passed on.
     """
     run = _Capture(profile, links, round(seconds * profile.fps), sink, on_rate, stop or threading.Event())
     say = on_state or (lambda state: None)
@@ -83,7 +83,7 @@ def capture(
 
 
 class _Capture:
-    """The steps of `capture`, in their order, and what they share."""
+    """The steps of `capture`, in their order, and their shared state."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class _Capture:
         self.sending = self.interrupted = False
 
     def arm(self) -> None:
-        """Every camera delivers a block. Those that can be started anew are stopped again."""
+        """Wait until every camera delivers a block, and stop those that can be restarted."""
         self._start(keep=False)
         while not all(r.proven for r in self.readers.values()) and not self.stop.is_set():
             for camera, reader in self.readers.items():
@@ -115,7 +115,7 @@ class _Capture:
                     self._raise_error(reader)
                     fix = "check its cable, and start and endpoint_in in the rig profile"
                     raise problem(f"camera {camera}", "data after its start sequence", reader.end or "none", fix)
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         if self.stop.is_set():
             raise _nothing()
         if self.restart:
@@ -125,14 +125,14 @@ class _Capture:
                 ring.reset()
 
     def trigger(self) -> None:
-        """From here on everything is kept."""
+        """Keep all data from here on."""
         if self.restart:
             self._start(keep=True)
         for reader in self.readers.values():
             reader.keep.set()
 
     def record(self) -> None:
-        """Wait for all cameras' last bytes; hand frames to the sink meanwhile."""
+        """Wait for the last bytes of all cameras; pass frames to the sink meanwhile."""
         rates = Rates(self.layout, self.readers, self.on_rate)
         try:
             while any(r.alive for r in self.readers.values()) and not self.stop.is_set():
@@ -140,7 +140,7 @@ class _Capture:
                 busy = self.sink is not None and self._write(self.sink)
                 rates.tell()
                 if not busy:
-                    self.stop.wait(_LOOK_S)
+                    self.stop.wait(_POLL_S)
         except KeyboardInterrupt:
             self.stop.set()
         self.interrupted = self.stop.is_set() and any(r.alive for r in self.readers.values())
@@ -157,8 +157,8 @@ class _Capture:
                 link.drain()
 
     def clip(self) -> Clip:
-        """Frames, gaps and statistics of every camera."""
-        # Continuous mode has popped every block; else all of them still wait.
+        """Return frames, gaps and statistics of every camera."""
+        # Continuous mode has popped every block; else all of them still wait in the ring.
         runs = {c: self.cutters[c].cut(ring.blocks()) for c, ring in self.rings.items()}
         n_ticks = self.n_ticks
         if self.interrupted:
@@ -170,7 +170,7 @@ class _Capture:
         return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)
 
     def close(self) -> None:
-        """Whatever happened: no thread reads, no camera sends, no device is held."""
+        """End all reading threads, stop the cameras and release the devices, after success or failure."""
         self._halt()
         self._stop()
         for link in self.links.values():
@@ -207,7 +207,7 @@ class _Capture:
             reader.join()
 
     def _agree(self, last: bool = False) -> None:
-        """Decide, once every camera has a whole frame, where tick 0 is and how many bytes each has to bring."""
+        """Set tick 0 and each camera's number of bytes, once every camera has a whole frame."""
         for reader in self.readers.values():
             self._raise_error(reader)
         if self.cutters:
@@ -227,13 +227,13 @@ class _Capture:
             self.cutters[camera] = Cutter(camera, self.layout, self.rings[camera], origin, first.lead)
 
     def _overdue(self) -> bool:
-        """Whether one camera is so far ahead that another without a frame is left out of the agreement."""
+        """Return whether one camera is so far ahead that the agreement leaves out another without a frame."""
         most = max(_SKEW_S * self.profile.fps * self.layout.frame_bytes, 4 * self.profile.transfer_bytes)
         readers = [r for r in self.readers.values() if r.origin is not None]
         return any(r.ring.position - (r.origin or 0) > most for r in readers)
 
     def _write(self, sink: Sink) -> bool:
-        """Hand one block of each camera to the sink; whether there was any."""
+        """Pass one block of each camera to the sink. Return whether there was any."""
         busy = False
         for camera, cutter in self.cutters.items():
             if (block := self.rings[camera].pop()) is not None:
@@ -279,7 +279,7 @@ def _nothing() -> UserError:
 
 
 def _compile(layout: Layout) -> None:
-    """Have the layout's kernels compiled before a camera sends."""
+    """Compile the layout's kernels before a camera sends."""
     if layout.has_tags():
         frame = layout.pack(np.zeros((1, layout.payload_bytes), np.uint8), 0)
         layout.find(frame[0])
@@ -291,7 +291,7 @@ def _primary(camera: CameraProfile) -> bool:
 
 
 def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
-    """Ring slots: for the whole clip; in continuous mode for `ring_seconds`, and twice the reads in flight at least."""
+    """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
     ticks = profile.ring_seconds * profile.fps if continuous else n_ticks
     if layout.count_tags() and not continuous:
         ticks += _SKEW_S * profile.fps  # frames before the tick that all cameras have

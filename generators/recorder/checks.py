@@ -1,4 +1,4 @@
-"""What is checked before a capture: the cameras on the bus, and room for their data in kernel, memory and on disk."""
+"""Checks before a capture: the cameras on the bus, and room for their data in kernel memory, memory and on disk."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MEMINFO = Path("/proc/meminfo")
 
 SUPER_SPEED = 4  # LIBUSB_SPEED_SUPER; 5 is SuperSpeed+
 _SPEEDS = {1: "Low Speed", 2: "Full Speed", 3: "High Speed (480 Mbit/s)"}
-_SPARE_BYTES = 256 << 20  # for the program itself, the buffers of its files, and what else the machine does
+_SPARE_BYTES = 256 << 20  # for the program itself, the buffers of its files, and other programs
 
 
 def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, usb.core.Device]:
-    """The devices of the profile's cameras, camera id -> device.
+    """Return the devices of the profile's cameras, camera id -> device.
 
     Raises UserError, which names all cameras concerned, where a serial number is absent or twice on the bus, where a
-    link is slower than SuperSpeed, or where the devices cannot be asked.
+    link is slower than SuperSpeed, or where the devices cannot be queried.
     """
     found: dict[tuple[int, int, str], list[usb.core.Device]] = defaultdict(list)
     for vendor, product in sorted({(c.vendor_id, c.product_id) for c in profile.cameras}):
@@ -40,9 +40,9 @@ def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, u
         fix = "check cable and power, or correct the serial in the rig profile"
         raise problem(_names(missing), "a device with this serial number", f"only the serials {others}", fix)
     if twice := [cameras[i] for i, devices in of.items() if len(devices) > 1]:
-        places = ", ".join(_place(d) for c in twice for d in of[c.id])
+        addresses = ", ".join(_bus_address(d) for c in twice for d in of[c.id])
         fix = "give each camera a serial number of its own (the bridge's EEPROM), or unplug one"
-        raise problem(_names(twice), "one device with this serial number", f"several, at {places}", fix)
+        raise problem(_names(twice), "one device with this serial number", f"several, at {addresses}", fix)
     if slow := [cameras[i] for i, devices in of.items() if (devices[0].speed or 0) < SUPER_SPEED]:
         speeds = ", ".join(sorted({_SPEEDS.get(of[c.id][0].speed or 0, "an unknown speed") for c in slow}))
         fix = "use a USB 3 port and cable, without a USB 2 hub in between"
@@ -53,7 +53,7 @@ def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, u
 def check_machine(
     profile: RigProfile, seconds: float, out: Path, *, continuous: bool = False, emulated: bool = False
 ) -> list[UserError]:
-    """What this machine lacks for recording `seconds` into the folder `out`; empty if nothing. Each says its fix.
+    """Return what this machine lacks to record `seconds` into the folder `out`, each as an error that states a fix.
 
     Emulated cameras need no kernel memory for USB.
     """
@@ -65,7 +65,7 @@ def check_machine(
 
 
 def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> UserError | None:
-    """The kernel limits the memory of all reads in flight, by default to 16 MiB; 0 is no limit."""
+    """Check the kernel's limit on the memory of all reads in flight: 16 MiB by default; 0 is no limit."""
     try:
         limit_mb = int(limit_file.read_text())
     except (OSError, ValueError):
@@ -79,7 +79,7 @@ def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> Use
 
 
 def check_memory(profile: RigProfile, seconds: float, continuous: bool, meminfo: Path = MEMINFO) -> UserError | None:
-    """Rings, and for a clip with tags the frames without them, which are made before it is written."""
+    """Check the memory for rings and, for a clip with tags, for the frames without tags, made before it is written."""
     layout = make_layout(profile.layout, profile.width, profile.height)
     kept_s = profile.ring_seconds if continuous else seconds
     tick_bytes = layout.frame_bytes
@@ -100,7 +100,7 @@ def check_memory(profile: RigProfile, seconds: float, continuous: bool, meminfo:
 
 
 def check_disk(profile: RigProfile, seconds: float, out: Path) -> UserError | None:
-    """The packed streams of all cameras, and a little more."""
+    """Check the disk space for the packed streams of all cameras and a margin."""
     layout = make_layout(profile.layout, profile.width, profile.height)
     need = len(profile.cameras) * seconds * profile.fps * layout.payload_bytes + (16 << 20)
     folder = next(p for p in (out, *out.resolve().parents) if p.exists())
@@ -112,7 +112,7 @@ def check_disk(profile: RigProfile, seconds: float, out: Path) -> UserError | No
 
 
 def check_ring(profile: RigProfile) -> UserError | None:
-    """A ring that the reads in flight fill has no place for blocks that wait for the disk."""
+    """Check that the reads in flight do not fill the ring: blocks that wait for the disk need room in it."""
     layout = make_layout(profile.layout, profile.width, profile.height)
     second = profile.fps * layout.frame_bytes
     need_s = 2 * profile.transfers * profile.transfer_bytes / second
@@ -132,14 +132,14 @@ def _devices(vendor: int, product: int, backend: Any | None) -> list[usb.core.De
 
 
 def _serial(device: usb.core.Device) -> str:
-    """The serial number. pyusb raises ValueError where it is not allowed to read the device's strings."""
+    """Return the serial number. pyusb raises ValueError where it may not read the device's strings."""
     try:
         return str(device.serial_number)
     except (usb.core.USBError, ValueError) as e:
-        raise problem(_place(device), "a serial number", str(e), udev_fix(device.idVendor)) from None
+        raise problem(_bus_address(device), "a serial number", str(e), udev_fix(device.idVendor)) from None
 
 
-def _place(device: usb.core.Device) -> str:
+def _bus_address(device: usb.core.Device) -> str:
     return f"bus {device.bus} address {device.address}"
 
 

@@ -1,4 +1,4 @@
-"""What a capture looks like: its states and spike rates while it runs, and a sheet of every camera's image."""
+"""Display of a capture: its states and spike rates while it runs, and a sheet of every camera's image."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Watch:
         self._shown: Live | None = None
 
     def state(self, state: str) -> None:
-        """The capture has reached a state."""
+        """Show that the capture has reached a state."""
         self._state = state
         if self._shown is None:
             self._console.print(state.lower())
@@ -45,12 +45,12 @@ class Watch:
             self._shown.update(self._table(), refresh=True)
 
     def rates(self, rates: Mapping[str, Rate]) -> None:
-        """How the cameras do now."""
+        """Show the cameras' current rates."""
         if not self._live:
             return
         self._rates.update(rates)
         if self._shown is None:
-            # Drawn when there is something new: a thread of its own would take time from the cameras' threads.
+            # Shown when there are new rates: a thread of its own would take time from the cameras' threads.
             self._shown = Live(self._table(), console=self._console, auto_refresh=False)
             self._shown.start()
         self._shown.update(self._table(), refresh=True)
@@ -76,33 +76,33 @@ class Watch:
     ) -> None:
         if self._shown is not None:
             self._shown.stop()
-            if not self._console.is_terminal:  # there the last table is left without an end of line
+            if not self._console.is_terminal:  # there the last table has no end of line
                 self._console.line()
 
 
 def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
     """Write one PNG with an image of every camera: the spikes of `WINDOW_TICKS` ticks near the middle (TFP).
 
-    One scale for all: white is the 99th percentile of all images. Where no such window is without a gap, the place
-    stays empty.
+    One scale for all: white is the 99th percentile of all images. A camera without such a window free of gaps has an
+    empty panel.
     """
     from matplotlib.figure import Figure
 
     streams = dict(sorted(streams.items()))
-    pictures = {camera: middle_image(stream) for camera, stream in streams.items()}
-    seen = [image for _, image in (p for p in pictures.values() if p is not None)]
+    images = {camera: middle_image(stream) for camera, stream in streams.items()}
+    seen = [image for _, image in (p for p in images.values() if p is not None)]
     white = max(float(np.percentile(np.concatenate([i.ravel() for i in seen]), 99)), 1e-6) if seen else 1.0
     first = next(iter(streams.values()))
     side = math.ceil(math.sqrt(len(streams)))
     rows = math.ceil(len(streams) / side)
     figure = Figure(figsize=(12, 12 / side * rows * (first.height / first.width + 0.08) + 0.5), layout="constrained")
     for axes, (camera, stream) in zip(figure.subplots(rows, side, squeeze=False).flat, streams.items(), strict=False):
-        picture = pictures[camera]
+        image = images[camera]
         lost = sum(gap.ticks for gap in stream.gaps)
-        title = f"{camera}, tick {picture[0]}" if picture else f"{camera}: no window without a gap"
+        title = f"{camera}, tick {image[0]}" if image else f"{camera}: no window without a gap"
         axes.set_title(title + (f", {lost} ticks lost" if lost else ""), fontsize=9)
-        if picture is not None:
-            axes.imshow(encode_srgb(picture[1] / np.float32(white)), cmap="gray", vmin=0, vmax=255)
+        if image is not None:
+            axes.imshow(encode_srgb(image[1] / np.float32(white)), cmap="gray", vmin=0, vmax=255)
     for axes in figure.axes:
         axes.axis("off")
     ms = first.n_ticks * 1e3 / first.rate_hz
@@ -112,7 +112,7 @@ def write_sheet(path: Path, streams: Mapping[str, SpikeStream]) -> None:
 
 
 def middle_image(stream: SpikeStream) -> tuple[int, NDArray[np.float32]] | None:
-    """First tick and mean [H, W] of the window without a gap that is nearest the middle; None where there is none."""
+    """Return first tick and mean [H, W] of the window without a gap nearest the middle; None where there is none."""
     length = min(WINDOW_TICKS, stream.n_ticks)
     kept = np.concatenate([[0], np.cumsum(present(stream.gaps, stream.n_ticks))])
     starts = np.nonzero(kept[length:] - kept[:-length] == length)[0]

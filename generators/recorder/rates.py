@@ -1,4 +1,4 @@
-"""What a capture tells while it runs: rates, backlog and losses of each camera."""
+"""Rates, backlog and losses of each camera during a capture."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _FRAMES = 4  # whose spikes are counted
 
 @dataclass(frozen=True)
 class Rate:
-    """One camera's state, a few times a second."""
+    """One camera's state, several times a second."""
 
     bytes_per_s: float
     ticks: int  # received since the trigger
-    spikes_per_tick: float  # mean over the pixels of the newest frames, 0..1; NaN where they are not at hand
+    spikes_per_tick: float  # mean over the pixels of the newest frames, 0..1; NaN where they are not available
     backlog: int  # ring slots that wait
     lost_ticks: int  # for want of a free slot
 
@@ -42,7 +42,7 @@ class Rates:
         self._last = {camera: reader.ring.position for camera, reader in readers.items()}
 
     def tell(self) -> None:
-        """Call `on_rate` if it is time to."""
+        """Call `on_rate` if the interval has passed."""
         now = time.monotonic()
         if self._on_rate is None or now - self._last_s < _EVERY_S:
             return
@@ -62,7 +62,7 @@ class Rates:
 
 
 def spikes_per_tick(layout: Layout, block: Block | None) -> float:
-    """Mean spikes per pixel and tick in a block's first whole frames; NaN where it has none."""
+    """Return the mean spikes per pixel and tick in a block's first whole frames; NaN where it has none."""
     if block is None or block.data is None:
         return math.nan
     size = layout.frame_bytes

@@ -19,7 +19,8 @@ from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
-from spike4dgs.generators.recorder.files.clip_files import ClipRecord, StreamFiles
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles
+from spike4dgs.generators.recorder.files.clip_record import ClipRecord
 from spike4dgs.generators.recorder.frames.clip import Clip, Sink
 from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
@@ -38,7 +39,7 @@ from spike4dgs.generators.recorder.sync import SyncReport, fit_arrival
 from spike4dgs.generators.recorder.usb.transport import Link, open_link
 
 LOST_DATA = 3  # exit code
-_PATIENCE = 3  # presses of Ctrl-C after which even the writing of what was captured is given up
+_PATIENCE = 3  # presses of Ctrl-C that abort even the writing of captured data
 
 
 def record(
@@ -56,19 +57,19 @@ def record(
 ) -> int:
     """Record all cameras of an array at once: OUT is a scene folder, or streams without poses before the calibration.
 
-    Ctrl-C ends the recording and keeps what was captured. The exit code is 3 where a camera lost data: the gaps are in
+    Ctrl-C ends the recording and keeps the captured data. The exit code is 3 where a camera lost data: the gaps are in
     scene.json, and readers refuse the recording unless --allow-gaps.
 
     Args:
-        rig: Rig profile (TOML, see docs/rig_profile.md); may be left out with --emulate.
+        rig: Rig profile (TOML, see docs/rig_profile.md); optional with --emulate.
         out: Folder of the recording; its name is the scene's.
         seconds: Length; 0.5 or, with --emulate, the scene's. With --continuous, the greatest length.
         mode: flat and dark record uniform light and darkness, for a later clip's --flat and --dark.
-        emulate: Record an emulated array that sends this scene's streams, to try everything without hardware.
+        emulate: Record an emulated array that sends this scene's streams, to try all steps without hardware.
         continuous: Write to disk while recording, instead of afterwards from memory.
         preview: Show spike rates while recording, and write OUT/sheet.png.
-        flat: Recording of uniform light that goes into the scene, for `calibrate` and for methods.
-        dark: Recording in the dark that goes with it.
+        flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
+        dark: The corresponding recording in the dark.
         flat_radiance: Radiance of that light, 1 is white.
     """
     source = _source(rig, emulate, mode)
@@ -85,7 +86,7 @@ def record(
         with Watch(profile, live=preview) as watch:
             sink = _sink(files, stop) if continuous else None
             clip = capture(profile, links, length, on_state=watch.state, on_rate=watch.rates, stop=stop, sink=sink)
-        for camera in clip.cameras:  # without frames in continuous mode: the sink has had them
+        for camera in clip.cameras:  # without frames in continuous mode: the sink has received them
             files.write_ticks(camera.camera, camera.ticks, camera.frames)
         clip = clip.without(files.flush(clip.n_ticks))
         failures, direct = files.failures, files.direct
@@ -111,7 +112,7 @@ def _source(rig: Path | None, emulate: Path | None, mode: str) -> Source:
 
 
 def _without_poses(profile: RigProfile) -> RigProfile:
-    """The same cameras; what they record of light and darkness is no scene."""
+    """Return the same cameras without calibration: recordings of uniform light and darkness are not scenes."""
     return replace(profile, cameras=tuple(replace(c, calibration=None) for c in profile.cameras))
 
 
@@ -126,7 +127,7 @@ def _light(profile: RigProfile, flat: Path | None, dark: Path | None, flat_radia
 
 
 def _open(profile: RigProfile, backend: Any | None) -> dict[str, Link]:
-    """All cameras or none."""
+    """Return the opened links of all cameras. Closes them if one cannot be opened."""
     devices = find_cameras(profile, backend)
     links: dict[str, Link] = {}
     try:
@@ -140,7 +141,7 @@ def _open(profile: RigProfile, backend: Any | None) -> dict[str, Link]:
 
 
 def _sink(files: StreamFiles, stop: threading.Event) -> Sink:
-    """Writes while the capture runs, and ends it when no file takes anything any more."""
+    """Return a sink that writes during the capture, and ends it when no file accepts data any more."""
 
     def write(camera: str, first_tick: int, frames: UInt8) -> None:
         files.write(camera, first_tick, frames)
@@ -152,7 +153,7 @@ def _sink(files: StreamFiles, stop: threading.Event) -> Sink:
 
 @contextmanager
 def _interruptible() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, on which a capture ends; writing what it brought goes on, unless the user insists."""
+    """Make Ctrl-C set the event, which ends a capture; captured data are still written, unless the user insists."""
     stop, presses = threading.Event(), 0
 
     def press(number: int, frame: FrameType | None) -> None:
@@ -184,7 +185,7 @@ def _described(clip: Clip, sync: SyncReport, known: Truth) -> ClipRecord:
 
 
 def _write_preview(out: Path) -> None:
-    """The sheet of a recording; a scene's manifest then lists it too."""
+    """Write the sheet of a recording; a scene's manifest then lists it too."""
     write_sheet(out / "sheet.png", open_recording(out, allow_gaps=True).streams)
     if (out / MANIFEST).is_file():
         write_manifest(out)
@@ -207,6 +208,6 @@ def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
         table.add_row(*row, style="red" if c.gaps else None)
     console.print(table)
     if sync.worst_pair:
-        print(f"by their times of arrival {' and '.join(sync.worst_pair)} differ most, {sync.worst_pair_us:.0f} us")
+        print(f"the arrival times of {' and '.join(sync.worst_pair)} differ most, by {sync.worst_pair_us:.0f} us")
     for gap in (gap for c in clip.cameras for gap in c.gaps):
         print(f"gap: {gap.camera} from tick {gap.first_tick}, {gap.ticks} ticks ({gap.reason})")

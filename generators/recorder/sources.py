@@ -1,4 +1,4 @@
-"""What `record` records: a real array behind USB, or an emulated one that shows a scene."""
+"""Sources of `record`: a real array behind USB, or an emulated one that shows a scene."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
-from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8, make_layout, orient
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8, make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.profile.profile import PACKET_BYTES, RigProfile, load_profile
 
 CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")
-SECONDS = 0.5  # that are recorded where nothing else is asked for
+SECONDS = 0.5  # default length of a recording
 _READ_S = 1e-3
 
 _BY_TICK = ("images", "masks", "geometry")  # FOLDER/CAMERA/TICK.*
@@ -27,9 +28,9 @@ _EXTRAS = ("ground_truth", "calibration", "instances")  # of scene.json, which d
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """An array to record. `backend` is pyusb's, None for the system's own; `seconds` is its usual length of a clip.
+    """An array to record. `backend` is pyusb's, None for the system's own; `seconds` is its default length of a clip.
 
-    `scene` is what an emulated array shows, where its cameras are the scene's own: then the truth is known.
+    `scene` is the scene that an emulated array shows, if its cameras are the scene's own: then the truth is known.
     """
 
     profile: RigProfile
@@ -40,24 +41,24 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a recording gets from the scene that it shows, as fields of `ClipRecord`."""
+    """The part of a recording that comes from the scene it shows, as fields of `ClipRecord`."""
 
     targets: tuple[Target, ...] = ()
     extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     files: Mapping[str, Path] = field(default_factory=dict)
 
     def __or__(self, other: Truth) -> Truth:
-        """Both; where both have something, that of `other`."""
+        """Return the union; `other` has precedence."""
         return Truth(self.targets + other.targets, {**self.extras, **other.extras}, {**self.files, **other.files})
 
 
 def real_source(rig: Path) -> Source:
-    """The array of a profile."""
+    """Return the array of a profile."""
     return Source(load_profile(rig))
 
 
 def emulated_source(path: Path, rig: Path | None, mode: str) -> Source:
-    """An emulated array that sends a scene's streams at their rate; for `FLAT` and `DARK` its calibration recordings.
+    """Return an emulated array that sends a scene's streams at their rate, or its recordings for `FLAT` and `DARK`.
 
     Its cameras are those of the profile `rig`, or made from the scene. Raises UserError where the scene cannot be read,
     has no such recordings, or does not go with the profile.
@@ -71,17 +72,17 @@ def emulated_source(path: Path, rig: Path | None, mode: str) -> Source:
 
 
 def _scene_profile(scene: Scene) -> RigProfile:
-    """Reads of about a millisecond, as 256 KiB are of 400x250, so that small scenes are not one read as a whole."""
+    """Return a profile whose reads take about a millisecond, as 256 KiB of 400x250 do, also for small scenes."""
     size = make_layout(PLAIN, int(scene.meta["width"]), int(scene.meta["height"])).frame_bytes
     packets = math.ceil(size * scene.rate_hz * _READ_S / PACKET_BYTES)
     return scene_profile(scene, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
 
 
 def truth(scene: Scene | None, n_ticks: int) -> Truth:
-    """Ground truth and calibration recordings of the scene for its first `n_ticks` ticks; nothing without a scene."""
+    """Return ground truth and calibration recordings of a scene for its first `n_ticks` ticks; none without a scene."""
     if scene is None:
         return Truth()
-    # A split may hold out cameras, and so have targets, that the default one has not.
+    # A split may hold out cameras, and so have targets, that the default split does not have.
     targets = [t for split in scene.meta["splits"] for t in open_scene(scene.root, split=split).targets]
     names = [n for n in scene.manifest.files if _belongs(n, n_ticks)]
     return Truth(
@@ -108,10 +109,10 @@ def _calibration_streams(scene: Scene, mode: str) -> dict[str, UInt8]:
 
 
 def calibration_truth(flat: Path, dark: Path, flat_radiance: float, profile: RigProfile) -> Truth:
-    """Recordings of uniform light and of darkness, as a scene of this array holds them.
+    """Return recordings of uniform light and of darkness, as a scene of this array holds them.
 
-    Raises UserError where they are not whole recordings of all its cameras, or the profile has no poses: what is then
-    recorded is no scene.
+    Raises UserError where they are not whole recordings of all its cameras, or where the profile has no poses, so that
+    the recording is not a scene.
     """
     if not profile.calibrated:
         fix = "run `spike4dgs calibrate-rig` first, or leave out --flat and --dark"

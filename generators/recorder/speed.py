@@ -1,4 +1,4 @@
-"""`speed record`: paced emulated cameras into memory and to disk, with queued reads beside reads one at a time."""
+"""`speed record`: paced emulated cameras into memory and to disk, with queued reads beside single reads."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ DISK_COLUMNS = (
     "fsync, ms", "disk alone, MB/s", "cores busy", "of it emulator",
 )  # fmt: skip
 
-_TIMES = 3.0  # a clip is so many times longer than what the buffers hold, or says nothing of the disk
-_GROWTH = 0.02  # of what is sent: a backlog that grows by less is steady, as far as a few seconds can tell
+_TIMES = 3.0  # least length of a clip, in times that the buffers hold: a shorter one does not measure the disk
+_GROWTH = 0.02  # of the data rate: a backlog that grows by less is steady, within the accuracy of a few seconds
 
 
 def record(argv: Sequence[str] = ()) -> int:
     """Measure how many emulated cameras this machine records, into memory and to disk, and how it reads them.
 
-    Each camera sends 400x250 at 20 kHz by the clock, 250 MB/s, through pyusb and the code that reads real ones; the
-    emulator's own copying runs on the same processor, and the bus costs nothing. A camera that no read waits for keeps
-    what fits into its memory and loses the rest, as real ones do. Recordings to disk have one camera, then two, and so
-    on, until one is not sustained: ticks are lost, or the backlog grows in the second half. Beside each stands the
-    rate at which the disk takes as many bytes in as many files without any camera.
+    Each camera sends 400x250 at 20 kHz by the clock, 250 MB/s, through pyusb and the code for real cameras; the
+    emulator's own copying runs on the same processor, and the bus costs no time. A camera without a read in flight
+    keeps as much as its memory holds and loses the rest, as real ones do. Recordings to disk have one camera, then two,
+    and so on, until one is not sustained: ticks are lost, or the backlog grows in the second half. Each is shown beside
+    the rate at which the disk stores as many bytes in as many files without any camera.
     """
     p = argparse.ArgumentParser("spike4dgs speed record", description=record.__doc__)
     p.add_argument("--cameras", type=int, default=9)
@@ -45,7 +45,7 @@ def record(argv: Sequence[str] = ()) -> int:
     p.add_argument("--memory-kib", type=int, default=64, help="memory of a camera and its USB bridge")
     p.add_argument("--disk-seconds", type=float, default=4.0, help="length of each recording to disk; 0: none")
     p.add_argument("--disk", type=Path, help="folder for them (default: a temporary one)")
-    p.add_argument("--csv", type=Path, help="write the tables here too, that of the disk with -disk behind the name")
+    p.add_argument("--csv", type=Path, help="also write the tables here, that of the disk with -disk behind the name")
     a = p.parse_args(list(argv))
     load = Load(a.cameras, a.fps, a.transfer_kib << 10, a.transfers, a.memory_kib << 10)
     mb_s = load.fps * FRAME_BYTES / 1e6
@@ -79,7 +79,7 @@ def _show_disk(title: str, load: Load, seconds: float, folder: Path, csv: Path |
 
 
 def not_sustained(load: Load, outcome: Outcome) -> str | None:
-    """Why a recording to disk does not show that the disk keeps up with the cameras; None where it does."""
+    """Return why a recording to disk does not show that the disk keeps up with the cameras; None where it does."""
     seconds = outcome.clip.n_ticks / load.fps
     if not outcome.clip.complete:
         return f"{sum(c.stats.lost_ticks for c in outcome.clip.cameras)} ticks in gaps"
@@ -88,14 +88,14 @@ def not_sustained(load: Load, outcome: Outcome) -> str | None:
     if outcome.wrong_frames:
         return "wrong frames"
     if seconds < _TIMES * load.buffer_s:
-        return f"{seconds:g} s are too short beside buffers of {load.buffer_s:.2f} s"
+        return f"{seconds:g} s are too short for buffers of {load.buffer_s:.2f} s"
     if growth(outcome) > _GROWTH * load.bytes_per_s:
         return f"the backlog grows by {growth(outcome) / 1e6:.0f} MB/s"
     return None
 
 
 def growth(outcome: Outcome) -> float:
-    """Bytes a second by which the backlog grew in the second half of a recording: the slope of a line through it."""
+    """Return the growth of the backlog in a recording's second half, bytes a second: the slope of a fitted line."""
     late = outcome.backlog[len(outcome.backlog) // 2 :]
     return float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 1 else 0.0
 

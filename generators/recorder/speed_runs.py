@@ -29,49 +29,49 @@ from spike4dgs.generators.recorder.usb.transport import UsbLink, open_link
 
 FRAME_BYTES = 12500
 _WIDTH, _HEIGHT = 400, 250
-_SOURCE_TICKS = 64  # that each camera sends again and again
+_SOURCE_TICKS = 64  # that each camera sends in a loop
 _CHECKED = 500  # ticks of each file that are read again
 
 
 @dataclass(frozen=True)
 class Load:
-    """What is measured: cameras of 400x250 at `fps`, and how they are read."""
+    """The load of a measurement: cameras of 400x250 at `fps`, and how they are read."""
 
     cameras: int
     fps: int
     transfer_bytes: int
     transfers: int
-    memory_bytes: int  # that a camera itself has, for the time without a read
+    memory_bytes: int  # of a camera itself, for the time without a read
     ring_seconds: float = RigProfile.ring_seconds  # of data that may wait for the disk
 
     @property
     def bytes_per_s(self) -> float:
-        """What all cameras send."""
+        """Bytes a second that all cameras send."""
         return float(self.cameras * self.fps * FRAME_BYTES)
 
     @property
     def buffer_s(self) -> float:
-        """For how long this process can hold what the cameras send and the disk does not take."""
+        """Seconds of data that this process can hold if the disk stores none."""
         return self.ring_seconds + self.cameras * PER_FILE * BUFFER_BYTES / self.bytes_per_s
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A capture of emulated cameras and what the cameras know about it."""
+    """A capture of emulated cameras, and the losses known to the cameras."""
 
     clip: Clip
     seconds: float  # from the trigger to the last byte, and on the disk where it goes there
-    unseen_bytes: int  # that cameras lost because no read was in flight: without tags nobody can tell
-    wrong_frames: int  # of the clip in memory, or of some ticks in each file, that are not the camera's at that tick
-    flush_s: float  # of `seconds`, to write what still waited in the end and to fsync
-    backlog: NDArray[np.float64]  # [n, 2]: seconds since the trigger, bytes in rings and buffers that waited then
+    unseen_bytes: int  # lost by cameras because no read was in flight; unnoticed without tags
+    wrong_frames: int  # in the clip in memory, or at some ticks of each file, that differ from the camera's
+    flush_s: float  # of `seconds`, to write the rest at the end and to fsync
+    backlog: NDArray[np.float64]  # [n, 2]: seconds since the trigger, bytes then waiting in rings and buffers
     cpu: float  # cores that were busy with this process
-    emulator_cpu: float  # of these, with what a USB controller does for real cameras
+    emulator_cpu: float  # of these, for work that a USB controller does for real cameras
     direct: bool  # past the page cache
 
 
 class _SentReads:
-    """Reads on an emulated camera, stamped when the camera had sent them, not when somebody looked."""
+    """Reads on an emulated camera, stamped with the time when the camera had sent them, not when they were checked."""
 
     def __init__(self, inner: Transfers, link: _Link) -> None:
         self.depth = inner.depth
@@ -80,7 +80,7 @@ class _SentReads:
 
     @property
     def in_flight(self) -> int:
-        """As the queue says."""
+        """Number of reads that have not ended, from the queue."""
         return self._inner.in_flight
 
     def submit(self, buffer: UInt8) -> None:
@@ -89,7 +89,7 @@ class _SentReads:
         self._inner.submit(buffer)
 
     def wait(self, timeout_s: float) -> Completion | None:
-        """The oldest read's end."""
+        """Return the oldest read's end."""
         due_s = self._link.emulated.due_s(self._link.profile.transfer_bytes)  # infinite before the start
         begun_s = time.thread_time()
         done = self._inner.wait(timeout_s)
@@ -106,19 +106,19 @@ class _SentReads:
 
 @dataclass(eq=False)
 class _Link(UsbLink):
-    """A link whose reads tell true times, and what the emulation of its camera costs."""
+    """A link whose reads have true times, and which measures the cost of emulating its camera."""
 
     emulated: EmulatedCamera
     cpu_s: float = 0.0
 
     def transfers(self) -> Transfers:
-        """Reads with true times."""
+        """Return reads with true times."""
         return _SentReads(super().transfers(), self)
 
 
 @dataclass(eq=False)
 class _Watch:
-    """Notes what a capture tells while it runs; times count from the trigger."""
+    """Records the rates of a capture; times count from the trigger."""
 
     load: Load
     links: Mapping[str, _Link]
@@ -129,7 +129,7 @@ class _Watch:
     backlog: list[tuple[float, int]] = field(default_factory=list)
 
     def state(self, state: str) -> None:
-        """The clocks run from TRIGGERED to DRAIN."""
+        """Run the clocks from TRIGGERED to DRAIN."""
         if state in (TRIGGERED, DRAIN):
             sign = -1 if state == TRIGGERED else 1
             self.seconds += sign * time.monotonic()
@@ -137,7 +137,7 @@ class _Watch:
             self.emulator_s += sign * sum(link.cpu_s for link in self.links.values())
 
     def rates(self, rates: Mapping[str, Rate]) -> None:
-        """What waits now."""
+        """Record the bytes that wait now."""
         waiting = sum(r.backlog for r in rates.values()) * self.load.transfer_bytes
         waiting += self.files.buffers.waiting if self.files is not None else 0
         self.backlog.append((time.monotonic() + self.seconds, waiting))
@@ -167,7 +167,7 @@ def run(load: Load, seconds: float, queued: bool, folder: Path | None = None) ->
 
 
 def disk_rate(folder: Path, files: int, seconds: float, bytes_per_s: float) -> float:
-    """Bytes a second to disk, fsync included, of as many files and bytes as a recording has, without any camera."""
+    """Return bytes a second to disk, fsync included, for as many files and bytes as a recording, without any camera."""
     data = np.random.default_rng(0).integers(0, 256, BUFFER_BYTES, dtype=np.uint8)
     n = max(round(seconds * bytes_per_s / files / len(data)), 1)
     buffers = Buffers(files, n * len(data))
@@ -187,7 +187,7 @@ def disk_rate(folder: Path, files: int, seconds: float, bytes_per_s: float) -> f
 
 
 def array_profile(load: Load) -> RigProfile:
-    """A rig without calibration."""
+    """Return a rig without calibration."""
     cameras = tuple(
         camera_profile(f"cam_{i:02d}", f"SPEED{i:04d}", SECONDARY if i else PRIMARY) for i in range(load.cameras)
     )
@@ -222,7 +222,7 @@ def _outcome(
 
 
 def _wrong(clip: Clip, sources: Mapping[str, UInt8]) -> int:
-    """Frames in memory that are not what the camera sent at their tick."""
+    """Return the number of frames in memory that differ from what the camera sent at their tick."""
     wrong = 0
     for c in clip.cameras:
         for i in range(0, len(c.ticks), _SOURCE_TICKS):
@@ -232,7 +232,7 @@ def _wrong(clip: Clip, sources: Mapping[str, UInt8]) -> int:
 
 
 def _wrong_on_disk(folder: Path, clip: Clip, sources: Mapping[str, UInt8]) -> int:
-    """The same of some frames in each file: zeros where the camera has a gap."""
+    """Return the same number for some frames in each file; frames in gaps must be zeros."""
     wrong = 0
     for c in clip.cameras:
         kept = present(c.gaps, clip.n_ticks)

@@ -1,9 +1,9 @@
-"""How well the cameras of a capture keep time with each other, from when their data arrived.
+"""The synchrony of a capture's cameras, from the arrival times of their data.
 
 For each camera a line is fitted to (ticks complete, time of arrival). Its slope against the nominal rate is the drift
 of the camera's clock against the computer's, its height the time of tick 0. Operating system and bus can only delay an
-arrival, often by milliseconds, so that the fit is by medians (Theil and Sen): a third of the reads may be late without
-moving it. Where frames carry a common counter it decides about ticks, and these figures are a check of it.
+arrival, often by milliseconds, so the fit uses medians (Theil and Sen): a third of the reads may be late without moving
+it. Where frames have a common counter, it determines the ticks, and these figures are a check of it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from spike4dgs.generators.recorder.frames.clip import Clip
 
-SUSPECT_PPM = 100.0  # crystals keep 50 ppm each: more is a rate that is not what the profile says, or lost data
-_MOST_READS = 400  # of each camera that take part: all pairs of them are compared
+SUSPECT_PPM = 100.0  # crystals keep 50 ppm each: more means a rate that differs from the profile's, or lost data
+_MOST_READS = 400  # of each camera that are used: all pairs of them are compared
 
 
 @dataclass(frozen=True)
 class ArrivalFit:
-    """One camera's clock, as seen from the computer. NaN where fewer than three reads ended."""
+    """One camera's clock against the computer's. NaN where fewer than three reads ended."""
 
     camera: str
     drift_ppm: float  # time per tick over the nominal one, less 1; positive: the camera is slow
@@ -36,7 +36,7 @@ class ArrivalFit:
 
     @property
     def suspect(self) -> bool:
-        """Whether the rate is off by more than crystals can be, beyond the scatter of the arrivals."""
+        """True if the rate is off by more than crystals can be, beyond the scatter of the arrivals."""
         return abs(self.drift_ppm) - 3 * self.drift_error_ppm > SUSPECT_PPM
 
 
@@ -51,7 +51,7 @@ class SyncReport:
     t0_ns: int | None  # CLOCK_MONOTONIC at tick 0, the median of the cameras
 
     def as_dict(self) -> dict[str, Any]:
-        """For scene.json; what is not known is null."""
+        """Return the report for scene.json; unknown values are null."""
         return _without_nan(asdict(self) | {"suspect": [c.camera for c in self.cameras if c.suspect]})
 
 
@@ -94,7 +94,7 @@ class _Line:
 
 
 def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
-    """The median of all slopes between two of the points (tick, ns) [m, 2], and the median height."""
+    """Return the median of all slopes between two of the points (tick, ns) [m, 2], and the median height."""
     if len(arrival) < 3 or np.ptp(arrival[:, 0]) == 0:
         return _Line(math.nan, math.nan, math.nan, math.nan, math.nan, len(arrival))
     used = arrival[np.linspace(0, len(arrival) - 1, min(len(arrival), _MOST_READS)).astype(int)]
@@ -107,7 +107,7 @@ def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     height = float(np.median(rest))
     away = np.abs(rest - height)
     residual = float(np.median(away))
-    # Median absolute deviation -> standard deviation, as for normal scatter, of which medians use 64 % (pi / 2 more).
+    # Median absolute deviation -> standard deviation for normal scatter; medians use 64 % of it (hence pi / 2).
     error = 1.4826 * residual * math.sqrt(math.pi / 2) / (math.sqrt(len(x)) * float(np.std(x)))
     return _Line(slope, error, height + float(base), residual, float(away.max()), len(arrival))
 

@@ -1,1 +1,1 @@
-"""Rendering with Mitsuba: scene objects, visibility, key frames, interpolated light."""
+"""Rendering with Mitsuba: scene objects, visibility, key frames, soft light."""

@@ -1,4 +1,4 @@
-"""How things move across the image, exactly from geometry, and at which ticks key frames are rendered for it."""
+"""Exact motion of objects across the image, from geometry, and the key frames that it requires."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from spike4dgs.generators.rendering.mitsuba_scene import Hits
 from spike4dgs.generators.worlds import WorldScene
 
 _STEP_S = 1e-6  # short against every motion here, long against float64 round-off of metres
-COARSE_PX = 2.5  # that anything moves between two coarse keys; less than the 3 px by which `sight` grows what moves
+COARSE_PX = 2.5  # largest motion between two coarse keys; `visibility` grows moving objects by more, 3 px
 _MOST_SUB_TICKS = 8
 
 
 def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: float, samples: int = 33) -> float:
-    """Speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
+    """Return the speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
 
-    Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation
-    included. Occlusion is not considered, so the answer is an upper bound that is met wherever that vertex is seen.
+    Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation included.
+    Occlusion is ignored, so the result is an upper bound, reached wherever that vertex is visible.
     """
     fastest = 0.0
     for t in np.linspace(0.0, duration_s, samples):
@@ -36,16 +36,16 @@ def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: fl
 
 
 def carried(world: WorldScene, hits: Hits, points: np.ndarray, from_s: float, to_s: float) -> np.ndarray:
-    """Where the surface points [N, 3] that `hits` found on moving things at `from_s` are at `to_s`: [N, 3] float64."""
+    """Return positions [N, 3] at `to_s` of the moving surface points [N, 3] that `hits` found at `from_s`; float64."""
     out = points.astype(np.float64)
     before, after = world.poses(from_s), world.poses(to_s)
     for number, name in enumerate(world.instances):
-        mine = hits.thing == number
+        mine = hits.number == number
         if mine.any():
             move = after[name] @ np.linalg.inv(before[name])
             out[mine] = points[mine] @ move[:3, :3].T + move[:3, 3]
     for number, surface in enumerate(world.deforming.values(), start=len(world.instances)):
-        mine = hits.thing == number
+        mine = hits.number == number
         if mine.any():
             corners = surface.part.mesh.faces[hits.face[mine]]  # [K, 3]
             u, v = hits.uv[mine].T
@@ -57,16 +57,16 @@ def carried(world: WorldScene, hits: Hits, points: np.ndarray, from_s: float, to
 
 @dataclass(frozen=True)
 class KeyPlan:
-    """At which ticks key frames are rendered, and which pixels of them.
+    """The ticks at which key frames are rendered, and which pixels of them.
 
     Attributes:
         n_ticks, rate_hz: length of the clip and ticks per second.
-        max_px: how far a point of the image may move between two of its keys.
+        max_px: largest motion of an image point between two of its keys.
         chain: spacings in ticks, coarsest first, each a divisor of the one before. Keys at multiples of `chain[0]` are
-            whole; at other multiples of `chain[k]` only pixels are traced whose motion over `chain[k - 1]` ticks is
+            whole. At other multiples of `chain[k]` only pixels are traced whose motion over `chain[k - 1]` ticks is
             more than `max_px`; the others are interpolated from the coarser keys.
-        sub_ticks: where the motion within one tick is more than `max_px`, the mean of a tick is rendered at so many
-            instants inside the tick; 1 is off.
+        sub_ticks: number of instants inside a tick whose mean is rendered where the motion within one tick is more than
+            `max_px`; 1 is off.
     """
 
     n_ticks: int
@@ -77,11 +77,11 @@ class KeyPlan:
 
     @property
     def ticks(self) -> list[int]:
-        """All ticks that have a key, ascending from 0 to the first coarse key at or after `n_ticks`."""
+        """Return all ticks with a key, ascending from 0 to the first coarse key at or after `n_ticks`."""
         return list(range(0, -(-self.n_ticks // self.chain[0]) * self.chain[0] + 1, self.chain[-1]))
 
     def level(self, tick: int) -> int:
-        """Which of the spacings a tick's key belongs to: the coarsest that divides it. 0 is a whole key."""
+        """Return the index in `chain` of a tick's key: the coarsest spacing that divides the tick. 0 is a whole key."""
         return next(level for level, spacing in enumerate(self.chain) if tick % spacing == 0)
 
 
@@ -95,17 +95,17 @@ def key_plan(
     adaptive: bool = True,
     sub_ticks: bool = True,
 ) -> KeyPlan:
-    """The plan for a clip, from the exact image motion of the world's geometry.
+    """Return the plan for a clip, from the exact image motion of the world's geometry.
 
     Raises UserError where a millisecond is no whole number of ticks.
 
     Args:
-        world: what moves.
+        world: the world with its moving objects.
         cameras: the views.
         n_ticks: length of the clip.
         rate_hz: ticks per second, a multiple of 1000.
-        max_px: how far a point of the image may move between two of its keys.
-        adaptive: False renders every pixel that changes at every tick: the slow, exact way.
+        max_px: largest motion of an image point between two of its keys.
+        adaptive: False renders every changing pixel at every tick: slow and exact.
         sub_ticks: False never renders instants inside a tick.
     """
     speed = max_image_speed(world, cameras, n_ticks / rate_hz)
@@ -117,11 +117,11 @@ def key_plan(
 
 
 def spacings(speed_px_s: float, n_ticks: int, rate_hz: int, max_px: float) -> tuple[int, ...]:
-    """Key spacings in ticks, coarsest first, for a clip whose fastest point has this speed.
+    """Return the key spacings in ticks, coarsest first, for a clip whose fastest point has this speed.
 
-    All divide a millisecond, so that a frame at every whole millisecond is exactly a key. The finest is the longest
-    that moves nothing by more than `max_px` (one tick, if even that is too long); each other is the shortest multiple
-    of the one after it, as long as nothing moves by more than 2.5 px.
+    All divide a millisecond, so that a frame at every whole millisecond is exactly a key. The finest is the longest in
+    which no point moves by more than `max_px` (one tick, if even that is too long). Each other is the shortest multiple
+    of the one after it, as long as no point moves by more than 2.5 px.
     Raises UserError where a millisecond is no whole number of ticks.
     """
     per_ms, rest = divmod(rate_hz, 1000)

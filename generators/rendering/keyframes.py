@@ -1,7 +1,7 @@
-"""Key frames on disk: one file per time, written whole or not at all, so that a killed run goes on where it was.
+"""Key frames on disk: one file per time, written whole or not at all, so that a killed run can resume.
 
-`still.npz` holds what does not move. A key file holds, for every view, only the pixels that the renderer gives
-(`MultiViewRenderer.key_arrays`): a bit for each pixel and the values of those that are set. Pixels that a coarse key
+`still.npz` holds the static background. A key file holds, for every view, only the pixels that the renderer gives
+(`MultiViewRenderer.key_arrays`): a bit for each pixel, and the values of those that are set. Pixels that a coarse key
 does not give are the background; those that a finer key does not give lie on the simulator's curve (clamped
 Catmull-Rom) through the next coarser keys.
 """
@@ -20,14 +20,14 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.image_motion import KeyPlan
-from spike4dgs.generators.rendering.render import Still
+from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.sensor.model import Float32
 
 
 class Clip(NamedTuple):
-    """One view of a clip, dense: what `sensor.simulate` takes."""
+    """One view of a clip, dense: the input of `sensor.model.simulate`."""
 
-    keys: Sequence[Float32]  # [H, W] each, read when it is asked for
+    keys: Sequence[Float32]  # [H, W] each, read on access
     ticks: list[int]
     means: bool = False  # each key is the mean of its own tick, instead of the radiance at its start
 
@@ -36,7 +36,7 @@ class KeyStore:
     """The key frames of a set of views in a folder.
 
     >>> store = KeyStore(Path("keys"))  # doctest: +SKIP
-    >>> store.set_still(renderer.still())  # doctest: +SKIP
+    >>> store.set_static(renderer.static())  # doctest: +SKIP
     >>> for tick in store.missing(plan):  # doctest: +SKIP
     ...     store.put(tick, renderer.key_arrays(tick, plan))
     >>> clip = store.view(0, plan)  # doctest: +SKIP
@@ -44,34 +44,34 @@ class KeyStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._loaded: Still | None = None
+        self._loaded: StaticViews | None = None
         self._background: Float32 | None = None
 
     @property
-    def has_still(self) -> bool:
-        """Whether what does not move is stored."""
-        return self._still_path.is_file()
+    def has_static(self) -> bool:
+        """True if the static background is stored."""
+        return self._static_path.is_file()
 
-    def still(self) -> Still:
-        """What does not move. Raises UserError where the file is missing or damaged."""
+    def static(self) -> StaticViews:
+        """Return the static background. Raises UserError where the file is missing or damaged."""
         if self._loaded is None:
-            self._loaded = Still.from_arrays(read_arrays(self._still_path, "background", "first"))
+            self._loaded = StaticViews.from_arrays(read_arrays(self._static_path, "background", "first"))
         return self._loaded
 
     @property
     def background(self) -> Float32:
         """Gray of the background, [C, H, W]."""
         if self._background is None:
-            self._background = gray(self.still().background)
+            self._background = gray(self.static().background)
         return self._background
 
-    def set_still(self, still: Still) -> None:
-        """Store what does not move. Raises UserError for values that are not finite."""
-        write_arrays(self._still_path, still.arrays())
+    def set_static(self, static: StaticViews) -> None:
+        """Store the static background. Raises UserError for values that are not finite."""
+        write_arrays(self._static_path, static.arrays())
         self._loaded = self._background = None
 
     def missing(self, plan: KeyPlan) -> list[int]:
-        """The ticks of a plan without a stored key."""
+        """Return the ticks of a plan without a stored key."""
         return [t for t in plan.ticks if not self._path(t).is_file()]
 
     def put(self, tick: int, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -79,22 +79,22 @@ class KeyStore:
         write_arrays(self._path(tick), arrays)
 
     def view(self, view: int, plan: KeyPlan) -> Clip:
-        """One view for the simulator: radiance at the keys' ticks or, with sub-ticks, the mean of every tick."""
+        """Return one view for the simulator: radiance at the keys' ticks or, with sub-ticks, the mean of every tick."""
         instants = self.instants(view, plan)
         if plan.sub_ticks == 1:
             return instants
         return Clip(_Means(self, view, plan, instants), list(range(plan.n_ticks)), True)
 
     def instants(self, view: int, plan: KeyPlan) -> Clip:
-        """One view of a plan: radiance at all ticks that have a key. Reading in ascending order is fastest."""
+        """Return the radiance of one view at all ticks with a key. Reading in ascending order is fastest."""
         return Clip(_Instants(self, view, plan), plan.ticks)
 
     def radiance(self, view: int, plan: KeyPlan, tick: int) -> Float32:
-        """Radiance [H, W] at the start of any tick of the clip: a key, or on the simulator's curve between two."""
+        """Return the radiance [H, W] at the start of any tick: a key, or on the simulator's curve between two."""
         return _Instants(self, view, plan).at(tick)
 
     def range(self, view: int, plan: KeyPlan) -> tuple[Float32, Float32]:
-        """Smallest and largest radiance [H, W] of each pixel of a view over the coarse keys."""
+        """Return the smallest and largest radiance [H, W] of each pixel of a view over the coarse keys."""
         low = high = self.background[view]
         keys = self.instants(view, plan)
         for k in range(0, len(keys.ticks), plan.chain[0] // plan.chain[-1]):
@@ -103,7 +103,7 @@ class KeyStore:
         return low, high
 
     def given(self, tick: int, view: int, kind: str = "") -> tuple[NDArray[np.bool_], Float32]:
-        """Which pixels [H, W] of a view a key gives, and their values. `kind` "mean_": the means over the tick.
+        """Return the mask [H, W] of the pixels that a key gives, and their values. `kind` "mean_": means over the tick.
 
         Raises UserError where the file is missing or damaged.
         """
@@ -118,7 +118,7 @@ class KeyStore:
         return bits.reshape(shape).astype(bool), values
 
     @property
-    def _still_path(self) -> Path:
+    def _static_path(self) -> Path:
         return self.folder / "still.npz"
 
     def _path(self, tick: int) -> Path:
@@ -126,7 +126,7 @@ class KeyStore:
 
 
 class _Instants(Sequence[Float32]):
-    """Dense keys of one view; those of the last few coarse intervals are kept."""
+    """Dense keys of one view; caches the keys of the last few coarse intervals."""
 
     def __init__(self, store: KeyStore, view: int, plan: KeyPlan) -> None:
         self._store, self._view, self._plan, self._ticks = store, view, plan, plan.ticks
@@ -146,7 +146,7 @@ class _Instants(Sequence[Float32]):
         return self._kept[tick]
 
     def _read(self, tick: int) -> Float32:
-        """Radiance at the start of a tick."""
+        """Return the radiance at the start of a tick."""
         chain = self._plan.chain
         if tick % chain[-1]:
             return self._between(tick, chain[-1])
@@ -157,7 +157,7 @@ class _Instants(Sequence[Float32]):
         return image
 
     def _between(self, tick: int, spacing: int) -> Float32:
-        """The clamped Catmull-Rom curve through the keys every `spacing` ticks; see `sensor`."""
+        """Return the clamped Catmull-Rom curve through the keys every `spacing` ticks; see `sensor.model`."""
         first, last = tick // spacing * spacing, self._ticks[-1]
         p1, p2 = self.at(first), self.at(first + spacing)
         p0 = self.at(first - spacing) if first else None
@@ -170,7 +170,7 @@ class _Instants(Sequence[Float32]):
 
 
 class _Means(Sequence[Float32]):
-    """The mean radiance of every tick: of the curve through the instants, or rendered where it moves too fast."""
+    """The mean radiance of every tick: of the curve through the instants, or rendered where the motion is too fast."""
 
     def __init__(self, store: KeyStore, view: int, plan: KeyPlan, instants: Clip) -> None:
         self._store, self._view, self._n, self._instants = store, view, plan.n_ticks, instants.keys
@@ -202,7 +202,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """Read some arrays of such a file. Raises UserError where it is missing or damaged."""
+    """Read some arrays of such a file. Raises UserError where the file is missing or damaged."""
     try:
         with open(path, "rb") as f, np.load(f) as data:
             return {name: data[name] for name in names}

@@ -1,4 +1,4 @@
-"""From a world's plain data to Mitsuba's scene objects."""
+"""Conversion of a world's plain data to Mitsuba's scene objects."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _PLAIN = Material((0.5, 0.5, 0.5))
 
 
 class Hits(NamedTuple):
-    """Where rays meet moving things first. All arrays have one entry per ray."""
+    """The first hits of rays with moving objects. All arrays have one entry per ray."""
 
     distance: np.ndarray  # float32, along the unit direction; inf: no hit
-    thing: np.ndarray  # int32, number of the instance or, after all instances, of the deforming surface; -1: no hit
+    number: np.ndarray  # int32, number of the instance or, after all instances, of the deforming surface; -1: no hit
     face: np.ndarray  # int64, of the mesh that was hit
     uv: np.ndarray  # [N, 2] float64, barycentric weights of the face's second and third corner
 
 
 class MitsubaScene:
-    """A world in Mitsuba's memory: `empty` (what stands still), `movers` (what moves, without materials), `full`.
+    """A world in Mitsuba's memory: `empty` (static surfaces), `movers` (moving surfaces, without materials), `full`.
 
-    `full` and `movers` are at the last pose that `place` was asked for. What moves is a few plain meshes whose vertices
-    are set anew, never Mitsuba's instances: for every kernel that it starts Mitsuba goes through each instance, and for
-    a figure of a dozen limbs that takes longer than tracing its pixels.
+    `full` and `movers` are at the time of the last `set_time`. The moving surfaces are a few plain meshes with updated
+    vertices, never Mitsuba's instances: every kernel launch visits each instance, and for a figure of a dozen limbs
+    that takes longer than tracing its pixels.
     """
 
     def __init__(self, world: WorldScene) -> None:
@@ -51,8 +51,8 @@ class MitsubaScene:
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
         # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
         self._own_normals = str(mi.variant()).startswith("scalar")
-        self._placed_at: float | None = None
-        self.place(0.0)
+        self._time_s: float | None = None
+        self.set_time(0.0)
 
     @property
     def mover_ids(self) -> list[str]:
@@ -60,30 +60,30 @@ class MitsubaScene:
         return [f"moving_{name}" for name in self._batches]
 
     def hits(self, distance: np.ndarray, shape: np.ndarray, face: np.ndarray, uv: np.ndarray) -> Hits:
-        """Hits from the number of the shape in `mover_ids` (-1: none) that each ray meets, and its face there."""
-        thing = np.full(len(shape), -1, np.int32)
+        """Return hits from the index in `mover_ids` of the shape that each ray meets (-1: none), and its face there."""
+        numbers = np.full(len(shape), -1, np.int32)
         for number, batch in enumerate(self._batches.values()):
             mine = shape == number
-            thing[mine] = batch.things[face[mine]]
-        return Hits(distance, thing, face, uv)
+            numbers[mine] = batch.objects[face[mine]]
+        return Hits(distance, numbers, face, uv)
 
-    def place(self, t_s: float) -> None:
-        """Move what moves in `full` and `movers` to where it is at `t_s` seconds."""
-        if t_s == self._placed_at:
+    def set_time(self, t_s: float) -> None:
+        """Move the moving surfaces of `full` and `movers` to their positions at `t_s` seconds."""
+        if t_s == self._time_s:
             return
         poses = self._world.poses(t_s)
         turns = np.array([poses[name][:3] for name in self._world.instances]).reshape(-1, 3, 4)
-        placed = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
+        moved = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
         for parameters in self._parameters:
-            for name, (positions, _) in placed.items():
+            for name, (positions, _) in moved.items():
                 parameters[f"{name}.vertex_positions"] = positions
             if self._own_normals:
                 parameters.update()
-            for name, (_, normals) in placed.items():
+            for name, (_, normals) in moved.items():
                 if normals is not None:
                     parameters[f"{name}.vertex_normals"] = normals
             parameters.update()
-        self._placed_at = t_s
+        self._time_s = t_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class _Batch:
         material: of all.
         owner: [N], number of the instance that each vertex belongs to; None for a deforming surface.
         normals: [N, 3] at rest; None where faces are flat, or Mitsuba computes them.
-        things: [M], number of the instance or deforming surface that each face belongs to.
+        objects: [M], number of the instance or deforming surface that each face belongs to.
         vertices: of a deforming surface.
     """
 
@@ -103,15 +103,15 @@ class _Batch:
     material: Material
     owner: np.ndarray | None
     normals: np.ndarray | None
-    things: np.ndarray
+    objects: np.ndarray
     vertices: Callable[[float], np.ndarray] | None = None
 
     def part(self, dressed: bool) -> Part:
-        """The mesh, with its material or without."""
+        """Return the mesh, with its material if `dressed`."""
         return Part(self.merged, self.material if dressed else _PLAIN)
 
     def at(self, t_s: float, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Flat float32 positions and normals at a time; `turns` [instances, 3, 4] are the poses."""
+        """Return flat float32 positions and normals at a time; `turns` [instances, 3, 4] are the poses."""
         if self.vertices is not None:
             return np.ascontiguousarray(self.vertices(t_s), np.float32).ravel(), None
         pose = turns[self.owner]
@@ -123,7 +123,7 @@ class _Batch:
 
 
 def _batches(world: WorldScene) -> dict[str, _Batch]:
-    """The moving surfaces of a world, those of equal material and smoothness merged."""
+    """Return the moving surfaces of a world; surfaces of equal material and smoothness are merged."""
     alike: dict[tuple[Any, ...], list[tuple[int, Part]]] = {}
     for number, group in enumerate(world.instances.values()):
         for part in world.groups[group]:
@@ -140,17 +140,17 @@ def _batches(world: WorldScene) -> dict[str, _Batch]:
             one = Part(merge([part.mesh for part in parts]), one.material)
         normals = np.concatenate([vertex_normals(part.mesh) for part in parts]) if one.mesh.smooth else None
         owner = np.repeat(numbers, [len(part.mesh.vertices) for part in parts])
-        things = np.repeat(numbers, [len(part.mesh.faces) for part in parts])
-        found[f"rigid{k}"] = _Batch(one.mesh, one.material, owner, normals, things)
+        objects = np.repeat(numbers, [len(part.mesh.faces) for part in parts])
+        found[f"rigid{k}"] = _Batch(one.mesh, one.material, owner, normals, objects)
     for number, (name, surface) in enumerate(world.deforming.items(), start=len(world.instances)):
-        things = np.full(len(surface.part.mesh.faces), number)
-        found[name] = _Batch(*surface.part, None, None, things, surface.vertices)
+        objects = np.full(len(surface.part.mesh.faces), number)
+        found[name] = _Batch(*surface.part, None, None, objects, surface.vertices)
     return found
 
 
 @lru_cache(maxsize=1)
 def mitsuba_scene(world: WorldScene) -> MitsubaScene:
-    """The scene of a world; the last one is kept, because every scene in memory makes Mitsuba's kernels larger."""
+    """Return the scene of a world. Only the last one is cached: each scene in memory makes Mitsuba's kernels larger."""
     return MitsubaScene(world)
 
 
@@ -159,7 +159,7 @@ def _shapes(prefix: str, parts: Mapping[str, Part]) -> dict[str, Any]:
 
 
 def _in_palettes(parts: Mapping[str, Part]) -> dict[str, Part]:
-    """The same surfaces, those of plain colours merged as far as they reflect alike: fewer materials, less work."""
+    """Return the same surfaces, but merge plain-coloured ones that reflect alike: fewer materials, less work."""
     kept: dict[str, Part] = {}
     alike: dict[tuple[Any, ...], list[Part]] = {}
     for name, part in parts.items():
@@ -171,7 +171,7 @@ def _in_palettes(parts: Mapping[str, Part]) -> dict[str, Part]:
 
 
 def _in_palette(parts: Sequence[Part]) -> Part:
-    """Surfaces that differ in their plain colours only as one, with these colours in an image of one row."""
+    """Return surfaces that differ only in their plain colours as one, with these colours in an image of one row."""
     material = parts[0].material
     colours = np.array([part.material.albedo for part in parts], np.float32)[None]  # [1, N, 3]
     meshes = [
@@ -182,7 +182,7 @@ def _in_palette(parts: Sequence[Part]) -> Part:
 
 
 def _emitter(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Turns numpy arrays into Mitsuba's bitmaps and transforms; `z_up` stands a sky upright in our world."""
+    """Convert NumPy arrays to Mitsuba's bitmaps and transforms; `z_up` turns a sky upright in our world."""
     mi = load_mitsuba()
     out = {key: value for key, value in spec.items() if key != "z_up"}
     if spec.get("z_up"):

@@ -1,7 +1,7 @@
-"""Which Mitsuba variant to render with: the vectorised LLVM one where it works, else the scalar one.
+"""The choice of the Mitsuba variant: the vectorised LLVM variant where it works, else the scalar one.
 
-`llvm_ad_rgb` needs a system libLLVM that suits the CPU; a bad one kills the process. So it is tried in a child
-process, once, and the answer is remembered for this Mitsuba, this libLLVM and this CPU.
+`llvm_ad_rgb` needs a system libLLVM that suits the CPU; an unsuitable one kills the process. A child process therefore
+tries it once, and the result is cached for this Mitsuba, this libLLVM and this CPU.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FAST, SAFE = "llvm_ad_rgb", "scalar_rgb"
 SUPPORTED = (FAST, SAFE, "cuda_ad_rgb")
 OVERRIDE = "SPIKE4DGS_MITSUBA_VARIANT"
 
-_LLVM_PLACES = (
+_LLVM_PATHS = (
     "/usr/lib/*/libLLVM*.so*",
     "/usr/lib/libLLVM*.so*",
     "/usr/lib64/libLLVM*.so*",
@@ -33,7 +33,7 @@ _LLVM_PLACES = (
     "/usr/local/lib/libLLVM*",
     "/opt/homebrew/opt/llvm/lib/libLLVM*",
 )
-_CUDA_PLACES = ("/usr/lib/*/libcuda.so*", "/usr/lib64/libcuda.so*", "/usr/lib/wsl/lib/libcuda.so*")
+_CUDA_PATHS = ("/usr/lib/*/libcuda.so*", "/usr/lib64/libcuda.so*", "/usr/lib/wsl/lib/libcuda.so*")
 _PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -47,10 +47,10 @@ print("works")
 
 @lru_cache(maxsize=1)
 def pick_variant() -> str:
-    """The variant for this process: `SPIKE4DGS_MITSUBA_VARIANT` where set, else the probe's answer.
+    """Return the variant for this process: `SPIKE4DGS_MITSUBA_VARIANT` where set, else the probe's answer.
 
-    Says on stderr, in one line, why it fell back to the scalar variant and what would make rendering faster.
-    Raises UserError for an unknown name in the environment variable, or one that does not work here.
+    If it falls back to the scalar variant, one line on stderr gives the reason and how to make rendering faster.
+    Raises UserError for an unknown name in the environment variable, or a variant that does not work here.
     """
     wanted = os.environ.get(OVERRIDE)
     if wanted:
@@ -78,7 +78,7 @@ def choose_device(device: str) -> None:
     """
     if device == "auto":
         return
-    if device == "cuda" and not any(glob.glob(place) for place in _CUDA_PLACES):
+    if device == "cuda" and not any(glob.glob(path) for path in _CUDA_PATHS):
         raise problem("--device cuda", "an NVIDIA GPU with its driver", "no libcuda", "use --device cpu")
     chosen = os.environ.get(OVERRIDE, "")
     if device == "cuda":
@@ -89,7 +89,7 @@ def choose_device(device: str) -> None:
 
 
 def load_mitsuba() -> ModuleType:
-    """The mitsuba module with its variant set; the first caller decides for the whole process."""
+    """Return the mitsuba module with its variant set; the first call decides for the whole process."""
     import mitsuba as mi
 
     if mi.variant() is None:
@@ -99,7 +99,7 @@ def load_mitsuba() -> ModuleType:
 
 
 def _cached_probe() -> str:
-    """Why the fast variant fails ("" if it works), from the cache file or from a new probe."""
+    """Return why the fast variant fails ("" if it works), from the cache file or from a new probe."""
     path = _cache_dir() / f"mitsuba-{_fingerprint()}.json"
     try:
         return str(json.loads(path.read_text())["why_not"])
@@ -117,7 +117,7 @@ def _cached_probe() -> str:
 
 
 def _probe(timeout_s: float = 180.0) -> str:
-    """Render a small image in a child process; returns "" or one line that says what went wrong."""
+    """Render a small image in a child process; return "" or one line that says what went wrong."""
     try:
         child = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
@@ -131,9 +131,9 @@ def _probe(timeout_s: float = 180.0) -> str:
 
 
 def _fingerprint() -> str:
-    """Names this Mitsuba, the libLLVM files that it would find and the CPU."""
+    """Return a name for this Mitsuba, the libLLVM files that it would find, and the CPU."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH", "")
-    files = [named] if named else sorted({f for place in _LLVM_PLACES for f in glob.glob(place)})
+    files = [named] if named else sorted({f for path in _LLVM_PATHS for f in glob.glob(path)})
     stamps = [(f, os.stat(f).st_size if os.path.exists(f) else -1) for f in files]
     facts = (version("mitsuba"), version("drjit"), stamps, platform.machine(), _cpu_name())
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]

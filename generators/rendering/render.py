@@ -1,18 +1,18 @@
-"""Key frames of a world: the background once, and at each time only the pixels that the moving things change.
+"""Key frames of a world: the background once, and at each time only the pixels that moving objects change.
 
 Three kinds of pixel, cheapest first:
 
-- *Still*: the background, rendered once with many samples.
+- *Static*: the background, rendered once with many samples.
 - *Softly lit* (bounced light, wide penumbrae): the background times a slowly varying factor, see `soft_light`.
-- *Traced* at every key: a ray through the pixel's centre meets a moving thing, or the surface that it meets has one
-  between itself and the light; both grown by 3 px (`sight`).
+- *Traced* at every key: a ray through the pixel's centre meets a moving object, or the surface that it meets has one
+  between itself and the light; both regions are grown by 3 px (`visibility`).
 
-Keys between two coarse ones hold only traced pixels in which something moves too fast for the coarse ones (`motion`).
+Keys between two coarse ones hold only traced pixels whose motion is too fast for the coarse ones (`image_motion`).
 
-Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. What stands still
-keeps its noise from key to key, and a list of pixels traced alone equals the same pixels of the whole image, bit for
-bit. Traced pixels that see no moving surface, only its shadow, get the background plus the *difference* of two such
-renderings: the background's low noise stays, and nothing jumps where the traced region ends.
+Common random numbers: a pixel's samples depend on (seed, camera, pixel, number of samples) only. Static surfaces keep
+their noise from key to key, and a list of pixels traced alone equals the same pixels of the whole image, bit for bit.
+Traced pixels that see only the shadow of a moving surface get the background plus the *difference* of two such
+renderings: the low noise of the background remains, and there is no step at the edge of the traced region.
 
 This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area), or denoise.
 """
@@ -33,39 +33,39 @@ from spike4dgs.generators.rendering.image_motion import KeyPlan, max_image_speed
 from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.soft_light import MOTION_PX, SoftLight
-from spike4dgs.generators.rendering.visibility import Sight
+from spike4dgs.generators.rendering.visibility import Visibility
 from spike4dgs.generators.worlds import WorldScene
 
 MAX_DEPTH = 4  # camera, surface, two bounces
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
-    """What does not move, linear RGB [C, H, W, 3] float32.
+class StaticViews:
+    """The views without moving objects, linear RGB [C, H, W, 3] float32.
 
     Attributes:
         background: at full quality.
-        first: the same with the random numbers, and so the noise, of keys.
+        first: the same with the random numbers, and therefore the noise, of keys.
     """
 
     background: np.ndarray
     first: np.ndarray
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a file or another process."""
+        """Return the arrays for a file or another process."""
         return {"background": self.background, "first": self.first}
 
     @staticmethod
-    def from_arrays(arrays: Mapping[str, np.ndarray]) -> Still:
-        """The inverse of `arrays`."""
-        return Still(arrays["background"], arrays["first"])
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> StaticViews:
+        """Return the views from the result of `arrays`."""
+        return StaticViews(arrays["background"], arrays["first"])
 
-    def views(self, chosen: Sequence[int]) -> Still:
-        """Some of the views."""
-        return Still(self.background[list(chosen)], self.first[list(chosen)])
+    def views(self, chosen: Sequence[int]) -> StaticViews:
+        """Return a selection of the views."""
+        return StaticViews(self.background[list(chosen)], self.first[list(chosen)])
 
 
-class MultiViewRenderer(Sight):
+class MultiViewRenderer(Visibility):
     """Renders all `cameras` (one resolution) of a world together: one launch per time. Images are [C, H, W] float32.
 
     >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
@@ -81,20 +81,20 @@ class MultiViewRenderer(Sight):
         spp: int,
         background_spp: int,
         color: bool = False,
-        still: Still | None = None,
+        static: StaticViews | None = None,
         whole_frames: bool = False,
     ) -> None:
-        """Loads the world into Mitsuba (about a second). Raises UserError for numbers of samples that do not fit.
+        """Load the world into Mitsuba (about a second). Raises UserError for numbers of samples that do not fit.
 
         Args:
-            world: what is rendered.
+            world: the world to render.
             cameras: views of one resolution.
             seed: of all random numbers.
             spp: samples per pixel of keys, a power of two.
-            background_spp: of what stands still, a power of two, at least `spp`.
+            background_spp: samples per pixel of the static background, a power of two, at least `spp`.
             color: images are linear RGB, [C, H, W, 3].
-            still: what a renderer with the same arguments returned from `still`; else it is rendered when needed.
-            whole_frames: trace every pixel of every key: the slow, exact way.
+            static: `static` of a renderer with the same arguments; if None, it is rendered when needed.
+            whole_frames: trace every pixel of every key: slow and exact.
         """
         for name, value in (("spp", spp), ("background_spp", background_spp)):
             if value < 1 or value & (value - 1):
@@ -108,32 +108,32 @@ class MultiViewRenderer(Sight):
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
         self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
-        if still is not None:
-            self.still = still
+        if static is not None:
+            self.static = static
 
     # ------------------------------------------------------------ images
 
     @cached_property
-    def still(self) -> Still:
-        """The views without the moving things."""
+    def static(self) -> StaticViews:
+        """The views without moving objects."""
         first = self._whole(self.spp, 0, None)
         total = first.astype(np.float64)
         parts = self.background_spp // self.spp
         for stream in range(1, parts):
             total += self._whole(self.spp, stream, None)
-        return Still((total / parts).astype(np.float32), first)
+        return StaticViews((total / parts).astype(np.float32), first)
 
-    def still_on(self, background: np.ndarray) -> Still:
-        """With a background that another renderer made; only the part that has this one's noise is rendered."""
-        return Still(background, self._whole(self.spp, 0, None))
+    def static_on(self, background: np.ndarray) -> StaticViews:
+        """Return static views with another renderer's background; only `first` is rendered."""
+        return StaticViews(background, self._whole(self.spp, 0, None))
 
     @cached_property
     def background(self) -> np.ndarray:
-        """`still.background`, in the kind of the images: [C, H, W], or in colour [C, H, W, 3]."""
-        return self.still.background if self.color else gray(self.still.background)
+        """`static.background` in the format of the images: [C, H, W], or in colour [C, H, W, 3]."""
+        return self.static.background if self.color else gray(self.static.background)
 
     def keys(self, t_s: float) -> np.ndarray:
-        """The views at `t_s`: still, softly lit and traced pixels put together."""
+        """Return the views at `t_s`, composed of static, softly lit and traced pixels."""
         if self.whole_frames:
             return self.crn_frames(t_s)
         change = self._soft_light.change(t_s)
@@ -143,11 +143,12 @@ class MultiViewRenderer(Sight):
         return image
 
     def key_arrays(self, tick: int, plan: KeyPlan) -> dict[str, np.ndarray]:
-        """What `KeyStore` keeps of a tick: for each view v the pixels that are given, packed, and their values.
+        """Return the arrays of a tick for `KeyStore`: for each view v the given pixels (packed) and their values.
 
-        Coarse keys (`given{v}`, `values{v}`): the pixels that differ from the background. Others: those that move too
-        fast for the coarser keys. With sub-ticks also `mean_given{v}`, `mean_values{v}`: the mean radiance over the
-        tick where it moves too fast even for that. A function of the arguments alone, whatever was rendered before.
+        Coarse keys (`given{v}`, `values{v}`) give the pixels that differ from the background, finer keys those that
+        move too fast for the coarser keys. With sub-ticks, `mean_given{v}` and `mean_values{v}` are the mean radiance
+        over the tick where the motion is too fast even for that. The result depends on the arguments alone, not on
+        earlier renderings.
         """
         t_s, level = tick / plan.rate_hz, plan.level(tick)
         if level == 0:
@@ -165,16 +166,16 @@ class MultiViewRenderer(Sight):
         return arrays
 
     def crn_frames(self, t_s: float) -> np.ndarray:
-        """Every pixel traced at `t_s` with the random numbers of `keys`; for measuring what `keys` leaves out."""
+        """Return all pixels traced at `t_s` with the random numbers of `keys`, to measure the error of `keys`."""
         rgb = self._whole(self.spp, 0, t_s)
         return rgb if self.color else gray(rgb)
 
     def reference_frames(self, t_s: float, spp: int) -> np.ndarray:
-        """The views at `t_s` by Mitsuba's own render loop, sensor, film and sampler: every pixel, nothing reused."""
+        """Return the views at `t_s` by Mitsuba's own render loop, sensor, film and sampler; no pixel is reused."""
         mi = load_mitsuba()
         from spike4dgs.generators.rendering.scalar_tiles import load_sensor
 
-        self._scene.place(t_s)
+        self._scene.set_time(t_s)
         integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
         frames = []
         for camera in self.cameras:
@@ -184,21 +185,21 @@ class MultiViewRenderer(Sight):
         return np.stack(frames) * np.float32(self.world.exposure)
 
     def changed(self, t_s: float) -> np.ndarray:
-        """[C, H, W] bool: the pixels of `keys` that are not simply the background: traced or softly lit."""
+        """Return [C, H, W] bool: the pixels of `keys` that are not plain background, but traced or softly lit."""
         return self.traced(t_s) | (self._soft_light.change(t_s) != 0)
 
     def traced(self, t_s: float) -> np.ndarray:
-        """[C, H, W] bool: the pixels that `keys` traces."""
+        """Return [C, H, W] bool: the pixels that `keys` traces."""
         return np.ones(self.shape, bool) if self.whole_frames else super().traced(t_s)
 
-    # ------------------------------------------------------------ inner workings
+    # ------------------------------------------------------------ internals
 
     def _whole(self, spp: int, stream: int, t_s: float | None) -> np.ndarray:
-        """Every pixel traced, linear RGB [C, H, W, 3]."""
+        """Return every pixel traced, linear RGB [C, H, W, 3]."""
         return self._rgb_at(np.arange(int(np.prod(self.shape))), spp, stream, t_s).reshape(*self.shape, 3)
 
     def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
-        """Radiance [K] or [K, 3] of the flat pixels `where` of a key."""
+        """Return the radiance [K] or [K, 3] of the flat pixels `where` of a key."""
         rgb = self._rgb_at(where, self.spp, 0, t_s)
         traced = rgb if self.color else gray(rgb)
         if self.whole_frames:
@@ -209,31 +210,31 @@ class MultiViewRenderer(Sight):
 
     @cached_property
     def _first(self) -> np.ndarray:
-        return self.still.first if self.color else gray(self.still.first)
+        return self.static.first if self.color else gray(self.static.first)
 
     def _means_at(self, where: np.ndarray, t_s: float, plan: KeyPlan) -> np.ndarray:
-        """Mean radiance [K] of flat pixels over the tick from `t_s` on: of so many instants inside it."""
+        """Return the mean radiance [K] of flat pixels over the tick from `t_s` on, from `plan.sub_ticks` instants."""
         shares = (np.arange(plan.sub_ticks) + 0.5) / plan.sub_ticks
         return np.mean([self._traced_at(where, t_s + share / plan.rate_hz) for share in shares], axis=0)
 
     def _fast(self, t_s: float, within_s: float, max_px: float) -> np.ndarray:
-        """[C, H, W] bool: traced pixels in which something moves more than `max_px` px `within_s` seconds."""
+        """Return [C, H, W] bool: traced pixels with a motion of more than `max_px` px in `within_s` seconds."""
         return super().traced(t_s) & (self.speeds(t_s) * within_s > max_px)
 
     def _rgb_at(self, pixels: np.ndarray, spp: int, stream: int, t_s: float | None) -> np.ndarray:
-        """Linear RGB [K, 3] of flat pixels; None: without the moving things."""
+        """Return linear RGB [K, 3] of flat pixels; `t_s` None: without moving objects."""
         if t_s is not None:
-            self._scene.place(t_s)
+            self._scene.set_time(t_s)
         return np.asarray(self._tracer.trace(pixels, spp, stream, t_s is not None) * np.float32(self.world.exposure))
 
     def _gray_at(self, pixels: np.ndarray, spp: int, moving: bool, t_s: float) -> np.ndarray:
-        """Radiance [K] of flat pixels with the keys' random numbers, gray and before exposure: for soft light."""
+        """Return the gray radiance [K], before exposure, of flat pixels with the keys' random numbers."""
         if moving:
-            self._scene.place(t_s)
+            self._scene.set_time(t_s)
         return gray(self._tracer.trace(pixels, spp, 0, moving))
 
     def _flat(self, image: np.ndarray) -> np.ndarray:
-        """A view of the image as [N] or [N, 3]."""
+        """Return a view of the image as [N] or [N, 3]."""
         return image.reshape(-1, 3) if self.color else image.reshape(-1)
 
     def _sparse(self, mask_name: str, values_name: str, given: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -245,13 +246,13 @@ class MultiViewRenderer(Sight):
         return arrays
 
     def _anchor_s(self) -> float:
-        """Time between the anchors of soft light."""
+        """Return the time between the anchors of soft light."""
         speed = max_image_speed(self.world, self.cameras, self.world.duration_s, samples=5)
         return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
 
 
 def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
-    """The tracer for the process's variant. Imported here because the modules need the variant to be set."""
+    """Return the tracer for the process's variant. Imports are here because the modules need the variant to be set."""
     if load_mitsuba().variant().startswith("scalar"):
         from spike4dgs.generators.rendering.scalar_tiles import TileTracer
 

@@ -1,7 +1,7 @@
 """The same tracing interface with Mitsuba's scalar variants: slower, needs no libLLVM.
 
 Python cannot call the scalar integrator per sample (a call costs more than a path), so pixels are rendered in fixed
-square tiles by `mi.render`. A tile's seed depends on (seed, camera, tile, stream), never on what else is traced.
+square tiles by `mi.render`. A tile's seed depends on (seed, camera, tile, stream), never on the other traced pixels.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class TileTracer:
         self._sensors: dict[tuple[int, int, int, int], Any] = {}
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        """Linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples.
+        """Return the linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples.
 
         A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
         """
@@ -72,11 +72,11 @@ class TileTracer:
         return load_sensor(camera, film, spp)
 
     def prepare(self, origins: np.ndarray, directions: np.ndarray) -> Rays:
-        """Rays [N, 3] with unit directions, ready to be cast again and again."""
+        """Return rays [N, 3] with unit directions, prepared for repeated casts."""
         return origins, directions
 
     def cast_static(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
-        """Where rays meet what stands still: distance [N] float32 (inf: nothing) and surface normal [N, 3] float32."""
+        """Cast rays at static surfaces. Return distance [N] (inf: no hit) and surface normal [N, 3], float32."""
         distance, normal = np.full(len(rays[0]), np.inf, np.float32), np.zeros((len(rays[0]), 3), np.float32)
         for k, (o, d) in enumerate(zip(*(a.tolist() for a in rays), strict=True)):
             hit = self._scene.empty.ray_intersect(mi.Ray3f(o, d))
@@ -85,7 +85,7 @@ class TileTracer:
         return distance, normal
 
     def cast_movers(self, rays: Rays) -> Hits:
-        """Where rays meet the moving things, which stand alone: nothing else is in the way."""
+        """Cast rays at the moving objects alone; static surfaces hide nothing."""
         n = len(rays[0])
         distance, number = np.full(n, np.inf, np.float32), np.full(n, -1, np.int32)
         face, uv = np.zeros(n, np.int64), np.zeros((n, 2))
@@ -99,7 +99,7 @@ class TileTracer:
 
 
 def load_sensor(camera: Camera, film: dict[str, Any], spp: int) -> Any:
-    """A Mitsuba sensor for `camera` with a box-filtered linear film, whole or cropped; at least `spp` samples."""
+    """Return a Mitsuba sensor of `camera` with a box-filtered linear film, whole or cropped; at least `spp` samples."""
     rows = math.isqrt(spp)
     strata = rows * -(-spp // rows)  # Mitsuba would take as many itself, with a warning for every sensor
     return mi.load_dict(

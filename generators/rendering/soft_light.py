@@ -1,9 +1,9 @@
-"""Light that the moving things throw or take far around them: bounced light, wide penumbrae, dim reflections.
+"""Light that moving objects add or remove far around them: bounced light, wide penumbrae, dim reflections.
 
-It varies slowly over the image and in time, so it is not worth tracing per key. At anchor times, on every second
-pixel of every second row, cheap renderings with and without the instances from the same random numbers give the
-relative change of radiance. Smoothed over space and blended in time it multiplies the background, whose texture and
-low noise stay. Where it is below 0.5 % it is exactly zero: those pixels are the background, bit for bit.
+It varies slowly over the image and in time, so tracing it for each key is not worth the time. At anchor times, on every
+second pixel of every second row, cheap renderings with and without the instances from the same random numbers give the
+relative change of radiance. Smoothed over space and blended in time, it multiplies the background, whose texture and
+low noise remain. Below 0.5 % it is exactly zero: those pixels are the background, bit for bit.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ STEP = 2  # pixels between the anchors' samples
 SPP = 32
 MOTION_PX = 4.0  # of the fastest point between two anchors
 _SIGMA = 1.25  # of the smoothing, in anchor samples
-_FAR_SIGMA = 6.0  # fills in what an anchor cannot see, behind the objects
-_DEAD, _FULL = 0.005, 0.012  # relative change: nothing below the first, all of it above the second
+_FAR_SIGMA = 6.0  # of the smoothing that fills in samples behind the objects
+_DEAD, _FULL = 0.005, 0.012  # relative change: zero below the first, in full above the second
 
 Trace = Callable[[np.ndarray, int, bool, float], np.ndarray]
 Region = Callable[[float], np.ndarray]
 
 
 class SoftLight:
-    """The relative change of radiance outside the hard region, at any time.
+    """The relative change of radiance outside the traced region, at any time.
 
     Args:
         shape: (views, height, width).
         trace: (flat pixels [K], spp, with the instances?, t_s) -> radiance [K].
-        region: t_s -> [C, H, W] bool, the pixels that are traced at every key anyway.
+        region: t_s -> [C, H, W] bool, the pixels that every key traces.
         anchor_s: time between anchors.
     """
 
@@ -40,10 +40,10 @@ class SoftLight:
         self._anchors: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def change(self, t_s: float) -> np.ndarray:
-        """[C, H, W] float32: radiance at `t_s` over the background's, minus one; 0 where nothing is noticeable."""
+        """Return [C, H, W] float32: radiance at `t_s` over the background's, minus one; 0 for a negligible change."""
         first = int(np.floor(t_s / self._anchor_s))
         late = np.float32(t_s / self._anchor_s - first)
-        # sums and weights are blended apart: what one anchor cannot see, the other fills in
+        # sums and weights are blended separately: samples hidden at one anchor are filled in from the other
         (sum0, weight0), (sum1, weight1) = self._anchor(first), self._anchor(first + 1)
         coarse = (sum0 * (1 - late) + sum1 * late) / (weight0 * (1 - late) + weight1 * late)
         size = np.abs(coarse)
@@ -51,7 +51,7 @@ class SoftLight:
         return self._enlarge(coarse * ramp * ramp * (3 - 2 * ramp))
 
     def _enlarge(self, coarse: np.ndarray) -> np.ndarray:
-        """Bilinear from the anchors' samples [C, h, w] to pixels [C, H, W]."""
+        """Interpolate bilinearly from the anchors' samples [C, h, w] to pixels [C, H, W]."""
         for axis, size in ((1, self._shape[1]), (2, self._shape[2])):
             at = np.minimum(np.arange(size) / STEP, coarse.shape[axis] - 1)
             low = at.astype(int)
@@ -62,14 +62,14 @@ class SoftLight:
 
     @cached_property
     def _without(self) -> tuple[np.ndarray, np.ndarray]:
-        """Flat numbers [C, h, w] of the anchors' pixels and their radiance without the instances."""
+        """Return flat numbers [C, h, w] of the anchors' pixels and their radiance without the instances."""
         flat = np.arange(int(np.prod(self._shape))).reshape(self._shape)[:, ::STEP, ::STEP]
         return flat, self._trace(flat.ravel(), SPP, False, 0.0).reshape(flat.shape)
 
     def _anchor(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted sum of the relative change around each sample, and the weight: [C, h, w] each."""
+        """Return the weighted sum of the relative change around each sample, and the weight: [C, h, w] each."""
         if number not in self._anchors:
-            if len(self._anchors) > 3:  # times usually ascend; a dropped anchor comes out the same when made again
+            if len(self._anchors) > 3:  # times usually ascend; a dropped anchor can be made again, with equal values
                 del self._anchors[min(self._anchors)]
             self._anchors[number] = self._make_anchor(number * self._anchor_s)
         return self._anchors[number]
@@ -78,7 +78,7 @@ class SoftLight:
         flat, without = self._without
         seen = ~self._region(t_s)[:, ::STEP, ::STEP]
         relative, weight = np.zeros(flat.shape, np.float32), np.where(seen, without, 0).astype(np.float32)
-        # brighter samples count more: sums of radiance are smoothed, not ratios, so dark noise does not spread
+        # brighter samples have more weight: sums of radiance are smoothed, not ratios, so dark noise does not spread
         relative[seen] = self._trace(flat[seen], SPP, True, t_s) - without[seen]
         near, far = (0, _SIGMA, _SIGMA), (0, _FAR_SIGMA, _FAR_SIGMA)
         total = ndimage.gaussian_filter(relative, near) + 1e-3 * ndimage.gaussian_filter(relative, far)

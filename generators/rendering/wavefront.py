@@ -1,4 +1,4 @@
-"""Tracing lists of pixels with Mitsuba's vectorised variants: all views and all pixels that changed in one launch.
+"""Tracing lists of pixels with Mitsuba's vectorised variants: all views and all changed pixels in one launch.
 
 Import only after the variant is set: the sampler derives from the variant's `mi.Sampler`.
 """
@@ -33,13 +33,13 @@ class PixelSampler(mi.Sampler):  # type: ignore[misc]
         self.dimension = dr.zeros(mi.UInt32, dr.width(key))
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
-        """One stratified number in [0, 1) per lane."""
+        """Return one stratified number in [0, 1) per lane."""
         salt = self._next_salt()
         stratum = _shuffle(self.index, self._count, salt)
         return (mi.Float(stratum) + _unit(_hash(salt ^ (self.index * 0x68E31DA4)))) / self._count
 
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
-        """One point per lane, stratified on the grid and along both axes."""
+        """Return one point per lane, stratified on the grid and along both axes."""
         salt = self._next_salt()
         s = _shuffle(self.index, self._count, salt)
         column, row = s & (self._columns - 1), s >> (self._columns.bit_length() - 1)
@@ -56,19 +56,19 @@ class PixelSampler(mi.Sampler):  # type: ignore[misc]
 
 
 def _hash(x: mi.UInt32) -> mi.UInt32:
-    """PCG's output permutation (Jarzynski and Olano 2020): 32 bits in, 32 well mixed bits out."""
+    """Return PCG's output permutation (Jarzynski and Olano 2020): 32 bits in, 32 well mixed bits out."""
     x = x * 747796405 + 2891336453
     x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737
     return (x >> 22) ^ x
 
 
 def _unit(x: mi.UInt32) -> mi.Float:
-    """The upper 24 bits as a float in [0, 1)."""
+    """Return the upper 24 bits as a float in [0, 1)."""
     return mi.Float(x >> 8) * (1.0 / (1 << 24))
 
 
 def _shuffle(i: mi.UInt32, n: int, salt: mi.UInt32) -> mi.UInt32:
-    """A random permutation of 0..n-1, n a power of two: every step is invertible modulo n."""
+    """Return a random permutation of 0..n-1, n a power of two: every step is invertible modulo n."""
     w = n - 1
     i = (i ^ salt) & w
     i = (i * ((salt >> 4) | 1)) & w
@@ -99,7 +99,7 @@ class WavefrontTracer:
         self._keys = mi.UInt32(np.array([zlib.crc32(c.id.encode()) for c in cameras], np.uint32))
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        """Linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
+        """Return the linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
 
         A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
         """
@@ -141,21 +141,21 @@ class WavefrontTracer:
         return ray
 
     def prepare(self, origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
-        """Rays [N, 3] with unit directions, ready to be cast again and again."""
+        """Return rays [N, 3] with unit directions, prepared for repeated casts."""
         o, d = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (origins, directions))
         ray = mi.Ray3f(mi.Point3f(o), d)
         dr.eval(ray)
         return ray
 
     def cast_static(self, rays: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
-        """Where rays meet what stands still: distance [N] float32 (inf: nothing) and surface normal [N, 3] float32."""
+        """Cast rays at static surfaces. Return distance [N] (inf: no hit) and surface normal [N, 3], float32."""
         hit = self._scene.empty.ray_intersect(rays)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         dr.eval(distance, hit.n)
         return np.array(distance), np.array(hit.n).T
 
     def cast_movers(self, rays: mi.Ray3f) -> Hits:
-        """Where rays meet the moving things, which stand alone: nothing else is in the way."""
+        """Cast rays at the moving objects alone; static surfaces hide nothing."""
         hit = self._scene.movers.ray_intersect_preliminary(rays)
         number = mi.Int32(-1)
         for k, shape in enumerate(self._movers):
@@ -163,5 +163,5 @@ class WavefrontTracer:
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         face, uv = (dr.select(hit.is_valid(), a, 0) for a in (hit.prim_index, hit.prim_uv))
         dr.eval(distance, number, face, uv)
-        place = np.array(face, np.int64), np.array(uv, np.float64).T
-        return self._scene.hits(np.array(distance), np.array(number), *place)
+        where = np.array(face, np.int64), np.array(uv, np.float64).T
+        return self._scene.hits(np.array(distance), np.array(number), *where)

@@ -1,1 +1,1 @@
-"""Tables and images of scenes and of what their making costs."""
+"""Tables and images of scenes and of the cost of making them."""

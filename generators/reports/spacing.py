@@ -1,8 +1,8 @@
-"""`spacing`: how far apart key frames may lie. Error of interpolated radiance and of spikes against render time.
+"""`spacing`: the error of interpolated radiance and of spikes against render time, for several key-frame spacings.
 
-One view of a world is rendered at every tick: the truth. Then only every 2nd, 4th, 8th ... of these frames is kept and
-the ticks between are interpolated, linearly and by the simulator's clamped Catmull-Rom curve. Errors are taken where
-and while something moves: in windows of 32 ticks, at pixels whose radiance varies by more than 1 % in the window.
+One view of a world is rendered at every tick: the truth. Then only every 2nd, 4th, 8th ... of these frames is kept, and
+the ticks between are interpolated, linearly and by the simulator's clamped Catmull-Rom curve. Errors are taken in
+windows of 32 ticks, at pixels whose radiance varies by more than 1 % in the window.
 """
 
 from __future__ import annotations
@@ -95,9 +95,9 @@ def spacing(
 def compare(
     frames: Float32, speed_px_s: float, seconds_per_key: float, spacings: Sequence[int], seed: int = 0
 ) -> list[Row]:
-    """Rows for each spacing and interpolation, from frames [n + 1, H, W] at every tick's start.
+    """Return a row for each spacing and interpolation, from frames [n + 1, H, W] at every tick's start.
 
-    The last row is a yardstick: the counts that another random initial phase changes, with exact radiance.
+    The last row is a yardstick: the change of counts with another random initial phase, and exact radiance.
     """
     n = len(frames) - 1
     truth = np.stack(list(tick_means(frames, range(n + 1), n)))
@@ -119,7 +119,7 @@ def compare(
 
 
 def linear_means(keys: Float32, key_ticks: Sequence[int], n_ticks: int) -> Iterator[Float64]:
-    """Mean radiance [H, W] of each tick on straight lines between the keys."""
+    """Yield the mean radiance [H, W] of each tick on straight lines between the keys."""
     for k, (start, end) in enumerate(itertools.pairwise(key_ticks)):
         for tick in range(start, min(end, n_ticks)):
             u = (tick + 0.5 - start) / (end - start)
@@ -127,19 +127,19 @@ def linear_means(keys: Float32, key_ticks: Sequence[int], n_ticks: int) -> Itera
 
 
 def _windows(values: NDArray[Any]) -> NDArray[Any]:
-    """[n, H, W] -> [n / 32, 32, H, W]."""
+    """Split values [n, H, W] into windows [n / 32, 32, H, W]."""
     return values.reshape(-1, WINDOW, *values.shape[1:])
 
 
 def _moving(frames: Float32) -> NDArray[np.bool_]:
-    """[n / 32, H, W]: pixels whose radiance varies in the window."""
+    """Return [n / 32, H, W]: pixels whose radiance varies in the window."""
     parts = _windows(frames[:-1])
     low, high = parts.min(1), parts.max(1)
     return np.asarray(high - low > _VARIES * np.maximum(high, _FLOOR))
 
 
 def _errors(means: Float64, truth: Float64, moving: NDArray[np.bool_]) -> tuple[float, float, float]:
-    """Percent: mean error of the window integral, mean and 99.9th percentile of the tick's radiance."""
+    """Return in percent: mean error of the window integral, mean and 99.9th percentile of the tick's radiance."""
     a, b = _windows(means), _windows(truth)
     integral = np.abs(a.sum(1) - b.sum(1)) / np.maximum(b.sum(1), _FLOOR * WINDOW)
     tick = (np.abs(a - b) / np.maximum(b, _FLOOR)).transpose(0, 2, 3, 1)[moving]
@@ -147,7 +147,7 @@ def _errors(means: Float64, truth: Float64, moving: NDArray[np.bool_]) -> tuple[
 
 
 def _counts(means: Float64, charge: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Spikes per window [n / 32, H, W]."""
+    """Return the spikes per window [n / 32, H, W]."""
     spikes = np.stack([fired for fired, _ in fire(iter(means), Sensor(), charge)])
     return np.asarray(_windows(spikes).sum(1))
 
@@ -159,7 +159,7 @@ def _share_off(a: NDArray[np.int64], b: NDArray[np.int64], moving: NDArray[np.bo
 def _render(
     world: Any, size: tuple[int, int], n: int, spp: int, seed: int, console: Any
 ) -> tuple[Float32, float, float]:
-    """Frames [n + 1, H, W] at every tick, speed of the fastest point in px/s, seconds per frame."""
+    """Return the frames [n + 1, H, W] at every tick, speed of the fastest point in px/s, seconds per frame."""
     from rich.progress import Progress
 
     from spike4dgs.generators.rendering.image_motion import max_image_speed
@@ -168,7 +168,7 @@ def _render(
 
     views = cameras(world, *size, [HELD_OUT_VIEW])
     renderer = MultiViewRenderer(world, views, seed=seed, spp=spp, background_spp=4 * spp)
-    renderer.keys(0.0)  # the background and the compilation of kernels are no cost of a key
+    renderer.keys(0.0)  # background and compilation of kernels are not part of a key's time
     start = time.perf_counter()
     with Progress(console=console, disable=not console.is_terminal) as bars:
         ticks = bars.track(range(n + 1), description="every tick")
@@ -205,7 +205,7 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
         )
     for r in (r for r in rows if r.interpolation == _PHASE):
         middle.axhline(r.counts_off, color="0.5", linestyle=":", label=_PHASE)
-    left.set(ylabel="error of the radiance (% of the true one)", title="radiance where something moves")
+    left.set(ylabel="error of the radiance (% of the true one)", title="radiance at moving pixels")
     middle.set(
         ylabel=f"counts off by one or more (% of {WINDOW}-tick windows)", title="spike counts, same initial phase"
     )
@@ -233,7 +233,7 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
 def _show(rows: Sequence[Row], console: Any) -> None:
     from rich.table import Table
 
-    table = Table(box=None, title="errors in % where something moves")
+    table = Table(box=None, title="errors in % at moving pixels")
     for f in fields(Row):
         text = f.name == "interpolation"
         table.add_column(f.name.replace("_", " "), justify="left" if text else "right", no_wrap=text)

@@ -26,7 +26,7 @@ _SPIKEZOO = "spikezoo video2spike_simulation"
 def simulate_numpy(
     keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32
 ) -> Iterator[UInt8]:
-    """The same model in plain numpy, float32, whole images at a time: what one writes first. Yields packed ticks."""
+    """Yield packed ticks of the same model in plain NumPy: float32, whole images at a time, the obvious program."""
     level = (charge / THRESHOLD).astype(np.float32)
     gain = np.float32(sensor.radiance_gain) * (np.float32(1) if sensor.gain is None else sensor.gain)
     dark = np.float32(0) if sensor.dark is None else sensor.dark
@@ -46,7 +46,7 @@ def simulate_numpy(
 def exact_counts(
     keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32
 ) -> NDArray[np.int64]:
-    """Spikes per pixel of the float64 twin, flat, in file order (rows bottom-up)."""
+    """Return the spikes per pixel of the float64 twin, flat, in file order (rows bottom-up)."""
     total = np.zeros(charge.shape, dtype=np.int64)
     for fired, _ in fire(tick_means(keys, ticks.tolist(), n_ticks), sensor, charge):
         total += fired
@@ -54,7 +54,7 @@ def exact_counts(
 
 
 def pattern(height: int, width: int, n_keys: int, moving: float) -> Float32:
-    """Keys [K, H, W]: a smooth pattern, drifting in the left `moving` share of the image, still in the rest."""
+    """Return keys [K, H, W]: a smooth pattern, drifting in the left `moving` share of the image, static in the rest."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     shift = np.where(x < moving * width, 0.5, 0.0) * np.arange(n_keys)[:, None, None]
     light = 0.45 + 0.4 * np.sin((x - shift) / 5) * np.cos(y / 7)
@@ -63,7 +63,7 @@ def pattern(height: int, width: int, n_keys: int, moving: float) -> Float32:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One simulator to time: a call that gives packed spikes, and the counts that it should find."""
+    """One simulator to time: a call that returns packed spikes, and the exact counts."""
 
     name: str
     threads: str
@@ -74,7 +74,7 @@ class Run:
 def simulate(argv: Sequence[str] = ()) -> int:
     """Time the simulator on one and two threads, plain numpy, and spikezoo; print speeds, ratios and errors.
 
-    spikezoo's function takes one frame for each tick: it gets them ready-made, and models neither maps nor noise.
+    spikezoo's function takes one frame for each tick: the frames are made in advance; it models neither maps nor noise.
     """
     p = argparse.ArgumentParser("spike4dgs speed simulate", description=simulate.__doc__)
     p.add_argument("--width", type=int, default=400)
@@ -82,8 +82,8 @@ def simulate(argv: Sequence[str] = ()) -> int:
     p.add_argument("--ticks", type=int, default=1000)
     p.add_argument("--spacing", type=int, default=10, help="ticks between key frames")
     p.add_argument("--moving", type=float, default=1.0, help="share of the image that moves")
-    p.add_argument("--repeats", type=int, default=5, help="the median of so many runs counts")
-    p.add_argument("--csv", type=Path, help="write the table here too")
+    p.add_argument("--repeats", type=int, default=5, help="number of timed runs, of which the median counts")
+    p.add_argument("--csv", type=Path, help="also write the table to this file")
     a = p.parse_args(list(argv))
     n_keys = -(-a.ticks // a.spacing) + 1
     keys, ticks = pattern(a.height, a.width, n_keys, a.moving), np.arange(n_keys, dtype=np.int64) * a.spacing
@@ -113,7 +113,7 @@ def simulate(argv: Sequence[str] = ()) -> int:
 
 
 def _our_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run]:
-    """Plain numpy first, then the simulator with more and with fewer of its terms."""
+    """Return plain NumPy first, then the simulator with more and with fewer of its terms."""
     height, width = keys.shape[1:]
     pixels, charge = (height, width, 0, "cam_00"), random_charge(height, width, [0])
     plain, maps = Sensor(), Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
@@ -137,9 +137,9 @@ def _our_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run
 
 
 def _spikezoo_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> list[Run]:
-    """spikezoo's simulator, where it is installed, on ready-made frames.
+    """Return spikezoo's simulator on ready-made frames, if it is installed.
 
-    It draws its initial charges from numpy's global generator, which is seeded so that the exact counts are known.
+    It draws its initial charges from NumPy's global generator, which is seeded so that the exact counts are known.
     """
     if (other := _spikezoo()) is None:
         return []
@@ -156,7 +156,7 @@ def _spikezoo_runs(keys: Float32, ticks: NDArray[np.int64], n_ticks: int) -> lis
 
 
 def _spikezoo() -> Callable[..., Any] | None:
-    """spikezoo's simulator, from its one file: importing the package would load its networks."""
+    """Return spikezoo's simulator, from its one file: importing the package would load its networks."""
     try:
         return getattr(module_of("spikezoo", "utils/spike_utils.py"), "video2spike_simulation", None)
     except ImportError as e:

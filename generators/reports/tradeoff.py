@@ -1,8 +1,8 @@
-"""`tradeoff`: what each saving of the renderer costs in error and gains in time, for one world and profile.
+"""`tradeoff`: error and time of each saving of the renderer, for one world and profile.
 
-Around a few random ticks the keys that are needed there are rendered with different settings, and the radiance that the
-sensor would see at these ticks is compared with full renderings of four times the profile's samples. Time is the mean
-time of the keys of each spacing, times how many of them a clip of the profile's length has.
+The keys around a few random ticks are rendered with different settings. The radiance that the sensor would receive at
+these ticks is compared with full renderings of four times the profile's samples. The time is the mean time of the keys
+of each spacing, times their number in a clip of the profile's length.
 """
 
 from __future__ import annotations
@@ -26,10 +26,18 @@ from spike4dgs.generators.profiles import PROFILES, RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.tasks import RenderKeys, RenderStills, Stills, cameras_of, held_out_view, plan_of, world_of
+from spike4dgs.generators.tasks import (
+    RenderKeys,
+    RenderStatic,
+    StaticParts,
+    cameras_of,
+    held_out_view,
+    plan_of,
+    world_of,
+)
 
 _TICKS = 3
-_MORE = 4  # times the samples, of the truth
+_MORE = 4  # times the profile's samples, for the truth
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class Row:
 
 
 def settings(job: Job) -> dict[str, Job]:
-    """The settings that are compared, the profile's own first."""
+    """Return the settings that are compared, the profile's own first."""
     p = job.profile
     return {
         f"as shipped: {p.spp} samples, {p.max_key_px:g} px": job,
@@ -89,12 +97,12 @@ def tradeoff(
     console.print(f"truth at ticks {ticks}, {_MORE * p.spp} samples a pixel")
     truth, moving = _truth(job, ticks)
     rows: list[Row] = []
-    stills: dict[int, Stills] = {}
+    static: dict[int, StaticParts] = {}
     for name, changed in settings(job).items():
         spp = changed.profile.spp
-        if spp not in stills:
-            stills[spp] = RenderStills(changed)(None)
-        rows.append(_measure(name, changed, stills[spp], ticks, truth, moving))
+        if spp not in static:
+            static[spp] = RenderStatic(changed)(None)
+        rows.append(_measure(name, changed, static[spp], ticks, truth, moving))
         console.print(f"{name}: {rows[-1].keys_minutes:.1f} min, {rows[-1].mean_percent:.2f} %", markup=False)
         _write(rows, out / f"{world}.csv")  # after every setting: the last ones take longest
         title = f"{world}, {profile}: {p.width}x{p.height}, {p.seconds * 1e3:g} ms, {len(p.views)} views"
@@ -104,9 +112,9 @@ def tradeoff(
 
 
 def needed(plan: KeyPlan, ticks: Sequence[int]) -> list[int]:
-    """The keys that the radiance at these ticks is made of (as `KeyStore.radiance` goes through them).
+    """Return the keys from which `KeyStore.radiance` computes the radiance at these ticks.
 
-    At least one of every spacing is among them, because its time is wanted.
+    They include at least one of every spacing, so that its time can be measured.
     """
     chain, last = plan.chain, plan.ticks[-1]
     seen: set[int] = set()
@@ -141,17 +149,17 @@ def _truth(job: Job, ticks: Sequence[int]) -> tuple[NDArray[np.float32], NDArray
 def _measure(
     name: str,
     job: Job,
-    stills: Stills,
+    static: StaticParts,
     ticks: Sequence[int],
     truth: NDArray[np.float32],
     moving: NDArray[np.bool_],
 ) -> Row:
-    plan, task = plan_of(job), RenderKeys(job, stills.still)
+    plan, task = plan_of(job), RenderKeys(job, static.views)
     seconds: dict[int, list[float]] = {level: [] for level in range(len(plan.chain))}
     with tempfile.TemporaryDirectory() as folder:
         store = KeyStore(Path(folder))
-        store.set_still(stills.still)
-        task(plan.ticks[:1])  # compilation is no cost of a key
+        store.set_static(static.views)
+        task(plan.ticks[:1])  # compilation is not part of a key's time
         for tick in needed(plan, ticks):
             start = time.perf_counter()
             ((_, arrays),) = task([tick])
@@ -177,7 +185,7 @@ def _plot(rows: Sequence[Row], path: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 5), layout="constrained")
-    markers = "os^vDPX"  # settings that cost the same lie on each other
+    markers = "os^vDPX"  # settings of equal cost lie on each other
     for axes, kind, where in zip(
         figure.subplots(1, 2), ("", "_moving"), ("whole image", "where it moves"), strict=True
     ):

@@ -1,4 +1,4 @@
-"""`worlds`: one table of all worlds: how fast, how much of the image moves, how deep, how often a key, how long."""
+"""`worlds`: one table of all worlds: speed, share of moving pixels, depth, key spacing, time to make."""
 
 from __future__ import annotations
 
@@ -76,11 +76,11 @@ def _row(job: Job, reports: Path | None) -> list[str]:
     from spike4dgs.generators.tasks import cameras_of, held_out_view, plan_of, world_of
 
     world, views, view = world_of(job), cameras_of(job), held_out_view(job)
-    sight = MultiViewRenderer(world, views[view : view + 1], seed=job.seed, spp=1, background_spp=1)
+    renderer = MultiViewRenderer(world, views[view : view + 1], seed=job.seed, spp=1, background_spp=1)
     depths, moving = [], []
     for t in np.linspace(0, job.seconds, _TIMES):
-        moving.append(float(sight.object_masks(t).mean()))
-        depths.append(sight.depths(t))
+        moving.append(float(renderer.object_masks(t).mean()))
+        depths.append(renderer.depths(t))
     near, far = (float(f(d[np.isfinite(d)])) for f, d in ((np.min, np.stack(depths)), (np.max, np.stack(depths))))
     plan, speed = plan_of(job), max_image_speed(world, views, job.seconds)
     spacing = " / ".join(str(s) for s in plan.chain) + (f", {plan.sub_ticks} a tick" if plan.sub_ticks > 1 else "")

@@ -1,7 +1,7 @@
 """Calibration recordings of the simulated cameras, and the command that turns recordings into maps.
 
-`calibrate` estimates the maps of a scene's cameras (`benchmark.calibration`) and, where the truth is known, says how
-far off they are.
+`calibrate` estimates the maps of a scene's cameras (`benchmark.scene.calibration`) and, where the truth is known, their
+errors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DARK_TICKS = 2000  # 100 ms: the darkest hundredth of the pixels fires every 670
 
 
 def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Sequence[int]) -> None:
-    """Record folder/flat/CAM.dat and folder/dark/CAM.dat with a simulated camera. `entropy`: of the initial charges."""
+    """Record folder/flat/CAM.dat and folder/dark/CAM.dat with a simulated camera; `entropy`: of initial charges."""
     for name, radiance, n_ticks in (("flat", FLAT_RADIANCE, FLAT_TICKS), ("dark", 0.0, DARK_TICKS)):
         keys = [np.full((camera.height, camera.width), radiance, np.float32)] * 2
         charge = random_charge(camera.height, camera.width, [*entropy, *name.encode()])
@@ -41,7 +41,7 @@ def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Seq
 def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) -> int:
     """Estimate gain and dark maps of a scene's cameras from its flat-field and dark recordings: OUT/CAM.npz and .png.
 
-    Where the scene holds the true maps (truth/), the table says how far off the estimates are.
+    Where the scene holds the true maps (truth/), the table lists the errors of the estimates.
 
     Args:
         scene: Scene folder with calibration/flat and calibration/dark.
@@ -50,7 +50,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
     from rich.console import Console
     from rich.table import Table
 
-    opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not looked at
+    opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not used
     table = Table(
         "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
     )
@@ -61,7 +61,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
             raise problem(scene / "scene.json", "calibration recordings", f"none of {camera.id}", fix)
         found = estimate(recordings)
         write_maps(out / f"{camera.id}.npz", {"gain": found.gain, "dark": found.dark})
-        _draw(found, out / f"{camera.id}.png", camera.id)
+        _plot(found, out / f"{camera.id}.png", camera.id)
         level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
         row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
         table.add_row(*row, *(f"{e:.3f}" if e is not None else "-" for e in truth_errors(opened, camera, found)))
@@ -71,7 +71,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
 
 
 def truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[float | None, float | None]:
-    """RMS error in percent of gain and dark map, each relative to the truth; None where the truth is not known."""
+    """Return the RMS errors in percent of gain and dark map, relative to the truth; None where the truth is unknown."""
     path = f"truth/{camera.id}.npz"
     if path not in scene.manifest.files:
         return None, None
@@ -81,7 +81,7 @@ def truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[floa
     return errors[0], errors[1]
 
 
-def _draw(found: Calibration, path: Path, title: str) -> None:
+def _plot(found: Calibration, path: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")

@@ -1,7 +1,7 @@
-"""The inner loop of `sensor`: 64 pixels of a tick become one word.
+"""The inner loop of `sensor.model`: 64 pixels of a tick become one word.
 
-numba vectorises the loops over 64 pixels; only the collection of their sign bits is written as vector code by hand.
-With shot noise other loops run, so that without it nothing is spent on it.
+numba vectorises the loops over 64 pixels; only the collection of their sign bits is vector code written by hand.
+Shot noise has loops of its own, so that it costs nothing when it is off.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 
 BLOCK = 64  # pixels whose spikes make one word
-STRIP = 16  # blocks taken through all intervals of a batch before the next: 128 bytes of a row, two cache lines
+STRIP = 16  # blocks that go through all intervals of a batch before the next strip: 128 bytes of a row, two cache lines
 
 
 @intrinsic
 def _sign_bits(typing_context: Any, values: Any) -> Any:
-    """Sign bits of an int32 array's first 64 entries as one uint64, entry 0 in the lowest bit.
+    """Return the sign bits of an int32 array's first 64 entries as one uint64, entry 0 in the lowest bit.
 
     Written as vector IR because no compiler finds this from a loop; it becomes a few mask instructions.
     """
@@ -76,7 +76,7 @@ def integrate(
                 d = dark[p : p + BLOCK] if len(dark) > BLOCK else dark
                 c[:] = charge[p : p + BLOCK]
                 out = words[start:stop, block]
-                constant = means or _still(k0, k1, k2, k3)
+                constant = means or _equal(k0, k1, k2, k3)
                 if constant:
                     _steady(k1, g, d, radiance_gain, unit, increment)
                 else:
@@ -94,8 +94,8 @@ def integrate(
 
 
 @kernel
-def _still(k0: Any, k1: Any, k2: Any, k3: Any) -> bool:
-    """Whether the four keys [64] are equal."""
+def _equal(k0: Any, k1: Any, k2: Any, k3: Any) -> bool:
+    """Return whether the four keys [64] are equal."""
     different = np.uint32(0)
     for i in range(BLOCK):
         different += np.uint32((k0[i] != k1[i]) | (k1[i] != k2[i]) | (k2[i] != k3[i]))
@@ -104,7 +104,7 @@ def _still(k0: Any, k1: Any, k2: Any, k3: Any) -> bool:
 
 @kernel
 def _steady(k: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, increment: Any) -> None:
-    """Increments [64] of pixels whose radiance does not change."""
+    """Write the increments [64] of pixels whose radiance does not change."""
     top = np.float64(THRESHOLD - 1)
     for i in range(BLOCK):
         x = (np.float64(g[i]) * radiance_gain * np.float64(k[i]) + np.float64(d[i])) * unit
@@ -114,7 +114,7 @@ def _steady(k: Any, g: Any, d: Any, radiance_gain: Any, unit: Any, increment: An
 
 @kernel
 def _constant(increment: Any, c: Any, words: Any) -> None:
-    """Ticks of 64 pixels whose radiance does not change: one integer addition each."""
+    """Write the ticks of 64 pixels whose radiance does not change: one integer addition each."""
     for j in range(len(words)):
         for i in range(BLOCK):
             c[i] = (c[i] & np.int32(0x7FFFFFFF)) + increment[i]
@@ -127,7 +127,7 @@ def _constant(increment: Any, c: Any, words: Any) -> None:
 def _prepare(
     k0: Any, k1: Any, k2: Any, k3: Any, weights: Any, g: Any, d: Any, radiance_gain: Any, one: Any, n: Any, w: Any
 ) -> None:
-    """Polynomial in u (rows 0..3 of `w` [6 * 64]) and limits (rows 4, 5) of the increment, in charge units."""
+    """Write polynomial in u (rows 0..3 of `w` [6 * 64]) and limits (rows 4, 5) of the increment, in charge units."""
     zero, top = np.float32(0.0), np.float32(THRESHOLD - 128)  # the largest float32 below
     width2, width3 = np.float32(1.0 / (12.0 * n * n)), np.float32(1.0 / (4.0 * n * n))
     for i in range(BLOCK):
@@ -153,7 +153,7 @@ def _prepare(
 
 @kernel
 def _changing(w: Any, n: Any, c: Any, words: Any) -> None:
-    """Ticks of 64 pixels along the polynomials that `_prepare` left in `w`."""
+    """Write the ticks of 64 pixels along the polynomials that `_prepare` left in `w`."""
     for j in range(len(words)):
         u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
         for i in range(BLOCK):
@@ -165,7 +165,7 @@ def _changing(w: Any, n: Any, c: Any, words: Any) -> None:
 
 @kernel
 def _along(w: Any, i: Any, u: Any) -> Any:
-    """Increment of pixel i at u."""
+    """Return the increment of pixel i at u."""
     cubic = w[2 * BLOCK + i] + u * w[3 * BLOCK + i]
     x = w[i] + u * (w[BLOCK + i] + u * cubic)
     low, high = w[4 * BLOCK + i], w[5 * BLOCK + i]
@@ -178,7 +178,7 @@ def _along(w: Any, i: Any, u: Any) -> Any:
 
 @kernel
 def mix(x: Any) -> Any:
-    """32 bits in, 32 well mixed bits out, one to one (multiplications and shifts of Ellis' lowbias32)."""
+    """Return 32 well mixed bits of 32 bits, one to one (multiplications and shifts of Ellis' lowbias32)."""
     x = np.uint32(x ^ (x >> np.uint32(16)))
     x = np.uint32(x * np.uint32(0x7FEB352D))
     x = np.uint32(x ^ (x >> np.uint32(15)))
@@ -188,9 +188,9 @@ def mix(x: Any) -> Any:
 
 @kernel
 def deviate(pixel: Any, tick: Any) -> Any:
-    """A nearly Gaussian integer in -510 .. 510, variance 21845: the sum of four random bytes, less its mean.
+    """Return a nearly Gaussian integer in -510 .. 510, variance 21845: the sum of four random bytes, less its mean.
 
-    A function of the hashes of pixel and tick alone.
+    It is a function of the hashes of pixel and tick alone.
     """
     x = mix(np.uint32(pixel ^ tick))
     pairs = np.uint32((x & np.uint32(0x00FF00FF)) + ((x >> np.uint32(8)) & np.uint32(0x00FF00FF)))
@@ -211,7 +211,7 @@ def _noisy(
     noise: Any,
     words: Any,
 ) -> None:
-    """Ticks of 64 pixels whose every spike takes its own, slightly different charge; see `sensor`."""
+    """Write the ticks of 64 pixels where every spike takes a slightly different charge; see `sensor.model`."""
     for j in range(len(words)):
         u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
         for i in range(BLOCK):

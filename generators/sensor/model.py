@@ -1,6 +1,6 @@
 """The spike camera: radiance key frames in, packed spikes out, in one pass.
 
-Model (subtractive integrate-and-fire). In every tick a pixel gains the charge
+Model (subtractive integrate-and-fire, constants in `benchmark.spikes.sensor_model`). In a tick a pixel gains the charge
 
     increment = gain * radiance_gain * (mean radiance over the tick) + dark
 
@@ -29,7 +29,7 @@ row that do not change over four keys are computed in float64 and rounded down t
 float32, each off by less than 2^-22 of the largest key around it: over N ticks the charge differs from exact arithmetic
 by less than N 2^-22 (0.024 at N = 10^5) in unsaturated light, the count by at most one spike. No fused multiply-add is
 used, so every processor gives the same bits.
-`sensor_reference` is the slow twin, `sensor_kernels` the inner loop.
+`sensor.reference` is the slow twin, `sensor.kernels` the inner loop.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
-DEVIATE_SD = 21845**0.5  # of `sensor_kernels.deviate`
+DEVIATE_SD = 21845**0.5  # of `sensor.kernels.deviate`
 MOST_DEVIATION = 510 / DEVIATE_SD
 _BATCH_BYTES = 16 << 20  # of key frames in memory at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What one camera does to light; None is off, and costs nothing.
+    """The response of one camera to light; None is off, and costs nothing.
 
     Attributes:
         radiance_gain: spikes per tick of a pixel that sees radiance 1.
         gain: [H, W], relative sensitivity, mean 1.
         dark: [H, W], spikes per tick in the dark.
-        photons: number of photons to a spike, for shot noise; at least 100.
-        noise_seed: what its random numbers are a function of.
+        photons: number of photons per spike, for shot noise; at least 100.
+        noise_seed: seed of the shot noise.
     """
 
     radiance_gain: float = SENSOR.radiance_gain
@@ -83,7 +83,7 @@ class Sensor:
 
 
 def random_charge(height: int, width: int, entropy: Sequence[int]) -> Int32:
-    """Initial charges [H, W], uniform in [0, threshold), a function of `entropy` (seed, camera, ...) alone."""
+    """Return initial charges [H, W], uniform in [0, threshold), a function of `entropy` (seed, camera, ...) alone."""
     bits = np.random.PCG64(np.random.SeedSequence(list(entropy))).random_raw(height * width)
     return np.asarray(bits >> np.uint64(33)).astype(np.int32).reshape(height, width)
 
@@ -137,7 +137,7 @@ def simulate(
 
 
 def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
-    """Room below zero in thresholds, charge units of a threshold, and charge units of one step of `deviate`."""
+    """Return the room below zero in thresholds, and the charge units of a threshold and of one step of `deviate`."""
     if sensor.photons is None:
         return 0.0, float(THRESHOLD), np.int32(0)
     sd = sensor.photons**-0.5
@@ -173,7 +173,7 @@ def _store(image: NDArray[Any], out: NDArray[Any]) -> None:
 
 
 def _stored_map(image: Float32 | None, off: float, blocks: int) -> Float32:
-    """A map in file order; one block of constants, which never leaves the first-level cache, where it is off."""
+    """Return a map in file order; where it is off, one block of constants, which never leaves the first-level cache."""
     if image is None:
         return np.full(BLOCK, off, dtype=np.float32)
     stored = np.zeros(blocks * BLOCK, dtype=np.float32)
@@ -192,7 +192,7 @@ def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int) -> No
 
 
 def _tangent_weights(ticks: NDArray[np.int64]) -> Float32:
-    """Weights [K - 1, 2] that turn p2 - p0 and p3 - p1 into the tangents of an interval, times its length.
+    """Return weights [K - 1, 2] that turn p2 - p0 and p3 - p1 into the tangents of an interval, times its length.
 
     At the clip's ends the missing key repeats its neighbour and the weight is 1: the slope of the interval itself.
     """
@@ -203,6 +203,6 @@ def _tangent_weights(ticks: NDArray[np.int64]) -> Float32:
 
 
 def _shares(blocks: int, threads: int) -> list[int]:
-    """Bounds of the threads' ranges of blocks, at whole strips so that no cache line has two writers."""
+    """Return bounds of the threads' ranges of blocks, at whole strips so that no cache line has two writers."""
     strips = -(-blocks // STRIP)
     return [min(blocks, strips * t // threads * STRIP) for t in range(threads + 1)]

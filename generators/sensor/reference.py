@@ -1,4 +1,4 @@
-"""The spike camera of `sensor` again: float64, one tick and one step after the other, slow and obvious."""
+"""The slow twin of `sensor.model`: float64, one tick and one step after the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _exact(image: Float32) -> Float64:
 
 
 def hermite(p1: Float64, p2: Float64, slope1: Float64, slope2: Float64, length: float, x: float) -> Float64:
-    """The cubic through p1 at x = 0 and p2 at x = length with these slopes per tick, at x."""
+    """Return the cubic through p1 at x = 0 and p2 at x = length with these slopes per tick, at x."""
     u = x / length
     h00, h10 = (1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2
     h01, h11 = u * u * (3 - 2 * u), u * u * (u - 1)
@@ -27,7 +27,7 @@ def hermite(p1: Float64, p2: Float64, slope1: Float64, slope2: Float64, length: 
 
 
 def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[Float64]:
-    """Mean radiance [H, W] of ticks 0 .. n_ticks - 1: Catmull-Rom through the keys, clamped to the neighbouring two."""
+    """Yield mean radiance [H, W] of ticks 0 .. n_ticks - 1: Catmull-Rom through the keys, clamped to the next two."""
     last = len(key_ticks) - 1
 
     def slope(k: int) -> Float64:
@@ -46,7 +46,7 @@ def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[F
 
 
 def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
-    """Spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
+    """Yield spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
     sd = 0.0 if sensor.photons is None else sensor.photons**-0.5
     height, width = charge.shape
     pixels = np.arange(height * width, dtype=np.uint64).reshape(height, width)[::-1]  # as the file numbers them
@@ -61,7 +61,7 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
 
 
 def deviates(pixels: NDArray[np.uint64], tick: int, key: int) -> Float64:
-    """The simulator's random numbers of a tick, mean 0 and variance 1: four bytes of a 32-bit hash, summed."""
+    """Return the simulator's random numbers of a tick, mean 0 and variance 1: four bytes of a 32-bit hash, summed."""
 
     def mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
         for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B), (16, 1)):
@@ -77,7 +77,7 @@ def deviates(pixels: NDArray[np.uint64], tick: int, key: int) -> Float64:
 def simulate_reference(
     keys: Keys, key_ticks: Sequence[int], n_ticks: int, sensor: Sensor, charge: Int32, means: bool = False
 ) -> NDArray[np.bool_]:
-    """Spikes [n_ticks, H, W], upright and unpacked: the arguments are those of `sensor.simulate`."""
+    """Return spikes [n_ticks, H, W], upright and unpacked; the arguments are those of `sensor.model.simulate`."""
     if means:
         return np.stack([fired for fired, _ in fire((_exact(key) for key in keys), sensor, charge)])
     return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge)])

@@ -1,4 +1,4 @@
-"""The worlds that the benchmark renders: every one a function of (seed, variant, duration). One line per world."""
+"""The worlds that the benchmark renders, each a function of (seed, variant, duration): one entry per world."""
 
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene

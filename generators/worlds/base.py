@@ -1,4 +1,4 @@
-"""What a world is: plain data (numpy meshes, textures, poses) that knows nothing of the renderer."""
+"""The description of a world: plain data (NumPy meshes, textures, poses), independent of the renderer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spike4dgs.generators.worlds.primitives.meshes import Mesh
 
 
 class Part(NamedTuple):
-    """One surface: a mesh and what it is made of."""
+    """One surface: a mesh and its material."""
 
     mesh: Mesh
     material: Material
@@ -21,12 +21,12 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Deforming:
-    """A moving surface whose vertices go their own ways: wings, or many rigid bodies merged into one mesh.
+    """A moving surface whose vertices move independently: wings, or many rigid bodies merged into one mesh.
 
     Attributes:
-        part: topology, texture coordinates and material; its vertices are only placeholders of the right number.
+        part: topology, texture coordinates and material; only the number of its vertices is used, not their positions.
         vertices: time in seconds -> [N, 3] float64 world positions, always in the order of `part.mesh.vertices`.
-        bodies: [M] int64, the body that each face belongs to, from 0 up without holes; None where it is one body.
+        bodies: [M] int64, the body that each face belongs to, numbered from 0 without gaps; None for a single body.
     """
 
     part: Part
@@ -36,7 +36,7 @@ class Deforming:
 
 @dataclass(frozen=True)
 class RigSpec:
-    """A 3x3 array of parallel-ish cameras.
+    """A 3x3 array of nearly parallel cameras.
 
     Attributes:
         center: position of the middle camera, world metres.
@@ -55,22 +55,22 @@ class RigSpec:
 
 @dataclass(frozen=True, eq=False)
 class WorldScene:
-    """One concrete world: what stands still, what moves, light and cameras. Metres, Z up, X right, Y away.
+    """One concrete world: static surfaces, moving surfaces, light and cameras. Metres, Z up, X right, Y away.
 
     Attributes:
         name: key in `WORLDS`.
-        seed, variant, duration_s: the arguments it was built from; equal arguments give equal scenes.
+        seed, variant, duration_s: the arguments of `build`; equal arguments give equal scenes.
         static: surfaces that never move.
         groups: rigid groups of surfaces in their own coordinates; an instance shows one group at a pose.
         instances: instance name -> group name. Only these and `deforming` move.
         emitters: Mitsuba emitter dictionaries (numbers, lists and numpy arrays only).
         poses: time in seconds -> {instance name: [4, 4] float64 local-to-world}.
-        exposure: factor from rendered radiance to scene units, in which white paper in full light is 1.0.
+        exposure: factor from rendered radiance to scene units, in which white paper in full light has radiance 1.
         rig: the camera array.
-        shadow_sources: [K, 4] homogeneous points of the main light (w = 0: at infinity); a surface point whose line to
-            one of them is crossed by a moving instance lies in its shadow.
+        shadow_sources: [K, 4] homogeneous points of the main light (w = 0: at infinity). A surface point is in the
+            shadow of a moving instance if the instance crosses its line to one of them.
         depth_range: (near, far) metres that enclose everything the cameras see.
-        notes: physical facts worth recording with the data (speed, size), name -> number with the unit in the name.
+        notes: physical facts to record with the data (speed, size), name -> number with the unit in the name.
         deforming: moving surfaces that are not rigid, name -> surface.
     """
 
@@ -91,8 +91,8 @@ class WorldScene:
     deforming: Mapping[str, Deforming] = field(default_factory=dict)
 
     @property
-    def thing_names(self) -> tuple[str, ...]:
-        """Names of the moving things: instances, then deforming surfaces, or the bodies of those that have several."""
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the moving objects: instances, then deforming surfaces, or the bodies of those with several."""
         names = list(self.instances)
         for name, surface in self.deforming.items():
             bodies = surface.bodies
@@ -100,7 +100,7 @@ class WorldScene:
         return tuple(names)
 
     def moving_points(self, t_s: float) -> np.ndarray:
-        """World positions of all moving vertices at `t_s`, always in the same order: [N, 3] float64."""
+        """Return the world positions of all moving vertices at `t_s`, always in the same order: [N, 3] float64."""
         poses = self.poses(t_s)
         chunks = []
         for instance, group in self.instances.items():
@@ -120,5 +120,5 @@ class World:
 
 
 def rng_for(name: str, seed: int, variant: int) -> np.random.Generator:
-    """The one random stream of a world, a function of its name, seed and variant."""
+    """Return the random generator of a world, a function of its name, seed and variant."""
     return np.random.default_rng([seed, variant, *name.encode()])

@@ -32,7 +32,7 @@ _TEAMS = (  # rider, colour of the frame
 
 @dataclass(frozen=True)
 class _Run:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 14.0
     lane_y_m: float = 0.7
@@ -41,7 +41,7 @@ class _Run:
     light: street.Light = street.Light(azimuth_deg=-75.0, elevation_deg=50.0, sun=3.2, sky=0.8)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Run:
+def _sample(variant: int, rng: np.random.Generator) -> _Run:
     if variant == 0:
         return _Run()
     light = street.Light(rng.uniform(-150, -30), rng.uniform(34, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
@@ -50,9 +50,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Run:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The cyclist is in the middle of the frame at half of `duration_s`. Wheels roll, cranks turn with them."""
+    """Build the world. The cyclist is in the middle of the frame at half of `duration_s`; wheels and cranks turn."""
     rng = rng_for("bicycle", seed, variant)
-    run = _draw(variant, rng)
+    run = _sample(variant, rng)
     clothes, paint = _TEAMS[run.team]
     rider = {f"rider_{k}": v for k, v in figure.groups(clothes, rng).items()}
     wheels = {f"{name}_wheel": "wheel" for name in AXLES_X_M}
@@ -99,7 +99,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def pedal_at(side: str, turn_rad: float) -> tuple[float, float, float]:
-    """Middle of a pedal in the bicycle's coordinates; the left one is up where the turn is zero."""
+    """Return the middle of a pedal in the bicycle's coordinates; the left one is up at turn zero."""
     sign = figure.SIDES[side]
     x, _, z = CRANK_AT
     return x + sign * CRANK_M * np.sin(turn_rad), 0.11 * sign, z + sign * CRANK_M * np.cos(turn_rad)
@@ -109,7 +109,7 @@ def pedal_at(side: str, turn_rad: float) -> tuple[float, float, float]:
 
 
 def _frame(paint: Colour) -> tuple[Part, ...]:
-    """Frame, forks, bars, saddle, brakes and a bottle."""
+    """Return frame, forks, bars, saddle, brakes and a bottle."""
     rear, front = ((x, 0.0, WHEEL_M) for x in AXLES_X_M.values())
     head_low, head_high = (0.36, 0.0, 0.70), (0.315, 0.0, 0.87)
     seat_top = (-0.215, 0.0, 0.80)
@@ -156,7 +156,7 @@ def _wheel() -> tuple[Part, ...]:
 
 
 def _crank() -> tuple[Part, ...]:
-    """Both crank arms and the chain ring, about the bottom bracket; the left arm points up."""
+    """Return both crank arms and the chain ring, about the bottom bracket; the left arm points up."""
     arms = [box((0.028, 0.016, CRANK_M), (0, s * 0.075, s * CRANK_M / 2)) for s in (-1, 1)]
     ring = revolve(
         np.array([(0.075, -0.048), (0.095, -0.048), (0.095, -0.053), (0.075, -0.053), (0.075, -0.048)]), 32, "y"

@@ -20,7 +20,7 @@ _PLUMAGES = (
 
 @dataclass(frozen=True)
 class _Flight:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 2.6
     height_m: float = 0.46
@@ -29,7 +29,7 @@ class _Flight:
     light: street.Light = street.Light(azimuth_deg=-118.0, elevation_deg=56.0, sun=3.0, sky=0.85)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Flight:
+def _sample(variant: int, rng: np.random.Generator) -> _Flight:
     if variant == 0:
         return _Flight()
     light = street.Light(rng.uniform(-150, -40), rng.uniform(48, 64), rng.uniform(2.9, 3.3), rng.uniform(0.7, 0.95))
@@ -38,9 +38,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Flight:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The bird is in the middle of the frame at half of `duration_s`; its body rises while the wings go down."""
+    """Build the world. The bird is in the middle of the frame at half of `duration_s`; downstrokes lift its body."""
     rng = rng_for("bird", seed, variant)
-    flight = _draw(variant, rng)
+    flight = _sample(variant, rng)
     plumage = _PLUMAGES[flight.plumage]
 
     def pose(t_s: float) -> np.ndarray:

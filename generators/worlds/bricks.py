@@ -19,7 +19,7 @@ COLUMNS, ROWS = 6, 8
 BALL_M = 0.042
 _WALL_Y = 0.02
 _AFTER_IMPACT_S = 0.035  # the middle of the clip
-_FLIGHT_S = 0.002  # of the ball before it meets the wall; all that came before is known without simulation
+_FLIGHT_S = 0.002  # simulated flight of the ball before it meets the wall; earlier motion needs no simulation
 _DESCENT_M_S = 1.2  # of the ball at the wall; its arc stays above the table for longer than any clip
 _TEXELS = 900  # per metre of the painted front
 _CELL = 24  # texels of a brick's own colour
@@ -35,7 +35,7 @@ _WORDS = {"SPIKE": 0.100, "GAUSS": 0.087, "20KHZ": 0.088, "BRICK": 0.095}
 
 @dataclass(frozen=True)
 class _Shot:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 13.0
     aim: tuple[float, float] = (-0.03, 0.17)  # x and z where the ball hits
@@ -45,7 +45,7 @@ class _Shot:
     lamp: Lamp = Lamp((-0.75, -0.85, 1.55), 0.95)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Shot:
+def _sample(variant: int, rng: np.random.Generator) -> _Shot:
     if variant == 0:
         return _Shot()
     lamp = Lamp(
@@ -58,14 +58,14 @@ def _draw(variant: int, rng: np.random.Generator) -> _Shot:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The ball meets the wall 35 ms before half of `duration_s`; the simulation begins 2 ms earlier."""
+    """Build the world. The ball meets the wall 35 ms before half of `duration_s`; simulation begins 2 ms earlier."""
     rng = rng_for("bricks", seed, variant)
-    shot = _draw(variant, rng)
+    shot = _sample(variant, rng)
     start_s = duration_s / 2 - _AFTER_IMPACT_S - _FLIGHT_S
-    places, ball, still = _places(), _ball(shot), _room(rng)
-    bodies = [Body("box", tuple(v / 2 for v in BRICK_M), p, density=650.0) for p in places]
-    path = simulate([*bodies, ball], start_s, duration_s, blocks=_blocks(still))
-    meshes, image = _bricks(places, shot, rng)
+    positions, ball, static = _positions(), _ball(shot), _room(rng)
+    bodies = [Body("box", tuple(v / 2 for v in BRICK_M), p, density=650.0) for p in positions]
+    path = simulate([*bodies, ball], start_s, duration_s, blocks=_blocks(static))
+    meshes, image = _bricks(positions, shot, rng)
     mesh, (owner, bodies_of_faces) = merge(meshes), owners(meshes)
 
     def ball_pose(t_s: float) -> dict[str, np.ndarray]:
@@ -82,7 +82,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         seed=seed,
         variant=variant,
         duration_s=duration_s,
-        static=still,
+        static=static,
         groups={"ball": (Part(ellipsoid((BALL_M,) * 3, (0, 0, 0), 40), Material(stripes, 0.12)),)},
         instances={"ball": "ball"},
         emitters=shot.lamp.emitters(),
@@ -104,8 +104,8 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     )
 
 
-def _places() -> list[tuple[float, float, float]]:
-    """Centres of the bricks in running bond; every other row is half a brick to the side."""
+def _positions() -> list[tuple[float, float, float]]:
+    """Return the centres of the bricks in running bond; every other row is half a brick to the side."""
     w, _, h = BRICK_M
     return [
         ((k - (COLUMNS - 1) / 2 + (0.25 if row % 2 else -0.25)) * w, _WALL_Y, (row + 0.5) * h)
@@ -115,7 +115,7 @@ def _places() -> list[tuple[float, float, float]]:
 
 
 def _ball(shot: _Shot) -> Body:
-    """The ball such that it touches the wall's front after _FLIGHT_S; its fall meanwhile is made up for."""
+    """Return the ball at a position from which it touches the wall's front after _FLIGHT_S, its fall included."""
     a = np.radians(shot.heading_deg)
     velocity = np.array([*(shot.speed_m_s * np.array([np.cos(a), np.sin(a)])), -_DESCENT_M_S])
     touch = np.array([shot.aim[0], _WALL_Y - BRICK_M[1] / 2 - BALL_M, shot.aim[1]])
@@ -127,13 +127,13 @@ def _ball(shot: _Shot) -> Body:
 
 
 def _room(rng: np.random.Generator) -> dict[str, Part]:
-    """The desk without what lies where bricks fly."""
+    """Return the desk without the objects that lie where bricks fly."""
     away = ("pot", "pencils", "mug", "die", "sheet", "ruler", "ball", "stack")
     return {name: part for name, part in desk.room(rng).items() if name not in away}
 
 
 def _blocks(room: dict[str, Part]) -> list[Block]:
-    """What stops bricks: the room's wall (as thick as need be), its skirting and the books, which stand firm."""
+    """Return the obstacles for bricks, none of which moves: the room's wall (made thick enough), skirting, books."""
     books = [Block.around(part.mesh) for name, part in room.items() if name.startswith("book")]
     wall = Block.around(room["wall"].mesh)
     front = min(Block.around(room[name].mesh).low[1] for name in ("poster0", "wall"))
@@ -145,28 +145,29 @@ def _blocks(room: dict[str, Part]) -> list[Block]:
 
 
 def _bricks(
-    places: list[tuple[float, float, float]], shot: _Shot, rng: np.random.Generator
+    positions: list[tuple[float, float, float]], shot: _Shot, rng: np.random.Generator
 ) -> tuple[list[Mesh], np.ndarray]:
-    """One box for each brick, in its own coordinates, and their image: the painted front, then a cell for each."""
-    colours = [np.array(_PAINTS[shot.paint][int(k)]) * rng.uniform(0.8, 1.2) for k in rng.integers(0, 4, len(places))]
+    """Return one box for each brick, in its own coordinates, and their image: the painted front, then a cell each."""
+    paints = rng.integers(0, 4, len(positions))
+    colours = [np.array(_PAINTS[shot.paint][int(k)]) * rng.uniform(0.8, 1.2) for k in paints]
     width, height = (COLUMNS + 0.5) * BRICK_M[0], ROWS * BRICK_M[2]
     front_h, front_w = (int(np.ceil(v * _TEXELS - 1e-9)) for v in (height, width))
     per_row = front_w // _CELL
-    cell_rows = -(-len(places) // per_row)
+    cell_rows = -(-len(positions) // per_row)
     image = plain((front_h + cell_rows * _CELL, front_w), (0.3, 0.3, 0.3))
     c = Canvas(image, _TEXELS)
-    for (x, _, z), colour in zip(places, colours, strict=True):
+    for (x, _, z), colour in zip(positions, colours, strict=True):
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.rectangle(left, top, left + BRICK_M[0], top + BRICK_M[2], tuple(colour))
     c.text(shot.word, width / 2 + 0.003, height / 2 + 0.003, _WORDS[shot.word], (0.84, 0.82, 0.76))
     c.text(shot.word, width / 2, height / 2, _WORDS[shot.word], (0.04, 0.05, 0.09))
-    for x, _, z in places:  # an edge around every brick
+    for x, _, z in positions:  # an edge around every brick
         left, top = x + width / 2 - BRICK_M[0] / 2, height - z - BRICK_M[2] / 2
         c.line([(left, top), (left + BRICK_M[0], top)], 0.003, (0.78, 0.74, 0.66), 0.7)
         c.line([(left, top), (left, top + BRICK_M[2])], 0.003, (0.15, 0.12, 0.10), 0.7)
     image = c.image
     meshes = []
-    for k, ((x, _, z), colour) in enumerate(zip(places, colours, strict=True)):
+    for k, ((x, _, z), colour) in enumerate(zip(positions, colours, strict=True)):
         row, column = divmod(k, per_row)
         y0, x0 = front_h + row * _CELL, column * _CELL
         image[y0 : y0 + _CELL, x0 : x0 + _CELL] = colour
@@ -179,7 +180,7 @@ def _bricks(
 
 
 def _brick(front: tuple[np.ndarray, np.ndarray], own: tuple[np.ndarray, np.ndarray], size: np.ndarray) -> Mesh:
-    """A box about the origin whose front face shows one rectangle (corner, extent, texels) and the others another."""
+    """Return a box about the origin: its front face shows one rectangle (corner, extent, texels), the rest another."""
     sx, sy, sz = BRICK_M
     faces = [
         ((0, -sy / 2, 0), (sx, 0, 0), (0, 0, sz), front),

@@ -21,7 +21,7 @@ _LIVERIES = (
 
 @dataclass(frozen=True)
 class _Run:
-    """What one variant draws: speed, lane, colours, light. Variant 0 keeps these values."""
+    """The random choices of a variant: speed, lane, colours, light. The defaults are those of variant 0."""
 
     speed_m_s: float = 32.0
     lane_y_m: float = 2.75
@@ -29,7 +29,7 @@ class _Run:
     light: street.Light = street.Light(azimuth_deg=-128.0, elevation_deg=46.0, sun=3.2, sky=0.75)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Run:
+def _sample(variant: int, rng: np.random.Generator) -> _Run:
     if variant == 0:
         return _Run()
     light = street.Light(rng.uniform(-150, -40), rng.uniform(36, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
@@ -37,9 +37,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Run:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The car is in the middle of the frame at half of `duration_s`; in half a second it crosses the whole view."""
+    """Build the world. The car is in the middle of the frame at half of `duration_s`; it crosses the view in 0.5 s."""
     rng = rng_for("car", seed, variant)
-    run = _draw(variant, rng)
+    run = _sample(variant, rng)
     wheels = vehicle.wheel_positions()
     livery = _LIVERIES[run.livery]
 

@@ -33,7 +33,7 @@ _WHITE: Colour = (0.84, 0.82, 0.76)
 
 @dataclass(frozen=True)
 class _Throw:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     count: int = 48
     speed_m_s: float = 2.6  # of fall in the middle of the clip
@@ -42,7 +42,7 @@ class _Throw:
     lamp: Lamp = Lamp((0.70, -0.70, 1.6), 0.95)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Throw:
+def _sample(variant: int, rng: np.random.Generator) -> _Throw:
     if variant == 0:
         return _Throw()
     side = rng.choice([-1.0, 1.0])
@@ -52,9 +52,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Throw:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """Most chips are in the air at half of `duration_s`; the lowest have bounced."""
+    """Build the world. Most chips are in the air at half of `duration_s`; the lowest have bounced."""
     rng = rng_for("chips", seed, variant)
-    throw = _draw(variant, rng)
+    throw = _sample(variant, rng)
     start_s = min(0.0, duration_s / 2 - _BEFORE_S)
     blocks = [Block.around(mesh) for mesh in _edges()]
     path = simulate(_bodies(throw, duration_s / 2 - start_s, rng), start_s, duration_s, friction=0.3, blocks=blocks)
@@ -83,23 +83,23 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body]:
-    """Chips that free flight would spread over a column `fall_s` later, apart from each other now and then.
+    """Return chips that free flight would spread over a column `fall_s` later, without overlap at either end.
 
-    Those that cross on the way collide, and the lowest meet the table.
+    Chips whose paths cross collide on the way, and the lowest meet the table.
     """
     speed = throw.speed_m_s - GRAVITY_M_S2 * fall_s
-    apart = 2.02 * np.hypot(RADIUS_M, THICK_M / 2)  # whatever way they are turned
-    placed: list[np.ndarray] = []  # [2, 3]: at the beginning and at the end
+    apart = 2.02 * np.hypot(RADIUS_M, THICK_M / 2)  # enough at every orientation
+    accepted: list[np.ndarray] = []  # [2, 3]: at the beginning and at the end
     bodies: list[Body] = []
     while len(bodies) < throw.count:
-        place = np.array([rng.normal(0, 0.10), rng.normal(0.02, 0.07), rng.uniform(0.01, 0.34)])
+        position = np.array([rng.normal(0, 0.10), rng.normal(0.02, 0.07), rng.uniform(0.01, 0.34)])
         down = max(speed + rng.uniform(-0.3, 0.3), 0.3)
         velocity = np.array([throw.drift_m_s + rng.normal(0, 0.25), rng.normal(0, 0.25), -down])
-        begin = place - velocity * fall_s + [0, 0, GRAVITY_M_S2 / 2 * fall_s**2]
-        ends = np.stack([begin, place])
-        if any(np.linalg.norm(ends - other, axis=1).min() < apart for other in placed):
+        begin = position - velocity * fall_s + [0, 0, GRAVITY_M_S2 / 2 * fall_s**2]
+        ends = np.stack([begin, position])
+        if any(np.linalg.norm(ends - other, axis=1).min() < apart for other in accepted):
             continue
-        placed.append(ends)
+        accepted.append(ends)
         q, spin = rng.normal(size=4), rng.normal(0, 22, 3)
         q /= np.linalg.norm(q)
         size = (RADIUS_M, THICK_M / 2)
@@ -109,7 +109,7 @@ def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body
 
 
 def _chip(kind: int) -> Mesh:
-    """A chip about the origin, its axis along z; its colours are column `kind` of the image: face above edge."""
+    """Return a chip about the origin, axis along z; column `kind` of the image has its colours, face above edge."""
     a = np.linspace(0, 2 * np.pi, _SEGMENTS, endpoint=False)
     h, r, n = THICK_M / 2, RADIUS_M, len(_COLOURS)
     rows = _CELL + 16
@@ -117,7 +117,7 @@ def _chip(kind: int) -> Mesh:
     parts = []
     for side in (-1.0, 1.0):
         points = np.concatenate([np.column_stack([r * circle, np.full(_SEGMENTS, side * h)]), [[0, 0, side * h]]])
-        flat = np.concatenate([circle * [side, 1.0], [[0, 0]]])  # both faces read from outside
+        flat = np.concatenate([circle * [side, 1.0], [[0, 0]]])  # the print of both faces reads from outside
         uv = np.stack([(kind + 0.5 + 0.48 * flat[:, 0]) / n, (0.5 - 0.48 * flat[:, 1]) * _CELL / rows], 1)
         i = np.arange(_SEGMENTS)
         faces = np.stack([i, (i + 1) % _SEGMENTS, np.full(_SEGMENTS, _SEGMENTS)], 1)
@@ -129,7 +129,7 @@ def _chip(kind: int) -> Mesh:
 
 
 def _image(rng: np.random.Generator) -> np.ndarray:
-    """Faces with a value, a ring and edge spots; below, the stripes of the edges."""
+    """Return the faces with a value, a ring and edge spots; below them, the stripes of the edges."""
     n = len(_COLOURS)
     c = Canvas(plain((_CELL + 16, n * _CELL), (0.5, 0.5, 0.5)), _CELL)
     for k, (colour, value) in enumerate(zip(_COLOURS, _VALUES, strict=True)):
@@ -151,7 +151,7 @@ def _image(rng: np.random.Generator) -> np.ndarray:
 
 
 def _table(felt: Colour, rng: np.random.Generator) -> dict[str, Part]:
-    """Felt with printed fields and a wooden edge, before the room's wall and posters."""
+    """Return a felt table with printed fields and a wooden edge, and the room's wall and posters behind it."""
     size = (780, 1300)
     cloth = mix(fractal(size, rng, 64, 1), tuple(0.75 * v for v in felt), tuple(1.25 * v for v in felt))
     cloth *= (0.85 + 0.3 * rng.random(size, dtype=np.float32))[..., None]
@@ -176,7 +176,7 @@ def _table(felt: Colour, rng: np.random.Generator) -> dict[str, Part]:
 
 
 def _edges() -> list[Mesh]:
-    """The table's far and near edge."""
+    """Return the table's far and near edge."""
     return [box((1.36, 0.03, 0.03), (0, y, 0.0)) for y in (0.455, -0.355)]
 
 

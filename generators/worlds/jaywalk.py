@@ -1,4 +1,4 @@
-"""World `jaywalk`: somebody runs across a street under a gantry of nine cameras, from left to right."""
+"""World `jaywalk`: a runner crosses a street under a gantry of nine cameras, from left to right."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _CLOTHES = (
         (0.75, 0.55, 0.08), (0.08, 0.10, 0.30), (0.06, 0.06, 0.07), (0.70, 0.70, 0.68), bag=(0.08, 0.30, 0.25)
     ),
 )
-_LENGTH_M = 0.65  # along its way, between the mean reach of its limbs
+_LENGTH_M = 0.65  # in the direction of motion, between the mean reach of its limbs
 _HIP_M, _BOB_M = 0.885, 0.03
 _LIFT_M = 0.40  # of the ankle behind the runner
-_STANCE = 0.25  # share of a stride that a foot stands
+_STANCE = 0.25  # share of a stride in which the foot is on the ground
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 5.0
     strides_per_s: float = 1.5
@@ -38,7 +38,7 @@ class _Run:
     light: street.Light = street.Light(azimuth_deg=-52.0, elevation_deg=38.0, sun=3.1, sky=0.8)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Run:
+def _sample(variant: int, rng: np.random.Generator) -> _Run:
     if variant == 0:
         return _Run()
     light = street.Light(rng.uniform(-150, -30), rng.uniform(32, 58), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
@@ -47,9 +47,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Run:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The runner is in the middle of the frame at half of `duration_s`."""
+    """Build the world. The runner is in the middle of the frame at half of `duration_s`."""
     rng = rng_for("jaywalk", seed, variant)
-    run = _draw(variant, rng)
+    run = _sample(variant, rng)
 
     def poses(t_s: float) -> dict[str, np.ndarray]:
         return figure.poses(stride(run.speed_m_s, run.strides_per_s, run.phase, run.lane_y_m, t_s - duration_s / 2))
@@ -75,9 +75,9 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def stride(speed_m_s: float, strides_per_s: float, phase: float, lane_y_m: float, t_s: float) -> figure.Joints:
-    """Joints of a runner who passes x = 0 at t = 0 in the given phase (0..1) of the left foot's stride.
+    """Return the joints of a runner who passes x = 0 at t = 0 in the given phase (0..1) of the left foot's stride.
 
-    A foot stands still on the ground for a quarter of its stride and swings over to its next place in the rest.
+    A foot rests on the ground for a quarter of its stride and swings to its next position in the rest.
     """
     at = phase + strides_per_s * t_s
     x = speed_m_s * t_s
@@ -95,7 +95,7 @@ def stride(speed_m_s: float, strides_per_s: float, phase: float, lane_y_m: float
 
 
 def _foot(share: float, stride_m: float) -> tuple[tuple[float, float], float]:
-    """Ankle (x relative to the hip, z) and pitch of the foot at a share of its stride; it stands first."""
+    """Return ankle (x relative to the hip, z) and pitch of a foot at a share of its stride; it begins on the ground."""
     reach = stride_m * _STANCE / 2
     if share < _STANCE:
         return (reach * (1 - 2 * share / _STANCE), figure.ANKLE_M), 0.0

@@ -51,7 +51,7 @@ _LIVERIES = (
 
 @dataclass(frozen=True)
 class _Run:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 24.0
     lane_y_m: float = 1.2
@@ -59,7 +59,7 @@ class _Run:
     light: street.Light = street.Light(azimuth_deg=-28.0, elevation_deg=33.0, sun=3.3, sky=0.7)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Run:
+def _sample(variant: int, rng: np.random.Generator) -> _Run:
     if variant == 0:
         return _Run()
     light = street.Light(rng.uniform(-150, -25), rng.uniform(32, 58), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
@@ -67,9 +67,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Run:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The motorcycle is in the middle of the frame at half of `duration_s`. Its wheels roll."""
+    """Build the world. The motorcycle is in the middle of the frame at half of `duration_s`; its wheels roll."""
     rng = rng_for("motor", seed, variant)
-    run = _draw(variant, rng)
+    run = _sample(variant, rng)
     livery = _LIVERIES[run.livery]
     suit = figure.Clothes(
         livery.body, livery.second, _DARK, _DARK, skin=_DARK, helmet=livery.second, number=livery.number
@@ -113,7 +113,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def body(livery: Livery) -> tuple[Part, ...]:
-    """Everything but wheels and rider; x forward, origin on the ground between the wheels."""
+    """Return all parts but wheels and rider; x forward, origin on the ground between the wheels."""
     skin = merge([_shell(_FAIRING), _shell(_TANK), _shell(_TAIL)])
     seat = ellipsoid((0.24, 0.13, 0.05), (-0.36, 0, 0.83), 18)
     engine = [box((0.34, 0.30, 0.26), (0.02, 0, 0.42)), box((0.24, 0.34, 0.10), (0.0, 0, 0.56))]
@@ -163,7 +163,7 @@ _TAIL += [(-0.15, 0.72, 0.09, 0.12), (-0.08, 0.72, 0.04, 0.06)]
 
 
 def _shell(stations: list[tuple[float, float, float, float]]) -> Mesh:
-    """A smooth skin over superelliptic cross-sections."""
+    """Return a smooth skin over superelliptic cross-sections."""
     given = np.array(stations)
     x = np.linspace(given[0, 0], given[-1, 0], 24)
     a = np.linspace(0, 2 * np.pi, 28, endpoint=False)
@@ -173,7 +173,7 @@ def _shell(stations: list[tuple[float, float, float, float]]) -> Mesh:
 
 
 def _guard(x: float, radius_m: float) -> Mesh:
-    """A mudguard over the upper part of a wheel."""
+    """Return a mudguard over the upper part of a wheel."""
     a = np.radians(np.linspace(25, 150, 14))
     inner = np.stack([x + radius_m * np.cos(a), 0 * a, WHEEL_M + radius_m * np.sin(a)], 1)
     return loft(np.stack([inner + (0, -0.075, -0.01), inner + (0, 0, 0.012), inner + (0, 0.075, -0.01)]), caps=False)
@@ -200,7 +200,7 @@ def _paint(livery: Livery) -> np.ndarray:
     c = Canvas(plain(_ATLAS.shape, livery.body), _ATLAS.texels_per_m)
 
     def side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.place(chart, np.array([(x, 0.0, z) for x, z in xz]))
+        return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
 
     for chart in ("near", "far"):
         c.polygon(
@@ -214,7 +214,7 @@ def _paint(livery: Livery) -> np.ndarray:
         c.text(livery.number, x, y, 0.125, (0.02, 0.02, 0.02))
         x, y = side(chart, [(0.13, 0.845)])[0]
         c.text("SPIKE", x, y, 0.055, _WHITE)
-    x, y = _ATLAS.place("front", np.array([(0, 0, 0.84)]))[0]
+    x, y = _ATLAS.project("front", np.array([(0, 0, 0.84)]))[0]
     c.ellipse(x, y, 0.10, 0.08, _WHITE)
     c.text(livery.number, x, y, 0.09, (0.02, 0.02, 0.02))
     return c.image

@@ -29,7 +29,7 @@ DISC_RADIUS_M, DISC_TOP_M = 0.32, 0.05
 
 @dataclass(frozen=True)
 class _Setup:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     turns_per_s: float = 5.0
     first_letter: int = 0
@@ -37,19 +37,19 @@ class _Setup:
     lamp: Lamp = Lamp()
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Setup:
+def _sample(variant: int, rng: np.random.Generator) -> _Setup:
     if variant == 0:
         return _Setup()
     side = rng.choice([-1.0, 1.0])
-    place = (side * rng.uniform(0.5, 1.0), rng.uniform(-0.9, -0.5), rng.uniform(1.5, 1.9))
+    position = (side * rng.uniform(0.5, 1.0), rng.uniform(-0.9, -0.5), rng.uniform(1.5, 1.9))
     turns = (rng.uniform(20.0, 25.0) if variant % 2 else rng.uniform(4.0, 5.5)) * rng.choice([-1.0, 1.0])
-    return _Setup(turns, int(rng.integers(8)), rng.uniform(0, 2 * np.pi), Lamp(place, rng.uniform(0.85, 1.1)))
+    return _Setup(turns, int(rng.integers(8)), rng.uniform(0, 2 * np.pi), Lamp(position, rng.uniform(0.85, 1.1)))
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The disc turns steadily (counter-clockwise from above in variant 0) during all of `duration_s`."""
+    """Build the world. The disc turns steadily (counter-clockwise from above in variant 0) during the whole clip."""
     rng = rng_for("turntable", seed, variant)
-    setup = _draw(variant, rng)
+    setup = _sample(variant, rng)
 
     def poses(t_s: float) -> dict[str, np.ndarray]:
         return {"disc": rotation("z", setup.start_rad + 2 * np.pi * setup.turns_per_s * t_s)}
@@ -82,7 +82,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 
 def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Everything that spins: the lettered top, the striped edge, a hub, blocks, a pawn, a cone and a ring."""
+    """Return all parts that spin: the lettered top, the striped edge, a hub, blocks, a pawn, a cone and a ring."""
     stripes = mix(((np.arange(512) // 8) % 2)[None] * np.ones((6, 1)), (0.06, 0.06, 0.07), (0.80, 0.79, 0.75))
     edge = revolve(np.array([(DISC_RADIUS_M, 0.004), (DISC_RADIUS_M, DISC_TOP_M)]), 128)
     collar = revolve(
@@ -119,12 +119,12 @@ def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
         block = box((size, size, size), (0, 0, DISC_TOP_M + size / 2)).moved(rotation("z", 0.4 + k))
         at = translation(0.165 * np.cos(angle), 0.165 * np.sin(angle), 0)
         parts.append(Part(block.moved(at), Material(_block_image("XYZ"[k], colour, rng), 0.25)))
-    parts += _small_things(rng)
+    parts += _small_objects(rng)
     return tuple(parts)
 
 
-def _small_things(rng: np.random.Generator) -> list[Part]:
-    """A pawn, a cone and a striped post between the blocks."""
+def _small_objects(rng: np.random.Generator) -> list[Part]:
+    """Return a pawn, a cone and a striped post between the blocks."""
 
     def around(mesh: Mesh, turn: float) -> Mesh:
         return mesh.at(0.17 * np.cos(2 * np.pi * turn), 0.17 * np.sin(2 * np.pi * turn), DISC_TOP_M)
@@ -161,7 +161,7 @@ def _small_things(rng: np.random.Generator) -> list[Part]:
 
 
 def _top_image(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
-    """Sectors, letters that read from the rim inwards, a tick scale and a dark middle with a hand."""
+    """Return sectors, letters that read from the rim inwards, a tick scale and a dark middle with a hand."""
     n, r = 720, DISC_RADIUS_M - 0.006
     c = Canvas(plain((n, n), (0.74, 0.71, 0.62)), n / (2 * r))
 
@@ -189,7 +189,7 @@ def _top_image(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
 
 
 def _block_image(letter: str, colour: Colour, rng: np.random.Generator) -> np.ndarray:
-    """A toy block's face: a coloured frame around a light field with a letter."""
+    """Return a toy block's face: a coloured frame around a light field with a letter."""
     c = Canvas(plain((96, 96), colour) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
     c.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
     c.text(letter, 0.5, 0.5, 0.50, tuple(0.5 * v for v in colour))

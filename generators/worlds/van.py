@@ -20,7 +20,7 @@ _LIVERIES = (
 
 @dataclass(frozen=True)
 class _Run:
-    """What one variant draws. Variant 0 keeps these values."""
+    """The random choices of a variant; the defaults are those of variant 0."""
 
     speed_m_s: float = 38.0
     lane_y_m: float = 2.7
@@ -28,7 +28,7 @@ class _Run:
     light: street.Light = street.Light(azimuth_deg=-62.0, elevation_deg=54.0, sun=2.8, sky=0.95)
 
 
-def _draw(variant: int, rng: np.random.Generator) -> _Run:
+def _sample(variant: int, rng: np.random.Generator) -> _Run:
     if variant == 0:
         return _Run()
     light = street.Light(rng.uniform(-150, -40), rng.uniform(36, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
@@ -36,9 +36,9 @@ def _draw(variant: int, rng: np.random.Generator) -> _Run:
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
-    """The van is in the middle of the frame at half of `duration_s`. Its wheels roll."""
+    """Build the world. The van is in the middle of the frame at half of `duration_s`; its wheels roll."""
     rng = rng_for("van", seed, variant)
-    run = _draw(variant, rng)
+    run = _sample(variant, rng)
     livery, wheels = _LIVERIES[run.livery], van_body.wheel_positions()
 
     def poses(t_s: float) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from spike4dgs.generators.sensor.reference import tick_means
 
 
 def smooth_keys(spacing, n_ticks, shape=(5, 7)):
-    """Keys of a slow, smooth pattern, monotone between keys almost everywhere."""
+    """Return keys of a slow, smooth pattern, monotone between keys almost everywhere."""
     ticks = np.arange(0, n_ticks + spacing, spacing)
     phase = np.random.default_rng(0).uniform(0, 6.3, shape)
     return (0.5 + 0.3 * np.sin(phase + ticks[:, None, None] / 150)).astype(np.float32), ticks.tolist()
@@ -36,7 +36,7 @@ def test_only_whole_exposures(n_ticks, count):
     assert starts == [round(k * 20_000 / FPS) for k in range(count)]
 
 
-def test_a_moving_edge_is_smeared_by_its_way():
+def test_a_moving_edge_is_smeared_over_its_path():
     x = np.arange(60)
     ticks = list(range(0, 181, 4))
     keys = [np.clip((t * 0.1 + 10 - x), 0, 1)[None].astype(np.float32) for t in ticks]  # to the right, 0.1 px a tick

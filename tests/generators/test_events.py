@@ -12,7 +12,7 @@ RATE = 20_000
 
 
 def plain_events(keys, ticks, threshold):
-    """The model again, one pixel and one event after the other, exact times."""
+    """Return the events of the model, one pixel and one event after the other, at exact times."""
     logs = np.log(np.maximum(np.asarray(keys, np.float64), 1e-3))
     found = []
     for y, x in np.ndindex(*logs.shape[1:]):
@@ -40,11 +40,11 @@ def test_events_are_those_of_a_plain_loop(height, width, n, threshold, seed):
     ours = key(zip(found.t, found.y, found.x, found.p, strict=True))
     for a, b in zip(ours, key(expected), strict=True):
         assert a[:3] == b[:3] and abs(a[3] - b[3]) <= 2
-    # what the events say of the light is within a threshold of the truth
+    # the light reconstructed from events is within a threshold of the truth
     logs = np.log(np.maximum(keys.astype(np.float64), 1e-3))
-    told = logs[0].copy()
-    np.add.at(told, (found.y, found.x), threshold * (2.0 * found.p - 1))
-    assert np.abs(told - logs[-1]).max() < threshold + 1e-9
+    rebuilt = logs[0].copy()
+    np.add.at(rebuilt, (found.y, found.x), threshold * (2.0 * found.p - 1))
+    assert np.abs(rebuilt - logs[-1]).max() < threshold + 1e-9
 
 
 def test_a_ramp_has_as_many_events_as_thresholds():
@@ -59,7 +59,7 @@ def test_a_ramp_has_as_many_events_as_thresholds():
         assert np.abs(found.t[mine] - ideal).max(initial=0) <= 2
 
 
-def test_nothing_moves_nothing_happens():
+def test_a_static_scene_has_no_events():
     image = np.random.default_rng(0).random((6, 9), dtype=np.float32)
     assert len(events([image] * 4, [0, 5, 10, 15], 15, RATE).t) == 0
 

@@ -1,4 +1,4 @@
-"""Emulated arrays that show a small scene: what the tests of cameras and of recordings share."""
+"""Emulated arrays that show a small scene, for the tests of cameras and of recordings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ N = 200  # ticks of the clips with faults
 
 
 def profile_of(scene: Scene, **changes: object) -> RigProfile:
-    # The time limit is for a machine that has other things to do.
+    # The time limit is for a busy machine.
     return scene_profile(scene, **({"transfer_bytes": BLOCK, "transfers": 4, "timeout_ms": 20000} | changes))
 
 

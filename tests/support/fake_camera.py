@@ -19,7 +19,7 @@ WIDTH, HEIGHT, FPS = 24, 10, 20000
 
 
 def rig(n: int, layout: str = "plain", **changes: object) -> RigProfile:
-    """A rig of n small cameras, the second one the primary, whose reads are 1 KiB."""
+    """Return a rig of n small cameras, the second one the primary, whose reads are 1 KiB."""
     cameras = tuple(
         CameraProfile(
             id=f"cam_{i:02d}",
@@ -43,7 +43,7 @@ def rig(n: int, layout: str = "plain", **changes: object) -> RigProfile:
 
 
 def frames_of(seed: int, layout: Layout, n: int, first_count: int = 0) -> UInt8:
-    """n raw frames [n, frame_bytes] of random pixels, counted from `first_count`."""
+    """Return n raw frames [n, frame_bytes] of random pixels, counted from `first_count`."""
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (n, layout.payload_bytes), dtype=np.uint8)
     return layout.pack(pixels, first_count)
@@ -54,7 +54,7 @@ class FakeCamera:
     """Sends `stream` from its first byte after each start, `bytes_per_s` fast; silent after the last byte.
 
     `faults`: stream byte -> status of the read that reaches it; a SHORT one ends there and loses nothing. They happen
-    in the second start only, so that the rehearsal passes, unless the camera cannot be started anew.
+    in the second start only, so that the rehearsal passes, unless the camera cannot be restarted.
     """
 
     camera: CameraProfile
@@ -143,7 +143,7 @@ class FakeTransfers:
 
 
 def rig_of(streams: Sequence[UInt8], profile: RigProfile) -> dict[str, FakeCamera]:
-    """A fake camera for each stream, by id; all write to one log."""
+    """Return a fake camera for each stream, by id; all write to one log."""
     log: list[str] = []
     return {
         c.id: FakeCamera(c, np.ascontiguousarray(streams[i]).reshape(-1), log=log)

@@ -1,4 +1,4 @@
-"""A small source scene, and a whole recording of it: what the tests of emulated and mocked cameras share."""
+"""A small source scene, and a whole recording of it, for the tests of emulated and mocked cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.stream import SpikeWriter, pack
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import find_cameras
-from spike4dgs.generators.recorder.files.clip_files import ClipRecord, StreamFiles
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles
+from spike4dgs.generators.recorder.files.clip_record import ClipRecord
 from spike4dgs.generators.recorder.frames.clip import CameraClip, Clip
 from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.profile.profile import RigProfile
@@ -27,7 +28,7 @@ FRAME = WIDTH * HEIGHT // 8
 
 
 def source_scene(root: Path, cameras: int = 9, ticks: int = TICKS) -> Scene:
-    """A scene whose cameras see noise, so that no tick is like another; the middle one is held out."""
+    """Write a scene whose cameras see noise, so that no tick is like another; the middle one is held out."""
     poses, rng = array_cameras(cameras, WIDTH, HEIGHT), np.random.default_rng(cameras)
     for camera in poses:
         with SpikeWriter(root / stream_name(camera.id), WIDTH, HEIGHT) as writer:
@@ -71,17 +72,17 @@ def record(out: Path, profile: RigProfile, backend: Any, ticks: int, queued: boo
 
 
 def finish(files: StreamFiles, clip: Clip) -> None:
-    """Describe a recording by what its capture says."""
+    """Describe a recording from its capture."""
     files.finish(ClipRecord(clip.n_ticks, gaps_of(clip.cameras), {"method": clip.sync}))
 
 
 def gaps_of(cameras: Sequence[CameraClip]) -> tuple[Gap, ...]:
-    """The gaps of all cameras."""
+    """Return the gaps of all cameras."""
     return tuple(gap for camera in cameras for gap in camera.gaps)
 
 
 def check_recording(out: Path, scene: Scene, clip: Clip) -> None:
-    """The folder holds the source's bits at every tick, except zeros in the gaps, which it lists."""
+    """Check that the folder holds the source's bits at every tick, except zeros in the gaps, which it lists."""
     recording = open_scene(out, allow_gaps=True)
     assert recording.n_ticks == clip.n_ticks
     assert [g["camera"] for g in recording.meta["gaps"]] == [g.camera for g in gaps_of(clip.cameras)]
@@ -95,7 +96,7 @@ def check_recording(out: Path, scene: Scene, clip: Clip) -> None:
 
 
 def check_identical(out: Path, scene: Scene) -> None:
-    """The folder is the source's: streams byte for byte, cameras, splits, clock and gain."""
+    """Check that the folder is the source's: streams byte for byte, cameras, splits, clock and gain."""
     for camera in scene.cameras:
         assert (out / stream_name(camera)).read_bytes() == (scene.root / stream_name(camera)).read_bytes()
     recording = open_scene(out)

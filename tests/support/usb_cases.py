@@ -1,4 +1,4 @@
-"""Recordings through libusb, from a bus that libumockdev mocks. `test_recorder_umockdev.py` runs these in a process of
+"""Recordings through libusb, from a bus that libumockdev mocks. `test_umockdev.py` runs these in a process of
 their own, which has the library preloaded; they are not collected otherwise.
 """
 
@@ -37,7 +37,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Plugs an array in, and returns the mock and pyusb's own backend, made after the devices, as libusb needs it."""
+    """Plug an array in, and return the mock and pyusb's own backend, made after the devices, as libusb needs it."""
     opened: list[tuple[UsbMock, Any]] = []
 
     def plug_in(scene: Scene, profile: RigProfile, *faults: Fault) -> tuple[UsbMock, Any]:
@@ -54,13 +54,13 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def profile_of(scene: Scene, **changes: object) -> RigProfile:
-    # The time limit is for a machine that has other things to do.
+    # The time limit is for a busy machine.
     return scene_profile(scene, **({"transfer_bytes": BLOCK, "transfers": QUEUED, "timeout_ms": 60000} | changes))
 
 
 @contextmanager
 def raised(kind: type[Exception]) -> Iterator[list[str]]:
-    """The message of an error. What pytest.raises keeps would keep the devices beyond their backend's life."""
+    """Collect the message of an error; pytest.raises would keep devices alive beyond their backend."""
     messages: list[str] = []
     try:
         yield messages
@@ -100,7 +100,7 @@ def test_one_read_at_a_time_records_the_same(two: Scene, bus: Any, tmp_path: Pat
 
 
 def fail(scene: Scene, bus: Any, out: Path, fault: Fault, **changes: object) -> CameraClip:
-    """Record with a fault of cam_01, which stops alone; returns its clip."""
+    """Record with a fault of cam_01, which stops alone. Return its clip."""
     profile = profile_of(scene, **changes)
     _, backend = bus(scene, profile, fault)
     clip = record(out, profile, backend, TICKS)
@@ -111,7 +111,7 @@ def fail(scene: Scene, bus: Any, out: Path, fault: Fault, **changes: object) -> 
 
 
 @pytest.mark.parametrize("kind", ["stall", "overflow", "unplugged", "short read"])
-def test_a_camera_that_fails_keeps_every_tick_that_came_before(two: Scene, bus: Any, tmp_path: Path, kind: str) -> None:
+def test_a_camera_that_fails_keeps_every_earlier_tick(two: Scene, bus: Any, tmp_path: Path, kind: str) -> None:
     failed = fail(two, bus, tmp_path / "clip", Fault("cam_01", kind, 30, 33))
     assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(30, TICKS - 30, kind)]
     assert failed.stats.end == kind
@@ -122,7 +122,7 @@ def test_a_short_read_between_frames_loses_nothing(two: Scene, bus: Any, tmp_pat
     assert not failed.gaps and failed.stats.short_reads == 1
 
 
-def test_a_camera_that_falls_silent_keeps_every_tick_that_came_before(two: Scene, bus: Any, tmp_path: Path) -> None:
+def test_a_camera_that_falls_silent_keeps_every_earlier_tick(two: Scene, bus: Any, tmp_path: Path) -> None:
     failed = fail(two, bus, tmp_path / "clip", Fault("cam_01", "time-out", 30, 33), timeout_ms=2000)
     assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(30, TICKS - 30, "time-out")]
     assert failed.stats.bytes == 30 * FRAME + 33
@@ -139,7 +139,7 @@ def test_a_camera_that_falls_silent_keeps_every_tick_that_came_before(two: Scene
         ("high speed", r"expected a SuperSpeed link \(5 Gbit/s\), found High Speed \(480 Mbit/s\); use a USB 3 port"),
     ],
 )
-def test_an_array_that_is_not_as_its_profile_says_is_not_recorded(
+def test_an_array_that_differs_from_its_profile_is_not_recorded(
     two: Scene, bus: Any, tmp_path: Path, kind: str, message: str
 ) -> None:
     profile = profile_of(two)

@@ -1,4 +1,4 @@
-"""An emulated array as devices of the kernel's usbfs, by libumockdev: libusb and pyusb run on it as they are.
+"""An emulated array as devices of the kernel's usbfs, by libumockdev: libusb and pyusb run on it unchanged.
 
     with UsbMock(EmulatedArray(profile, streams, paced=False)):
         usb.core.find(find_all=True, backend=...)  # a backend that was made after this
@@ -66,7 +66,7 @@ class UsbMock:
         return self
 
     def add(self, path: str, number: int, descriptors: bytes, attributes: dict[str, str]) -> None:
-        """A device in sysfs, and its node."""
+        """Add a device to sysfs, with its node."""
         node, text = f"bus/usb/001/{number:03d}", descriptors.hex().upper()
         properties = {
             "DEVNAME": f"/dev/{node}",
@@ -89,7 +89,7 @@ class UsbMock:
         self.check(self.lib.testbed_add_from_string, "\n".join(lines).encode())
 
     def check(self, function: Any, *arguments: Any) -> None:
-        """Call a function of the testbed that says whether it worked."""
+        """Call a function of the testbed. Raises OSError where it fails."""
         error = c.c_void_p()
         if not function(self.testbed, *arguments, c.byref(error)):
             raise OSError(f"libumockdev refused {arguments}")
@@ -139,7 +139,7 @@ class MockDevice:
         return 1
 
     def _answer(self, client: int) -> int:
-        """0, or the negative errno of an ioctl."""
+        """Return 0, or the negative errno of an ioctl."""
         lib = self.mock.lib
         request, argument = lib.ioctl_client_get_request(client), lib.ioctl_client_get_arg(client)
         if self._gone and request not in (REAP, REAP_NOW):
@@ -223,7 +223,7 @@ class MockDevice:
             return self.camera.read(np.frombuffer(memory, np.uint8), cut)
 
     def _unplug(self) -> None:
-        """As the kernel does: every urb ends, then the device leaves the bus."""
+        """End every urb, then remove the device from the bus, as the kernel does."""
         self._gone = True
         for memory, urb in self._reads:
             urb.status, urb.actual_length = _STATUS[UNPLUGGED], 0
@@ -240,7 +240,7 @@ class MockDevice:
 
 
 def descriptors(camera: EmulatedCamera, slow: bool) -> bytes:
-    """Device and configuration descriptors of a camera, at SuperSpeed or, if `slow`, at High Speed."""
+    """Return device and configuration descriptors of a camera, at SuperSpeed or, if `slow`, at High Speed."""
     profile, ports = camera.profile, interfaces(camera.profile)
     body = b""
     for number, endpoints in ports.items():

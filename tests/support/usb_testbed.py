@@ -1,4 +1,4 @@
-"""What the kernel's usbfs and libumockdev look like from Python: structures, request numbers, functions.
+"""The kernel's usbfs and libumockdev in Python: structures, request numbers, functions.
 
 For 64-bit machines; written against umockdev 0.17.
 """
@@ -46,7 +46,7 @@ class Memory(c.Structure):
 
 
 def _ioctl(number: int, size: int = 0, direction: int = 2) -> int:
-    """A request number of usbfs, as the kernel's _IO, _IOW (1) and _IOR (2) make it."""
+    """Return a request number of usbfs, as the kernel's _IO, _IOW (1) and _IOR (2) make it."""
     return (direction << 30 if size else 0) | size << 16 | ord("U") << 8 | number
 
 
@@ -83,7 +83,7 @@ _OF_GOBJECT: dict[str, tuple[Any, list[Any]]] = {
 
 
 def library() -> SimpleNamespace:
-    """The functions of libumockdev that are used, by their names without prefix."""
+    """Return the functions of libumockdev that are used, by their names without prefix."""
     umockdev, gobject = c.CDLL("libumockdev.so.0"), c.CDLL("libgobject-2.0.so.0")
     functions = {name: getattr(umockdev, f"umockdev_{name}") for name in _FUNCTIONS}
     functions |= {"connect": gobject.g_signal_connect_data, "unref": gobject.g_object_unref}

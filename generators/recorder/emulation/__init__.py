@@ -1,1 +1,1 @@
-"""An array of cameras in software, behind a pyusb backend."""
+"""An array of emulated cameras behind a pyusb backend."""

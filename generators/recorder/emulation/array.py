@@ -1,4 +1,4 @@
-"""An array of emulated cameras that one trigger starts, made from a rig profile and a scene's streams.
+"""An array of emulated cameras that share one trigger, made from a rig profile and a scene's streams.
 
     profile = scene_profile(scene)
     array = EmulatedArray(profile, scene_streams(scene), faults=[Fault("cam_03", "stall", tick=200)])
@@ -17,15 +17,16 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation.camera import FAULTS, EmulatedCamera, Fault, UInt8
-from spike4dgs.generators.recorder.frames.layouts import make_layout, orient
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.profile.profile import BOTTOM_UP, PRIMARY, SECONDARY, CameraProfile, RigProfile
 
 
 class EmulatedArray:
     """The cameras of a rig profile, each sending its packed stream `sources[camera id]`.
 
-    `paced`: by the profile's clock, each off by its `ppm`; otherwise as fast as they are read. Raises UserError for a
-    camera without a stream, or one of another size, and for a fault that there is not.
+    `paced`: at the rate of the profile's clock, each off by its `ppm`; otherwise as fast as they are read. Raises
+    UserError for a camera without a stream, or one of another size, and for an unknown fault.
     """
 
     def __init__(
@@ -52,16 +53,16 @@ class EmulatedArray:
             )
             for c in profile.cameras
         }
-        self.commands: list[tuple[str, bytes]] = []  # camera and what was written to it, in order
+        self.commands: list[tuple[str, bytes]] = []  # camera and data of each write, in order
         self._armed: set[str] = set()
         self._lock = threading.Lock()
 
     def has(self, camera: str, kind: str) -> bool:
-        """Whether a camera has a fault of this kind."""
+        """Return whether a camera has a fault of this kind."""
         return any(f.camera == camera and f.kind == kind for f in self.faults)
 
     def write(self, camera: str, data: bytes) -> bool:
-        """A command for a camera. False where it is none of its profile, which the camera answers with a stall."""
+        """Handle a command for a camera. Return False for one that is not in its profile: the camera stalls."""
         c = self.cameras[camera].profile
         with self._lock:
             self.commands.append((camera, data))
@@ -84,7 +85,7 @@ class EmulatedArray:
 
 
 def camera_profile(name: str, serial: str, role: str) -> CameraProfile:
-    """A camera as the emulator plays it: a bridge's usual numbers, and commands that only say what they are."""
+    """Return an emulated camera's profile: the usual numbers of a bridge, and readable commands."""
     return CameraProfile(
         id=name,
         serial=serial,
@@ -103,7 +104,7 @@ def camera_profile(name: str, serial: str, role: str) -> CameraProfile:
 
 
 def scene_profile(scene: Scene, **changes: Any) -> RigProfile:
-    """The profile of an emulated array that shows a scene; `changes` are fields of `RigProfile`.
+    """Return the profile of an emulated array that shows a scene; `changes` are fields of `RigProfile`.
 
     Every camera of the scene, the first as the primary, with its calibration; each keeps the scene's held-out views.
     """
@@ -129,7 +130,7 @@ def scene_profile(scene: Scene, **changes: Any) -> RigProfile:
 
 
 def scene_streams(scene: Scene) -> dict[str, UInt8]:
-    """The packed streams [n_ticks, bytes] of a scene by camera, rows bottom-up, for an `EmulatedArray`."""
+    """Return the packed streams [n_ticks, bytes] of a scene by camera, rows bottom-up, for an `EmulatedArray`."""
     streams = {name: scene.stream(name) for name in scene.cameras}
     return {name: orient(s.packed, s.width, s.height, not s.rows_bottom_up, False) for name, s in streams.items()}
 

@@ -62,14 +62,14 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
             self._plugs += [_Plug(len(self._plugs) + i + 1, camera, speed) for i in range(copies)]
 
     def enumerate_devices(self) -> Iterator[_Plug]:
-        """The devices that are plugged in."""
+        """Yield the devices that are plugged in."""
         return (plug for plug in self._plugs if plug.camera.dead != UNPLUGGED)
 
     def get_parent(self, dev: _Plug) -> None:
-        """Emulated devices hang on no hub."""
+        """Return None: emulated devices are on no hub."""
 
     def get_device_descriptor(self, dev: _Plug) -> SimpleNamespace:
-        """As a vendor's device of USB 3.1, with its place on the bus."""
+        """Return the descriptor of a vendor-specific USB 3.1 device, with its position on the bus."""
         camera = dev.camera.profile
         return SimpleNamespace(
             bLength=18,
@@ -94,7 +94,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def get_configuration_descriptor(self, dev: _Plug, config: int) -> SimpleNamespace:
-        """One configuration."""
+        """Return the only configuration."""
         if config:
             raise IndexError(config)
         return SimpleNamespace(
@@ -110,7 +110,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def get_interface_descriptor(self, dev: _Plug, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """The interfaces that the rig profile names."""
+        """Return the interfaces that the rig profile names."""
         number, endpoints = list(interfaces(dev.camera.profile).items())[intf]
         if alt:
             raise IndexError(alt)
@@ -128,7 +128,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def get_endpoint_descriptor(self, dev: _Plug, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Bulk endpoints."""
+        """Return bulk endpoints."""
         return SimpleNamespace(
             bLength=7,
             bDescriptorType=usb.util.DESC_TYPE_ENDPOINT,
@@ -142,28 +142,28 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def open_device(self, dev: _Plug) -> _Plug:
-        """The handle of a device that is plugged in."""
+        """Return the handle of a device that is plugged in."""
         _check_plugged(dev)
         return dev
 
     def close_device(self, dev_handle: _Plug) -> None:
-        """Nothing is to be released."""
+        """Do nothing: there is no resource to release."""
 
     def get_configuration(self, dev_handle: _Plug) -> int:
-        """Always the one."""
+        """Return 1, the only configuration."""
         _check_plugged(dev_handle)
         return 1
 
     def set_configuration(self, dev_handle: _Plug, config_value: int) -> None:
-        """There is one."""
+        """Accept the only configuration."""
         _check_plugged(dev_handle)
 
     def claim_interface(self, dev_handle: _Plug, intf: int) -> None:
-        """Nobody else can have it."""
+        """Accept the claim: no other program can hold the interface."""
         _check_plugged(dev_handle)
 
     def release_interface(self, dev_handle: _Plug, intf: int) -> None:
-        """Nothing is to be released."""
+        """Do nothing: there is no resource to release."""
 
     def clear_halt(self, dev_handle: _Plug, ep: int) -> None:
         """End a stall."""
@@ -180,7 +180,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         data: array.array[int],
         timeout: int,
     ) -> int:
-        """The string descriptors; any other request stalls."""
+        """Answer requests for string descriptors; stall on any other request."""
         _check_plugged(dev_handle)
         if (bmRequestType, bRequest, wValue >> 8) != (0x80, 6, usb.util.DESC_TYPE_STRING):
             raise _error(errno.EPIPE)
@@ -189,14 +189,14 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(answer)
 
     def bulk_write(self, dev_handle: _Plug, ep: int, intf: int, data: array.array[int], timeout: int) -> int:
-        """A command; an unknown one stalls."""
+        """Pass a command to the camera; stall on an unknown one."""
         _check_plugged(dev_handle)
         if not self.emulated.write(dev_handle.camera.profile.id, data.tobytes()):
             raise _error(errno.EPIPE)
         return len(data) * data.itemsize
 
     def bulk_read(self, dev_handle: _Plug, ep: int, intf: int, buff: array.array[int], timeout: int) -> int:
-        """One read that blocks. A time-out that cuts it off returns what has come, as libusb does."""
+        """Do one blocking read. A time-out that cuts it off returns the bytes so far, as libusb does."""
         camera, into = dev_handle.camera, np.frombuffer(buff, np.uint8)
         with camera.changed:
             camera.lose_unread(0)
@@ -208,13 +208,13 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         return done[0]
 
     def open_transfers(self, device: usb.core.Device, endpoint: int, transfer_bytes: int, depth: int) -> EmulatedReads:
-        """A queue of reads on a device's data endpoint."""
+        """Return a queue of reads on a device's data endpoint."""
         plug = next(p for p in self._plugs if p.address == device.address)
         return EmulatedReads(plug.camera, transfer_bytes, depth)
 
 
 class EmulatedReads:
-    """Reads in flight on an emulated camera, a `Transfers`: what has come of them is copied when `wait` looks."""
+    """Reads in flight on an emulated camera, a `Transfers`; `wait` copies the bytes that have arrived."""
 
     def __init__(self, camera: EmulatedCamera, transfer_bytes: int, depth: int) -> None:
         self.depth = depth
@@ -223,7 +223,7 @@ class EmulatedReads:
 
     @property
     def in_flight(self) -> int:
-        """Reads that have not ended; of a camera without a clock, all that `wait` has not told about."""
+        """Number of reads that have not ended; for a camera without a clock, those that `wait` has not returned."""
         with self._camera.changed:
             return len(self._flying) - self._camera.ended(len(self._flying), self._size)
 
@@ -234,7 +234,7 @@ class EmulatedReads:
             self._flying.append(buffer)
 
     def wait(self, timeout_s: float) -> Completion | None:
-        """The oldest read's end, or None."""
+        """Return the oldest read's end, or None."""
         if not self._flying:
             return None
         with self._camera.changed:
@@ -245,7 +245,7 @@ class EmulatedReads:
         return Completion(done[0], time.monotonic_ns(), done[1])
 
     def cancel(self) -> list[Completion]:
-        """End every read with what has come of it."""
+        """End every read with the bytes that have arrived."""
         out = []
         with self._camera.changed:
             while self._flying:
@@ -267,7 +267,7 @@ def _wait(camera: EmulatedCamera, into: UInt8, timeout_s: float) -> tuple[int, s
 
 
 def interfaces(camera: CameraProfile) -> dict[int, list[int]]:
-    """Interface number -> endpoint addresses, as the profile names them."""
+    """Return interface number -> endpoint addresses, as the profile names them."""
     out: dict[int, list[int]] = {camera.interface: [camera.endpoint_in]}
     if camera.endpoint_out is not None:
         control = camera.interface if camera.control_interface is None else camera.control_interface
@@ -276,7 +276,7 @@ def interfaces(camera: CameraProfile) -> dict[int, list[int]]:
 
 
 def string_descriptor(camera: CameraProfile, index: int) -> bytes:
-    """What a camera answers when it is asked for a string: manufacturer, product, serial number."""
+    """Return a camera's answer to a request for a string: manufacturer, product, serial number."""
     if index == 0:
         return _LANGUAGE
     text = (*_STRINGS, camera.serial)[index].encode("utf-16-le")

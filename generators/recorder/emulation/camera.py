@@ -1,8 +1,8 @@
-"""A camera in software, behind the plug: what it sends, when, and how it fails.
+"""An emulated camera behind the USB plug: its data, their timing, and its faults.
 
-It sends the ticks of a packed stream, again and again without pause; its first frame after a start is tick 0 of the
-stream. `emulated_array.py` joins cameras to an array, `emulator.py` puts them behind a pyusb backend; nothing here
-depends on how a camera is read. Not modelled: the time that a bus takes.
+It sends the ticks of a packed stream in an endless loop; its first frame after a start is tick 0 of the stream.
+`array.py` joins cameras to an array, `backend.py` puts them behind a pyusb backend; this module does not depend on how
+a camera is read. Not modelled: the time that a bus takes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
-from spike4dgs.generators.recorder.frames.layouts import make_layout, orient
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.profile.profile import TOP_DOWN, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, OK
 
@@ -28,18 +29,18 @@ MISSING, DUPLICATE, HIGH_SPEED = "missing", "duplicate serial", "high speed"
 _IN_STREAM = (STALL, OVERFLOW, UNPLUGGED, TIME_OUT, SHORT_READ, LOST)
 FAULTS = (*_IN_STREAM, MISSING, DUPLICATE, HIGH_SPEED)
 
-_HELD_BYTES = 16384  # what a camera that was stopped still hands out: the memory of its USB bridge
+_HELD_BYTES = 16384  # that a stopped camera still delivers: the memory of its USB bridge
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong with one camera.
+    """One fault of one camera.
 
     - "stall", "overflow", "unplugged": the read that reaches byte `offset` of `tick` ends so, with the bytes before it.
-    - "time-out": nothing comes from there on, for good.
+    - "time-out": no data arrive from there on.
     - "short read": that read ends early; `lost` bytes are missing before the next one.
-    - "lost bytes": `lost` bytes are missing there, and no status tells.
-    - "missing", "duplicate serial", "high speed": the camera is not there; is there twice; is on a slow link.
+    - "lost bytes": `lost` bytes are missing there, and no status reports it.
+    - "missing", "duplicate serial", "high speed": the camera is absent, is present twice, or is on a slow link.
 
     `start` counts the start sequences before the fault: a recording begins with the second (1), after a rehearsal (0).
     """
@@ -54,20 +55,20 @@ class Fault:
 
 @dataclass(frozen=True)
 class ReadPlan:
-    """How a read will end, in positions of the stream since the camera's start."""
+    """The end of a read, in positions of the stream since the camera's start."""
 
     pieces: tuple[tuple[int, int], ...]  # [from, to) of the bytes that it brings
     after: int  # position of the byte that follows
-    faults: int  # that it meets
+    faults: int  # that it reaches
     status: str
 
 
 class EmulatedCamera:
-    """One camera: started and stopped by commands, read by whoever asks first.
+    """One camera: started and stopped by commands, read by the first who asks.
 
-    `source` is [n_ticks, payload_bytes], packed as on disk (rows bottom-up). `ticks_per_s` None: data are there as soon
-    as they are asked for. `memory_bytes`: what it holds while no read is in flight; whole frames beyond that are lost
-    (None: nothing is lost).
+    `source` is [n_ticks, payload_bytes], packed as on disk (rows bottom-up). `ticks_per_s` None: data are available as
+    soon as they are requested. `memory_bytes`: capacity while no read is in flight; whole frames beyond it are lost
+    (None: no frame is lost).
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class EmulatedCamera:
 
     @property
     def running(self) -> bool:
-        """Whether it sends."""
+        """True while the camera sends."""
         return self._begun is not None
 
     def begin(self, now_s: float) -> None:
@@ -113,7 +114,7 @@ class EmulatedCamera:
             self.changed.notify_all()
 
     def end(self) -> None:
-        """Send no more, except for what the USB bridge holds."""
+        """Stop sending, except for the bytes that the USB bridge holds."""
         with self.changed:
             if self._begun is not None and self.dead is None:
                 n = min(_HELD_BYTES, self._produced() - self._at)
@@ -122,12 +123,12 @@ class EmulatedCamera:
             self.changed.notify_all()
 
     def clear_halt(self) -> None:
-        """Forget a stall."""
+        """Clear a stall."""
         with self.changed:
             self.dead = None if self.dead == STALL else self.dead
 
     def due_s(self, n: int) -> float:
-        """When a read of `n` bytes ends by itself, in the time of time.monotonic(); infinite where it never does."""
+        """Return when a read of `n` bytes ends by itself (clock of time.monotonic()); infinite where it never does."""
         if self.dead or len(self._held):
             return 0.0
         if self._begun is None:
@@ -138,7 +139,7 @@ class EmulatedCamera:
         return 0.0 if self._rate is None else self._begun + plan.pieces[-1][1] / self._rate
 
     def read(self, into: UInt8, cut: bool = False) -> tuple[int, str] | None:
-        """End a read of len(into) bytes: their number and its status. None if it is not due, unless it is cut off."""
+        """End a read of len(into) bytes. Return their number and its status, or None if it is neither due nor `cut`."""
         if len(self._held):
             n = min(len(self._held), len(into))
             into[:n], self._held = self._held[:n], self._held[n:]
@@ -154,7 +155,7 @@ class EmulatedCamera:
         return self._fill(into, plan) if due else self._fill_until(into, plan)
 
     def ended(self, reads: int, size: int) -> int:
-        """How many of the reads of one size that are in flight have ended by now; 0 where no clock says."""
+        """Return how many of the reads of one size in flight have ended by now; 0 without a clock."""
         if self._rate is None and not self.dead:
             return 0
         if self.dead or self._faults or len(self._held):
@@ -163,11 +164,11 @@ class EmulatedCamera:
         return 0 if self._begun is None else min((self._produced() - self._at) // size, reads)
 
     def lose_unread(self, asked: int) -> None:
-        """Lose the frames that found no room, when a read is submitted behind others for `asked` bytes in all."""
+        """Lose the frames that had no room, when a read is submitted behind others for `asked` bytes in all."""
         if self._memory is None or self._rate is None or self._begun is None:
             return
         room = max(asked + self._memory, -self._at % self._frame)  # a frame that has begun is sent to its end
-        plan = self._plan(room + 1)  # one byte more, so that a hole that is just there already counts
+        plan = self._plan(room + 1)  # one byte more, so that a loss at this very position counts
         first = plan.after // self._frame
         lost = (self._produced() // self._frame - first) * self._frame
         if plan.status == OK and lost > 0:
@@ -176,7 +177,7 @@ class EmulatedCamera:
             self.lost_bytes += lost
 
     def _produced(self) -> int:
-        """Bytes that it has sent or could have sent since its start."""
+        """Return the number of bytes that it has sent or could have sent since its start."""
         if self._rate is None or self._begun is None:
             return 1 << 62
         return int((time.monotonic() - self._begun) * self._rate)
@@ -203,7 +204,7 @@ class EmulatedCamera:
         return n, plan.status
 
     def _fill_until(self, into: UInt8, plan: ReadPlan) -> tuple[int, str]:
-        """What has come of a read that is not due."""
+        """Copy the bytes that have arrived of a read that is not due."""
         have = self._produced()
         pieces = tuple((a, min(b, have)) for a, b in plan.pieces if a < have)
         n = self._copy(into, pieces)
@@ -221,7 +222,7 @@ class EmulatedCamera:
         return n
 
     def _some(self, a: int, b: int) -> UInt8:
-        """Bytes from position a on, no more than b - a; a view where frames are sent as they are stored."""
+        """Return bytes from position a on, at most b - a; a view where frames are sent as they are stored."""
         if self._wire is None:
             return self._bytes(a, b)
         i = a % len(self._wire)  # the stream begins anew at its end

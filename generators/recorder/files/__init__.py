@@ -1,1 +1,1 @@
-"""Recordings on disk, written while they grow."""
+"""Recordings on disk, written during the capture."""

@@ -1,9 +1,9 @@
-"""Files that grow as fast as the disk takes them: past the page cache where the system allows it (`O_DIRECT`).
+"""Files that grow as fast as the disk allows: past the page cache where the system supports it (`O_DIRECT`).
 
-A cache that is written to faster than the disk empties it makes every writer wait for long and at a time of its own
-choosing. Here bytes are collected in a few aligned buffers, and a thread for each file hands whole buffers to the disk:
-the processor copies each byte once, and what waits is known (`Buffers.waiting`). Where a file system does not take
-unaligned files or none of this at all, buffers go through the cache and are forced out one by one, for the same reason.
+A cache that is filled faster than the disk empties it blocks every writer for long, at unpredictable times. Here bytes
+are collected in a few aligned buffers, and a thread for each file writes whole buffers to the disk: the processor
+copies each byte once, and the amount of waiting data is known (`Buffers.waiting`). Where a file system does not support
+unaligned files or O_DIRECT at all, buffers go through the cache and are forced out one by one, for the same reason.
 
 Measured with 1 to 2 GiB on a virtual disk: one file took 600 to 880 MB/s past the cache, at 3 to 7 % of a core, and 300
 MB/s at 49 % through it. Buffers of 16 MiB were no faster than 4 MiB, and their longest write took three times as long.
@@ -28,42 +28,42 @@ UInt8 = NDArray[np.uint8]
 
 BUFFER_BYTES = 4 << 20
 PER_FILE = 4  # buffers
-_BLOCK = 4096  # bytes whose multiples O_DIRECT takes: of addresses, sizes and places in the file
+_BLOCK = 4096  # bytes: O_DIRECT needs addresses, sizes and offsets in multiples of it
 
-_Job = tuple[int, UInt8, int]  # place in the file, buffer, bytes of it
+_Job = tuple[int, UInt8, int]  # offset in the file, buffer, number of its bytes
 
 
 class Buffers:
-    """Aligned memory for `files` files that are each of `file_bytes` at most; they share it."""
+    """Aligned memory, shared by `files` files of at most `file_bytes` each."""
 
     def __init__(self, files: int, file_bytes: int) -> None:
         self.size = min(BUFFER_BYTES, _up(max(file_bytes, 1)))
         self.count = files * PER_FILE
         memory = np.frombuffer(mmap.mmap(-1, self.count * self.size), np.uint8).reshape(self.count, self.size)
-        memory.fill(0)  # has the system map the pages now, not while a camera sends
+        memory.fill(0)  # makes the system map the pages now, not while a camera sends
         self._free: queue.SimpleQueue[UInt8] = queue.SimpleQueue()
         for buffer in memory:
             self._free.put(buffer)
 
     @property
     def waiting(self) -> int:
-        """Bytes of the buffers that are being filled or written."""
+        """Number of bytes in buffers that are being filled or written."""
         return (self.count - self._free.qsize()) * self.size
 
     def take(self) -> UInt8:
-        """A buffer [size] of any content; waits for one."""
+        """Return a free buffer [size] of any content; wait for one."""
         return self._free.get()
 
     def give(self, buffer: UInt8) -> None:
-        """Give a buffer back."""
+        """Return a buffer to the free ones."""
         self._free.put(buffer)
 
 
 class DiskFile:
-    """A new file of `n_bytes` zeros, whose space is reserved, and which is written from its start to its end.
+    """A new file of `n_bytes` zeros with reserved space, written from its start to its end.
 
-    Its own thread writes; an error of the system stops that for good, and is kept in `error`. Only the constructor and
-    `close` raise OSError.
+    Its own thread writes; an error of the system ends the writing for good, and is kept in `error`. Only the
+    constructor and `close` raise OSError.
     """
 
     def __init__(self, path: Path, n_bytes: int, buffers: Buffers) -> None:
@@ -72,7 +72,7 @@ class DiskFile:
         self.written = 0  # every byte before this is on the disk, or was left zero
         self._fd = self._open(path)
         self._buffers = buffers
-        self._buffer: UInt8 | None = None  # that is being filled, to be written at _at
+        self._buffer: UInt8 | None = None  # being filled, to be written at _at
         self._at = self._filled = 0
         self._failed = 0  # end of the buffer that could not be written
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
@@ -86,9 +86,9 @@ class DiskFile:
         self._thread.start()
 
     def write(self, at: int, data: UInt8) -> None:
-        """Take bytes [n] for the place `at`, behind all that came before; what lies between them stays zero.
+        """Accept bytes [n] for offset `at`, after all earlier ones; bytes between them stay zero.
 
-        Waits where no buffer is free. After an error there is nothing more to do, and nothing is done.
+        Waits while no buffer is free. Does nothing after an error.
         """
         if at < self._at + self._filled:
             raise ValueError(f"byte {at} is to be written after byte {self._at + self._filled}")
@@ -105,21 +105,21 @@ class DiskFile:
                 self._hand_over()
 
     def flush(self) -> None:
-        """Wait until everything is on the disk, or was refused. Nothing can be written after this."""
+        """Wait until all bytes are on the disk or have failed. Nothing can be written after this."""
         if self._thread.is_alive():
             self._hand_over()
             self._jobs.put(None)
             self._thread.join()
 
     def blank(self, start: int) -> None:
-        """Zeros from `start` to the end of the buffer that could not be written, as far as the disk takes them."""
+        """Write zeros from `start` to the end of the buffer that could not be written, as far as the disk allows."""
         with contextlib.suppress(OSError):
             self._cached()
             while start < self._failed:
                 start += os.pwrite(self._fd, bytes(self._failed - start), start)
 
     def close(self, n_bytes: int | None = None) -> None:
-        """Close the file; with `n_bytes` cut it to that length first, and have the disk hold it."""
+        """Close the file; with `n_bytes`, cut it to that length first and force it to the disk."""
         self.flush()
         fd, self._fd = self._fd, -1
         if fd >= 0:
@@ -137,7 +137,7 @@ class DiskFile:
         except OSError as e:
             if e.errno != errno.EINVAL:
                 raise
-        self.direct = False  # the file system has nothing but the cache
+        self.direct = False  # the file system supports the cache only
         return os.open(path, flags, 0o644)
 
     def _skip(self, at: int) -> None:
@@ -152,7 +152,7 @@ class DiskFile:
             self._buffer[: self._filled] = 0
 
     def _hand_over(self) -> None:
-        """Have the buffer written, with zeros up to a whole block: they are written over, or cut off in the end."""
+        """Have the buffer written, zero-padded to a whole block; the padding is overwritten, or cut off at the end."""
         if self._buffer is not None:
             n = _up(self._filled)
             self._buffer[self._filled : n] = 0
@@ -178,7 +178,7 @@ class DiskFile:
                 if self.direct:
                     self.written = at
         finally:
-            if not self.direct:  # what the cache has taken is not on the disk yet
+            if not self.direct:  # data in the cache are not on the disk yet
                 os.fdatasync(self._fd)
                 os.posix_fadvise(self._fd, start, at - start, os.POSIX_FADV_DONTNEED)
                 self.written = at
@@ -189,7 +189,7 @@ class DiskFile:
         except OSError as e:
             if e.errno != errno.EINVAL or not self.direct:
                 raise
-        self._cached()  # this file system wants another alignment, or a limit cut a write in the middle of a block
+        self._cached()  # this file system needs another alignment, or a limit cut a write in the middle of a block
         return os.pwrite(self._fd, data.data, at)
 
     def _cached(self) -> None:

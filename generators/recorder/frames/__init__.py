@@ -1,1 +1,1 @@
-"""From bytes to frames with true ticks: layouts, rings, losses, clips."""
+"""Conversion of bytes to frames with true ticks: layouts, rings, losses, clips."""

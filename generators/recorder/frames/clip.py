@@ -1,4 +1,4 @@
-"""What a capture returns: each camera's frames with their true ticks, what is missing, and how the reading went."""
+"""The result of a capture: each camera's frames with their true ticks, its gaps, and statistics of its reads."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ UInt8 = NDArray[np.uint8]
 
 FRAME_TAGS, ARRIVAL_TIMES = "frame tags", "arrival times"
 
-# What continuous mode writes with: camera, true tick of the first frame, raw frames [n, frame_bytes] of consecutive
-# ticks. The frames are a view of the ring: copy or write them before returning. Called from capture()'s thread only.
+# The sink of continuous mode: camera, true tick of the first frame, raw frames [n, frame_bytes] of consecutive ticks.
+# The frames are a view of the ring: copy or write them before returning. Called from capture()'s thread only.
 Sink = Callable[[str, int, UInt8], None]
 
 
 @dataclass(frozen=True)
 class CameraStats:
-    """How one camera's capture went."""
+    """Statistics of one camera's capture."""
 
     bytes: int  # received after the trigger, dropped ones included
     blocks: int  # reads that ended with data
@@ -38,7 +38,7 @@ class CameraStats:
 
 @dataclass(frozen=True, eq=False)
 class CameraClip:
-    """What one camera delivered. In continuous mode `frames` and `ticks` are empty: the sink has had them."""
+    """The frames of one camera. In continuous mode `frames` and `ticks` are empty: the sink has received them."""
 
     camera: str
     frames: UInt8  # [n, frame_bytes] raw, as received; a view of the ring where nothing is missing
@@ -54,16 +54,16 @@ class Clip:
 
     n_ticks: int
     cameras: tuple[CameraClip, ...]
-    sync: str  # "frame tags", or "arrival times" where the layout has none or the cameras' counters are not common
+    sync: str  # "frame tags", or "arrival times" where the layout has no tags or the cameras' counters are not common
     interrupted: bool  # stopped before the wanted length
 
     @property
     def complete(self) -> bool:
-        """Whether no camera lost anything."""
+        """True if no camera lost a tick."""
         return not any(c.gaps for c in self.cameras)
 
     def without(self, gaps: tuple[Gap, ...]) -> Clip:
-        """The same clip, of which the disk has not taken these ticks."""
+        """Return the same clip with these gaps, the ticks that the disk did not store."""
         return replace(self, cameras=tuple(_without(c, gaps, self.n_ticks) for c in self.cameras))
 
 

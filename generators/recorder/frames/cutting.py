@@ -1,4 +1,4 @@
-"""From a ring's blocks to frames with true ticks: whole runs at once, as views of the ring where that is possible."""
+"""Conversion of a ring's blocks to frames with true ticks: whole runs at once, as views of the ring where possible."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ UInt8 = NDArray[np.uint8]
 
 
 class Cutter:
-    """Cuts one camera's blocks into frames, and notes which tick was complete when each read ended.
+    """Cuts one camera's blocks into frames, and records which tick was complete when each read ended.
 
     `origin` is the counter of tick 0 where the cameras have agreed on one. `lead` bytes are dropped first: those of a
-    frame that had begun before the recording.
+    frame that began before the recording.
     """
 
     def __init__(self, camera: str, layout: Layout, ring: Ring, origin: int | None = None, lead: int = 0) -> None:
@@ -32,9 +32,9 @@ class Cutter:
         self._base = self._flat.ctypes.data
 
     def cut(self, blocks: Sequence[Block]) -> list[Run]:
-        """The frames that these blocks, the next ones of the stream, complete."""
+        """Return the frames that these blocks, the next ones of the stream, complete."""
         runs: list[Run] = []
-        group: list[Block] = []  # neighbours in the stream and in memory
+        group: list[Block] = []  # adjacent in the stream and in memory
         for block in [*blocks, None]:
             if group and (block is None or block.data is None or _address(block) != _end(group[-1])):
                 runs += self._feed(group)
@@ -46,12 +46,12 @@ class Cutter:
         return runs
 
     def finish(self, n_ticks: int, reason: str) -> tuple[Gap, ...]:
-        """The gaps of the clip [0, n_ticks), whose end lacks for `reason` if it does."""
+        """Return the gaps of the clip [0, n_ticks); a missing end has the reason `reason`."""
         return self._counter.finish(n_ticks, reason)
 
     @property
     def arrival(self) -> NDArray[np.int64]:
-        """[m, 2]: ticks complete when a read ended, CLOCK_MONOTONIC ns."""
+        """Return [m, 2]: number of complete ticks when a read ended, and its time (CLOCK_MONOTONIC, ns)."""
         return np.array(self._arrival, np.int64).reshape(-1, 2)
 
     def _feed(self, group: list[Block]) -> list[Run]:
@@ -63,7 +63,7 @@ class Cutter:
         complete = np.full(len(group), -1)
         for run in runs:
             self.next_tick = run.first_tick + len(run.frames)
-            beyond = ends - run.frames.ctypes.data  # from the run's first byte; nonsense for a frame of two groups
+            beyond = ends - run.frames.ctypes.data  # from the run's first byte; meaningless for a frame of two groups
             within = (beyond >= 0) & (beyond < run.frames.nbytes + self._frame_bytes)
             complete[within] = run.first_tick + np.minimum(beyond[within] // self._frame_bytes, len(run.frames))
         self._arrival += [(int(t), b.arrival_ns) for t, b in zip(complete, group, strict=True) if t >= 0]
@@ -72,7 +72,7 @@ class Cutter:
 
 @dataclass(frozen=True)
 class First:
-    """A camera's first whole frame: where in its stream, behind how many kept bytes, and its counter (0: has none)."""
+    """A camera's first whole frame: its position in the stream, the kept bytes before it, its counter (0: has none)."""
 
     position: int
     lead: int
@@ -80,7 +80,7 @@ class First:
 
 
 def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
-    """The first whole frame that these blocks, the first ones kept, begin with; None where there is none yet."""
+    """Return the first whole frame in these blocks, the first ones kept; None if there is none yet."""
     if not blocks:
         return None
     position = blocks[0].position
@@ -99,9 +99,9 @@ def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
 
 
 def agree(counters: Sequence[int], most: int) -> int | None:
-    """The first counter that every camera has sent, if they differ by no more than `most` frames; else None.
+    """Return the first counter that every camera has sent, if they differ by no more than `most` frames; else None.
 
-    Counters that one trigger has set to zero differ by what the cameras sent before the recording; others by anything.
+    Counters set to zero by one trigger differ by the frames sent before the recording; others differ by anything.
     """
     first = counters[0]
     ahead = [(c - first + COUNTER // 2) % COUNTER - COUNTER // 2 for c in counters]
@@ -109,7 +109,7 @@ def agree(counters: Sequence[int], most: int) -> int | None:
 
 
 def joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
-    """Frames [n, frame_bytes] of all runs within the clip, not copied where there is one run, and their ticks [n]."""
+    """Return frames [n, frame_bytes] of all runs within the clip (a view, if there is one run) and their ticks [n]."""
     cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
     ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
     if len(cut) == 1:

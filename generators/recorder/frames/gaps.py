@@ -1,4 +1,4 @@
-"""Gaps while recording: the reasons there are, and which ticks of a clip are missing from what was received."""
+"""Gaps while recording: their reasons, and the ticks of a clip that were not received."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["REASONS", "Gap", "missing", "merged"]
 
 OVERFLOW, STALL, UNPLUGGED, TIME_OUT = "overflow", "stall", "unplugged", "time-out"
 SHORT_READ, TORN_FRAME, INTERRUPTED = "short read", "torn frame", "interrupted"
-DISK = "disk"  # received, and not taken by the disk
+DISK = "disk"  # received, but not stored by the disk
 REASONS = (OVERFLOW, STALL, UNPLUGGED, TIME_OUT, SHORT_READ, TORN_FRAME, INTERRUPTED, DISK)
 
 
 def missing(camera: str, ticks: NDArray[np.int64], n_ticks: int, reason: str) -> tuple[Gap, ...]:
-    """The ticks of [0, n_ticks) that are not among `ticks` (ascending), as gaps of one reason."""
+    """Return the ticks of [0, n_ticks) that are not among `ticks` (ascending), as gaps of one reason."""
     inside = ticks[(ticks >= 0) & (ticks < n_ticks)]
     edges = np.concatenate([[-1], inside, [n_ticks]])
     holes = np.nonzero(np.diff(edges) > 1)[0]
@@ -26,7 +26,7 @@ def missing(camera: str, ticks: NDArray[np.int64], n_ticks: int, reason: str) ->
 
 
 def merged(gaps: Iterable[Gap], n_ticks: int) -> tuple[Gap, ...]:
-    """Gaps sorted, cut to [0, n_ticks), without overlap; neighbours of one camera and reason are one gap.
+    """Return the gaps sorted, cut to [0, n_ticks), without overlap; adjacent gaps of one camera and reason are joined.
 
     Where two overlap, the ticks keep the reason of the one that begins first.
     """

@@ -1,7 +1,7 @@
-"""The memory that one camera's reads fill: allocated before the capture starts, and never waited for.
+"""The memory for one camera's reads: allocated before the capture starts, and always available to the next read.
 
-Reads take slots in turn. Where the consumer has not given one back in time, the read goes to a spare buffer whose
-bytes nobody keeps: the USB side goes on, and what is lost is known to the byte.
+Reads take slots in turn. If the consumer has not released one in time, the read goes to a spare buffer whose bytes are
+dropped: the USB side continues, and the loss is known to the byte.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SPARE = -1
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """What one read brought: bytes [position, position + bytes) of the camera's stream. `data` is None if dropped."""
+    """The data of one read: bytes [position, position + bytes) of the camera's stream. `data` is None if dropped."""
 
     data: UInt8 | None  # [bytes], a view of the ring
     position: int
@@ -38,13 +38,13 @@ class Ring:
     def __init__(self, slots: int, slot_bytes: int) -> None:
         self.slots, self.slot_bytes = slots, slot_bytes
         self.memory = np.empty((slots + 1, slot_bytes), np.uint8)  # the last row is the spare buffer
-        self.memory.fill(0)  # has the system map the pages now, not while the camera sends
+        self.memory.fill(0)  # makes the system map the pages now, not while the camera sends
         self._lock = threading.Lock()
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, with no read in flight and no block waiting."""
-        self.position = 0  # bytes that came so far
+        """Reset to no read in flight and no waiting block."""
+        self.position = 0  # bytes received so far
         self.dropped = 0  # of these, in the spare buffer
         self.waiting = 0  # slots with blocks that the consumer has not popped
         self.backlog = 0  # most that waited at once
@@ -54,7 +54,7 @@ class Ring:
         self._popped: int | None = None
 
     def take(self) -> UInt8:
-        """The buffer [slot_bytes] for the next read: a free slot, or the spare one."""
+        """Return the buffer [slot_bytes] for the next read: a free slot, or the spare one."""
         with self._lock:
             slot = self._next if self._used < self.slots else _SPARE
             if slot != _SPARE:
@@ -64,7 +64,7 @@ class Ring:
         return self.memory[slot]
 
     def put(self, n: int, arrival_ns: int, keep: bool = True) -> Block:
-        """Note that the oldest read has brought `n` bytes, and hand them to the consumer unless not to `keep` them."""
+        """Record that the oldest read has delivered `n` bytes, and queue them for the consumer if `keep`."""
         slot = self._flying.popleft()
         data = None if slot == _SPARE else self.memory[slot, :n]
         block = Block(data, self.position, n, arrival_ns)
@@ -80,7 +80,7 @@ class Ring:
         return block
 
     def pop(self) -> Block | None:
-        """The oldest block that waits, or None. The block popped before it is released."""
+        """Return the oldest waiting block, or None. The block popped before it is released."""
         self.release()
         if not self._filled:
             return None
@@ -91,13 +91,13 @@ class Ring:
         return block
 
     def release(self) -> None:
-        """Give the popped block's slot back to the reads."""
+        """Release the popped block's slot for further reads."""
         if self._popped is not None and self._popped != _SPARE:
             self._free()
         self._popped = None
 
     def blocks(self) -> list[Block]:
-        """Every block that waits, oldest first; they keep waiting."""
+        """Return every waiting block, oldest first; they keep waiting."""
         with self._lock:
             return [block for _, block in self._filled]
 

@@ -1,9 +1,9 @@
-"""From a camera's bytes to frames with their true ticks, across losses of known and unknown size.
+"""Conversion of a camera's bytes to frames with their true ticks, across losses of known and unknown size.
 
 A tick is never guessed. Where the layout has a counter, a frame's tick follows from it, and after any loss the next
-whole frame is looked for byte by byte. Where it has none, ticks follow from the number of bytes, and a loss of unknown
-size ends the camera's recording: everything after it is a gap, because its ticks cannot be known. What no tag and no
-USB status tells, bytes that a camera without tags leaves out, stays unknown here; arrival times may show it.
+whole frame is searched byte by byte. Without a counter, ticks follow from the number of bytes, and a loss of unknown
+size ends the camera's recording: everything after it is a gap, because its ticks cannot be known. A loss that neither
+tag nor USB status reports, in a camera without tags, goes unnoticed here; arrival times may show it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NOTHING = np.empty(0, np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Raw frames of consecutive ticks; a view of the bytes that were fed where no frame straddled two of them."""
+    """Raw frames of consecutive ticks; a view of the bytes of one `feed` unless a frame is split between two."""
 
     first_tick: int
     frames: UInt8  # [n, frame_bytes]
@@ -42,17 +42,17 @@ class TickCounter:
     def __init__(self, layout: Layout, camera: str, origin: int | None = None) -> None:
         self._layout, self._camera = layout, camera
         self._counter = None if origin is None else origin - 1  # of the last frame that was numbered
-        self._tick = -1  # of the same frame; without counters of the last one that came or was skipped
+        self._tick = -1  # of the same frame; without counters, of the last frame that arrived or was skipped
         self._next = 0  # the tick after the last frame that was returned
-        self._synced = not layout.has_tags()  # whether it is known where the next frame begins
+        self._synced = not layout.has_tags()  # whether the beginning of the next frame is known
         self._ended = False  # lost for good
-        self._part = _NOTHING  # the beginning of a frame, or while out of step what may be one
+        self._part = _NOTHING  # the beginning of a frame, or while out of step a possible one
         self._ahead = 0  # bytes to drop before the next frame begins
         self._reason: str | None = None  # of the first loss that has not become a gap yet
         self._gaps: list[Gap] = []
 
     def feed(self, data: UInt8) -> list[Run]:
-        """Take the next bytes [n] of the stream; returns the frames that they complete, in ascending order of ticks."""
+        """Accept the next bytes [n] of the stream. Return the frames that they complete, in order of their ticks."""
         drop = min(self._ahead, len(data))
         self._ahead -= drop
         runs: list[Run] = []
@@ -78,7 +78,7 @@ class TickCounter:
         return runs
 
     def skip(self, n_bytes: int, reason: str) -> None:
-        """The next `n_bytes` came and were dropped: their number is known, so that the frames after them keep step."""
+        """Skip `n_bytes` that arrived and were dropped: their number is known, so later frames keep their ticks."""
         self._reason = self._reason or reason
         have, self._part = len(self._part), _NOTHING
         if not self._synced:
@@ -90,20 +90,20 @@ class TickCounter:
             self._tick += lost
 
     def lose(self, reason: str) -> None:
-        """An unknown number of bytes is missing here."""
+        """Record that an unknown number of bytes is missing here."""
         self._reason = self._reason or reason
         self._part, self._ahead = _NOTHING, 0
-        # Before the first frame nothing can be lost: tick 0 has not been yet.
+        # Before the first frame nothing can be lost: tick 0 is still to come.
         self._ended = self._ended or (self._synced and not self._layout.count_tags())
         self._synced = False
 
     def finish(self, n_ticks: int, reason: str = INTERRUPTED) -> tuple[Gap, ...]:
-        """The gaps of the clip [0, n_ticks): where its end lacks, that is for `reason` unless a loss is the cause."""
+        """Return the gaps of the clip [0, n_ticks): a missing end has the reason `reason` unless a loss caused it."""
         tail = Gap(self._camera, self._next, n_ticks - self._next, self._reason or reason)
         return merged([*self._gaps, tail], n_ticks)
 
     def _join(self, data: UInt8, runs: list[Run]) -> UInt8:
-        """Complete the frame that the bytes before have begun; returns the bytes that are still to be cut."""
+        """Complete the frame that the earlier bytes began. Return the bytes that are still to be cut."""
         part, self._part = self._part, _NOTHING
         need = self._layout.frame_bytes - len(part)
         if not len(part):
@@ -118,7 +118,7 @@ class TickCounter:
         return np.concatenate([part, data])
 
     def _number(self, frames: UInt8, counts: Int64, runs: list[Run]) -> None:
-        """Append frames [n, frame_bytes] as runs, and what lacks before each as a gap."""
+        """Append frames [n, frame_bytes] as runs, and the ticks missing before each as a gap."""
         ticks = self._ticks(counts)
         late = np.maximum.accumulate(np.concatenate([[self._next - 1], ticks]))[:-1]
         kept = np.nonzero(ticks > late)[0]  # a counter that goes back or repeats is no new tick
@@ -131,13 +131,13 @@ class TickCounter:
         for part in np.split(kept, breaks):
             first = int(ticks[part[0]])
             if first > self._next:
-                # A counter that leaps though every read ended well: the camera or its bridge has lost the frames.
+                # A counter that jumps although every read ended well: the camera or its bridge has lost the frames.
                 self._gaps.append(Gap(self._camera, self._next, first - self._next, self._reason or OVERFLOW))
             self._next, self._reason = first + len(part), None
             runs.append(Run(first, frames[part[0] : part[-1] + 1]))
 
     def _ticks(self, counts: Int64) -> Int64:
-        """True ticks of frames with these counters [n], negative before tick 0."""
+        """Return the true ticks of frames with these counters [n], negative before tick 0."""
         if not self._layout.count_tags():
             return self._tick + 1 + np.arange(len(counts))
         if self._counter is None and len(counts):

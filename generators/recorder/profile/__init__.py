@@ -1,1 +1,1 @@
-"""The rig profile: what cannot be asked over USB, in one TOML file."""
+"""The rig profile: all facts of an array that USB does not report, in one TOML file."""

@@ -1,4 +1,4 @@
-"""Gain and dark maps of a camera as `calibrate` writes them, which recordings carry with them."""
+"""Gain and dark maps of a camera, as `calibrate` writes them and recordings include them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Float32 = NDArray[np.float32]
 
 
 def read_maps(path: Path, width: int, height: int) -> dict[str, Float32]:
-    """The maps of an .npz, `gain` (mean 1) and `dark` (spikes per tick), each [H, W].
+    """Return the maps of an .npz, `gain` (mean 1) and `dark` (spikes per tick), each [H, W].
 
     Raises UserError where the file is missing, damaged, or not of a camera of this size.
     """

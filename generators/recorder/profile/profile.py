@@ -1,4 +1,4 @@
-"""The rig profile: everything about an array of cameras that cannot be asked over USB, in one TOML file.
+"""The rig profile: all facts of an array of cameras that USB does not report, in one TOML file.
 
 docs/rig_profile.md describes every key; docs/rig_example.toml is a whole profile.
 """
@@ -47,9 +47,9 @@ _VECTOR = tuple_of(_FINITE, "a list of numbers")
 
 @dataclass(frozen=True, eq=False)
 class CameraProfile:
-    """One camera: how it is found, how it is started and stopped, how its images lie, and its calibration.
+    """One camera: how to find, start and stop it, the orientation of its images, and its calibration.
 
-    `start` and `stop` are written to `endpoint_out`, one bulk write for each item. `rows` and `mirrored` tell how the
+    `start` and `stop` are written to `endpoint_out`, one bulk write for each item. `rows` and `mirrored` state how the
     camera sends its image; streams on disk are always bottom-up and not mirrored.
     """
 
@@ -58,7 +58,7 @@ class CameraProfile:
     vendor_id: int
     product_id: int
     interface: int
-    control_interface: int | None  # of endpoint_out, where it is another one than `interface`
+    control_interface: int | None  # of endpoint_out, if it is not `interface`
     endpoint_in: int
     endpoint_out: int | None
     start: tuple[bytes, ...]
@@ -77,7 +77,7 @@ class RigProfile:
     name: str
     width: int
     height: int
-    layout: str  # a name that `make_layout` knows
+    layout: str  # a name for `make_layout`
     cameras: tuple[CameraProfile, ...]
     fps: int = 20000
     title: str = ""
@@ -91,19 +91,19 @@ class RigProfile:
     timeout_ms: int = 500  # without any data, after which a camera counts as gone
 
     def camera(self, id: str) -> CameraProfile:
-        """The camera of that name. Raises KeyError where there is none."""
+        """Return the camera of that name. Raises KeyError where there is none."""
         return {c.id: c for c in self.cameras}[id]
 
     @property
     def calibrated(self) -> bool:
-        """Whether every camera has intrinsics and a pose, so that a recording can become a scene."""
+        """True if every camera has intrinsics and a pose, so that a recording can become a scene."""
         return all(c.calibration is not None for c in self.cameras)
 
 
 def load_profile(path: Path) -> RigProfile:
-    """Read and validate a rig profile; files that it names are looked for beside it.
+    """Read and validate a rig profile; files that it names are relative to its folder.
 
-    Raises UserError, one line that names file, key, what was expected and found, where anything is wrong.
+    Raises UserError for any error: one line with file, key, expected and found value.
     """
     top = read_toml(path, "a rig profile")
     top.take("schema", choice(SCHEMA))
@@ -134,7 +134,7 @@ def load_profile(path: Path) -> RigProfile:
 
 
 def calibration_toml(cameras: Iterable[Camera]) -> str:
-    """Intrinsics and poses as the file that a profile's key `calibration` names; every number returns exactly."""
+    """Return intrinsics and poses as the file of a profile's key `calibration`; reading it back gives equal numbers."""
     lines = [f'schema = "{CALIBRATION_SCHEMA}"']
     for c in cameras:
         values = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "rotation": c.R.tolist(), "translation": c.t.tolist()}
@@ -144,7 +144,7 @@ def calibration_toml(cameras: Iterable[Camera]) -> str:
 
 
 def read_calibration(path: Path, width: int, height: int) -> dict[str, Camera]:
-    """The cameras of a file that `calibration_toml` made, by id. Raises UserError where it is no such file."""
+    """Return the cameras of a file that `calibration_toml` made, by id. Raises UserError where it is no such file."""
     top = read_toml(path, "the calibration of a rig")
     top.take("schema", choice(CALIBRATION_SCHEMA))
     tables = top.table("camera") or Table(path, "camera", {})
@@ -175,7 +175,7 @@ def _read_cameras(top: Table, width: int, height: int) -> tuple[CameraProfile, .
     name = top.get("calibration", TEXT, None)
     known = read_calibration(folder / name, width, height) if name else {}
     if unique := {"id", "serial", "calibration", "maps"} & set(shared):
-        raise top.error(f"defaults.{min(unique)}", "what cameras have in common", "what each has of its own", "move it")
+        raise top.error(f"defaults.{min(unique)}", "common keys of the cameras", "a key of each camera", "move it")
     tables = top.tables("camera")
     if not tables:
         raise top.error("camera", "a table [[camera]] for each camera", "none", "add them")
@@ -243,11 +243,11 @@ def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.fl
     return array
 
 
-# ------------------------------------------------------------ the whole
+# ------------------------------------------------------------ checks across keys
 
 
 def _check_whole(top: Table, p: RigProfile) -> None:
-    """What no key shows alone: names used twice, roles, sizes that do not go together."""
+    """Check facts across keys: names used twice, roles, sizes that do not go together."""
     try:
         layout = make_layout(p.layout, p.width, p.height)
     except UserError as e:

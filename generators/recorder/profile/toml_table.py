@@ -1,4 +1,4 @@
-"""TOML tables read key by key: whatever is wrong becomes one UserError that names file, key, found value and fix."""
+"""TOML tables, read key by key: any error becomes one UserError that names file, key, found value and fix."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ _SHOWN = 60  # characters of a wrong value
 
 @dataclass(frozen=True)
 class Kind(Generic[T]):
-    """A kind of value: what it is called, and how it is read (ValueError or TypeError where it is another)."""
+    """A kind of value: its name in messages, and its reader (ValueError or TypeError for values of another kind)."""
 
     expected: str
     read: Callable[[Any], T]
 
 
 class Table:
-    """A table of a TOML file. Each key is taken once; `close` refuses those that nobody has asked for."""
+    """A table of a TOML file. Each key is taken once; `close` refuses the keys that were not."""
 
     def __init__(self, path: Path, name: str, values: dict[str, Any]) -> None:
         self.path, self._name, self._left, self._known = path, name, dict(values), set[str]()
 
     def error(self, key: str, expected: str, found: str, fix: str = "correct the file") -> UserError:
-        """The error for a key of this table."""
+        """Return the error for a key of this table."""
         name = f"{self._name}.{key}" if self._name and key else self._name or key
         return problem(f"{self.path}, key {name}", expected, found, fix)
 
     def take(self, key: str, kind: Kind[T]) -> T:
-        """The value of a key that must be there."""
+        """Return the value of a required key."""
         if key not in self._left:
             raise self.error(key, kind.expected, "no such key", "add it")
         return self.get(key, kind, None)  # type: ignore[return-value]
 
     def get(self, key: str, kind: Kind[T], default: D) -> T | D:
-        """The value of a key that may lack."""
+        """Return the value of an optional key."""
         self._known.add(key)
         if key not in self._left:
             return default
@@ -53,30 +53,30 @@ class Table:
             raise self.error(key, kind.expected, shown(value)) from None
 
     def tables(self, key: str) -> list[Table]:
-        """The tables of an array of tables, [[key]]."""
+        """Return the tables of an array of tables, [[key]]."""
         values = self.get(key, Kind(f"tables [[{key}]]", _list_of_tables), [])
         return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(values)]
 
     def table(self, key: str) -> Table | None:
-        """A table in this one, or None where it lacks."""
+        """Return a table in this one, or None where it is absent."""
         values = self.get(key, Kind(f"a table [{key}]", _table), None)
         return None if values is None else Table(self.path, f"{self._name}.{key}".lstrip("."), values)
 
     def items(self) -> list[tuple[str, Table]]:
-        """All that is left, each a table by name."""
+        """Take all remaining keys, each a table, and return them by name."""
         return [(key, self.table(key)) for key in list(self._left)]  # type: ignore[misc]
 
     def with_defaults(self, values: dict[str, Any]) -> Table:
-        """This table, with values for the keys that it lacks."""
+        """Return this table with values for its absent keys."""
         return Table(self.path, self._name, {**values, **self._left})
 
     def rest(self) -> dict[str, Any]:
-        """All that nobody has taken, which is taken by that."""
+        """Take all remaining keys and return them."""
         rest, self._left = self._left, {}
         return rest
 
     def close(self) -> None:
-        """Raise UserError for a key that nobody has taken."""
+        """Raise UserError for a key that was not taken."""
         if self._left:
             raise self.error(next(iter(self._left)), f"keys among {', '.join(sorted(self._known))}", "another key")
 
@@ -94,7 +94,7 @@ def read_toml(path: Path, what: str) -> Table:
 
 
 def shown(value: object) -> str:
-    """A value as an error shows it, cut where it is long."""
+    """Return a value in the form of an error message, cut where it is long."""
     try:
         text = repr(value)
     except ValueError:  # a number with more digits than Python prints
@@ -103,7 +103,7 @@ def shown(value: object) -> str:
 
 
 def whole(low: int, high: int) -> Kind[int]:
-    """An integer of [low, high]."""
+    """Return the kind of integers of [low, high]."""
 
     def read(value: Any) -> int:
         if type(value) is not int or not low <= value <= high:
@@ -114,7 +114,7 @@ def whole(low: int, high: int) -> Kind[int]:
 
 
 def number(low: float, high: float, expected: str) -> Kind[float]:
-    """A finite number of (low, high]."""
+    """Return the kind of finite numbers of (low, high]."""
 
     def read(value: Any) -> float:
         if type(value) not in (int, float) or not (math.isfinite(value) and low < value <= high):
@@ -125,7 +125,7 @@ def number(low: float, high: float, expected: str) -> Kind[float]:
 
 
 def choice(*names: str) -> Kind[str]:
-    """One of some words."""
+    """Return the kind of these words."""
 
     def read(value: Any) -> str:
         if value not in names:
@@ -136,7 +136,7 @@ def choice(*names: str) -> Kind[str]:
 
 
 def matching(expected: str, fits: Callable[[str], object]) -> Kind[str]:
-    """A string that `fits`."""
+    """Return the kind of strings that `fits` accepts."""
 
     def read(value: Any) -> str:
         if not isinstance(value, str) or not fits(value):
@@ -147,7 +147,7 @@ def matching(expected: str, fits: Callable[[str], object]) -> Kind[str]:
 
 
 def tuple_of(kind: Kind[T], expected: str) -> Kind[tuple[T, ...]]:
-    """A list of values of one kind."""
+    """Return the kind of lists of values of one kind."""
 
     def read(value: Any) -> tuple[T, ...]:
         if not isinstance(value, list):

@@ -3,7 +3,7 @@
 Board coordinates, seen from the front: x to the right, y down, z into the board; the origin is its middle. Corners are
 the inner ones, where four squares meet, row by row from the top left. The square below and right of the first corner is
 dark. One of `columns` and `rows` is odd and the other even, so half a turn of the board exchanges dark and light, and
-every image tells which way up the board is.
+every image shows which way up the board is.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class Board:
 
 
 def find_corners(image: Float32, board: Board) -> Float64 | None:
-    """Corners of the board [rows * columns, 2] in px (pixel centres at +0.5), or None where it is not seen whole.
+    """Return the board's corners [rows * columns, 2] in px (pixel centres at +0.5); None if any corner is not visible.
 
     `image` is linear radiance [H, W], of any scale. OpenCV's sector-based detector (Duda and Frese, 2018) finds the
-    grid; its first corner and direction are then made those of the board, by the handedness and by which squares are
+    grid. Its first corner and direction are then set to those of the board, by the handedness and by which squares are
     dark, so the order does not depend on how the board is held.
     """
     import cv2
@@ -65,12 +65,12 @@ def find_corners(image: Float32, board: Board) -> Float64 | None:
     white = float(np.percentile(image, 99))
     if not white > 0:
         return None
-    picture = np.rint(np.clip(image / white, 0, 1) * 255).astype(np.uint8)
-    zoom = 2 if max(picture.shape) <= _SMALL else 1
+    eight_bit = np.rint(np.clip(image / white, 0, 1) * 255).astype(np.uint8)
+    zoom = 2 if max(eight_bit.shape) <= _SMALL else 1
     if zoom > 1:
-        picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        eight_bit = cv2.resize(eight_bit, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(picture, (board.columns, board.rows), flags=flags)
+    found, corners = cv2.findChessboardCornersSB(eight_bit, (board.columns, board.rows), flags=flags)
     if not found or len(corners) != board.columns * board.rows:
         return None
     uv = (corners.reshape(board.rows, board.columns, 2).astype(np.float64) + 0.5) / zoom
@@ -78,7 +78,7 @@ def find_corners(image: Float32, board: Board) -> Float64 | None:
 
 
 def _as_on_the_board(uv: Float64, image: Float32) -> Float64:
-    """The grid [rows, columns, 2] in the board's own order: not mirrored, dark below and right of the first corner."""
+    """Return the grid [rows, columns, 2] in the board's order: not mirrored, dark below and right of corner 0."""
     right, down = uv[0, -1] - uv[0, 0], uv[-1, 0] - uv[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0:
         uv = uv[:, ::-1]

@@ -1,7 +1,7 @@
-"""A chessboard that moves before an array of nine spike cameras, without hardware: a clip to try the calibration on.
+"""A simulated clip of a chessboard that moves in front of an array of nine spike cameras, to try the calibration.
 
-The board's radiance is traced with 4x4 samples a pixel, at a key for every pixel that the board moves, and handed to
-the same sensor simulator as every scene, with gain and dark maps and shot noise. What is written is a scene folder, so
+The board's radiance is rendered with 4x4 samples a pixel, at key frames for every pixel that the board moves, and
+passed to the sensor simulator of all scenes, with gain and dark maps and shot noise. The output is a scene folder, so
 `record --emulate` serves it like a real array, and its poses are the truth for `calibrate-rig`. Not modelled: lenses
 (the cameras are pinholes), and shading of the board by its tilt.
 """
@@ -28,34 +28,34 @@ from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 RATE_HZ = 20000
-LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames, and how far the board moves in that time at most
+LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
-_POSES = 500  # of the motion at which its speed is looked at
+_POSES = 500  # samples of the motion from which its speed is computed
 DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of view is the horizontal one
 _PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
 
 
 @dataclass(frozen=True)
 class BoardMotion:
-    """Where the board is at a share `s` of the clip: it sways, comes and goes, tilts both ways and rolls.
+    """Motion of the board over the clip, at shares `s` in 0..1: it sways, moves to and fro, tilts both ways and rolls.
 
-    Every swing has its own number of cycles in a clip, so that place and tilt never go together: that is what tells
+    Every swing has its own number of cycles in a clip, so that position and tilt are uncorrelated, which separates
     focal lengths from distances.
     """
 
     distance_m: float = DISTANCE_M
 
     def pose(self, s: float) -> tuple[Float64, Float64]:
-        """Rotation [3, 3] and translation [3] from board to world coordinates (z up, the array looks along +y)."""
+        """Return rotation [3, 3] and translation [3] from board to world coordinates (z up, viewing direction +y)."""
 
         def swing(amplitude: float, cycles: float, phase: float) -> float:
             return amplitude * math.sin(2 * math.pi * (cycles * s + phase))
 
         d = self.distance_m
-        place = np.array([swing(0.10 * d, 2, 0.1), swing(0.15 * d, 1, 0.3), swing(0.05 * d, 3, 0.4)])
+        position = np.array([swing(0.10 * d, 2, 0.1), swing(0.15 * d, 1, 0.3), swing(0.05 * d, 3, 0.4)])
         tilt = _turn(0, swing(35, 2, 0.35)) @ _turn(1, swing(35, 3, 0.0)) @ _turn(2, swing(15, 1, 0.6))
         upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the board's y is down, its z away
-        return upright @ tilt, place
+        return upright @ tilt, position
 
 
 def _turn(axis: int, degrees: float) -> Float64:
@@ -67,7 +67,7 @@ def _turn(axis: int, degrees: float) -> Float64:
 
 
 def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M) -> tuple[Camera, ...]:
-    """Nine cameras, 3x3, that look at the origin, none mounted or made quite like another.
+    """Return nine cameras, 3x3, that look at the origin, each with its own errors of mounting and manufacture.
 
     Standard deviations: 2 % of the focal length, 1 % of the width in the principal point, a degree about each axis.
     """
@@ -91,20 +91,20 @@ def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M
     return tuple(cameras)
 
 
-def draw_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:
-    """Radiance [H, W] of the board before an even wall; a pixel is the mean of 4x4 samples. R, t: board to world."""
+def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:
+    """Return radiance [H, W] of the board in front of an even wall, with 4x4 samples a pixel. R, t: board to world."""
     to_camera = np.stack([camera.R @ R[:, 0], camera.R @ R[:, 1], camera.R @ t + camera.t], axis=1)
     to_board = np.linalg.inv(camera.K @ to_camera)  # (u, v, 1) -> (x, y, 1) / depth, x and y in the board's plane
     to_board[:2] /= board.square_m
     image = np.full((camera.height, camera.width), WALL, np.float32)
     top, bottom, left, right = _bounds(camera, board, R, t)
     part = image[top:bottom, left:right]
-    in_threads(_draw, len(part), to_board, board.columns, board.rows, left, top, part, small=part.size < 20000)
+    in_threads(_render_rows, len(part), to_board, board.columns, board.rows, left, top, part, small=part.size < 20000)
     return image
 
 
 def _bounds(camera: Camera, board: Board, R: Float64, t: Float64) -> tuple[int, int, int, int]:
-    """First and last row and column that the board with its margin may touch; all of them where it comes too near."""
+    """Return first and last row and column of the board with its margin; of the whole image where it is too near."""
     half = np.array([board.columns + 3, board.rows + 3]) / 2 * board.square_m
     outline = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
     uv, depth = camera.project(outline @ R.T + t)
@@ -117,13 +117,15 @@ def _bounds(camera: Camera, board: Board, R: Float64, t: Float64) -> tuple[int, 
 
 
 @kernel
-def _draw(h: Float64, columns: int, rows: int, left: int, top: int, image: Float32, start: int, stop: int) -> None:
-    """Rows [start, stop) of a part of an image. h [3, 3]: pixel -> board in squares, over the depth."""
+def _render_rows(
+    h: Float64, columns: int, rows: int, left: int, top: int, image: Float32, start: int, stop: int
+) -> None:
+    """Fill rows [start, stop) of a part of an image. h [3, 3]: pixel -> board in squares, over the depth."""
     for v in range(start, stop):
         for u in range(image.shape[1]):
             x, y = left + u, top + v
             light = _light(h, columns, rows, x, y)
-            whole = True  # a pixel whose four corners see one square sees nothing else
+            whole = True  # a pixel whose four corners are in one square sees only that square
             for k in range(1, 4):
                 whole &= _square(h, columns, rows, x + k % 2, y + k // 2) == _square(h, columns, rows, x, y)
             if not whole:
@@ -135,7 +137,7 @@ def _draw(h: Float64, columns: int, rows: int, left: int, top: int, image: Float
 
 @kernel
 def _square(h: Float64, columns: int, rows: int, x: float, y: float) -> Any:
-    """Column and row of the board's square at a place of the image; the first square is (-1, -1)."""
+    """Return column and row of the board's square at a point of the image; the first square is (-1, -1)."""
     over = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     a = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / over + (columns - 1) / 2
     b = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / over + (rows - 1) / 2
@@ -155,7 +157,7 @@ def _light(h: Float64, columns: int, rows: int, x: float, y: float) -> float:
 def write_board_clip(
     out: Path, cameras: tuple[Camera, ...], board: Board, motion: BoardMotion, n_ticks: int, seed: int = 0
 ) -> Path:
-    """Write the clip as a scene folder and return its path. Raises UserError where something is there already."""
+    """Write the clip as a scene folder and return its path. Raises UserError where the folder exists."""
     check_new(out)
     spacing = key_spacing(cameras, board, motion, n_ticks)
     key_ticks = list(range(0, n_ticks + spacing, spacing))
@@ -177,7 +179,7 @@ def write_board_clip(
         out,
         SceneDescription(
             id=f"board-{seed}",
-            title="A chessboard that moves before the array",
+            title="A chessboard that moves in front of the array",
             licence="CC0-1.0",
             cameras=cameras,
             train=ids,
@@ -200,7 +202,7 @@ def write_board_clip(
 
 
 def key_spacing(cameras: Sequence[Camera], board: Board, motion: BoardMotion, n_ticks: int) -> int:
-    """Ticks between key frames: no corner of the board moves by more than `KEY_PX` in any camera."""
+    """Return the ticks between key frames: no corner of the board moves by more than `KEY_PX` in any camera."""
     ticks = np.linspace(0, n_ticks, _POSES)
     corners = board.corners[[0, board.columns - 1, -board.columns, -1]]
     poses = [motion.pose(tick / n_ticks) for tick in ticks]
@@ -212,7 +214,7 @@ def key_spacing(cameras: Sequence[Camera], board: Board, motion: BoardMotion, n_
 
 @dataclass(frozen=True, eq=False)
 class _Keys(Sequence[Float32]):
-    """What a camera sees at the key ticks, drawn when it is asked for."""
+    """A camera's images at the key ticks, rendered on access."""
 
     camera: Camera
     board: Board
@@ -222,7 +224,7 @@ class _Keys(Sequence[Float32]):
         return len(self.poses)
 
     def __getitem__(self, k: Any) -> Any:
-        return draw_board(self.camera, self.board, *self.poses[k])
+        return render_board(self.camera, self.board, *self.poses[k])
 
 
 def board_clip(
@@ -236,17 +238,17 @@ def board_clip(
     square_m: float = 0.04,
     seed: int = 0,
 ) -> int:
-    """Simulate a chessboard that moves before an array of nine cameras: a scene for `record --emulate`.
+    """Simulate a chessboard that moves in front of an array of nine cameras: a scene for `record --emulate`.
 
     Args:
         out: Folder of the scene.
-        seconds: Length of the clip; the board goes through the same motion in it, so a longer clip is slower.
+        seconds: Length of the clip; the board makes the same motion in any length, so a longer clip is slower.
         width: Pixels per row of the cameras.
         height: Rows of the cameras.
         columns: Inner corners of the board from left to right.
         rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
         square_m: Side of a square in metres.
-        seed: Of the array's errors of mounting and of the sensors.
+        seed: Seed of the array's mounting errors and of the sensors.
     """
     n_ticks = round(seconds * RATE_HZ)
     if n_ticks < 1:

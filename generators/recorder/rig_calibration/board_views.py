@@ -1,4 +1,4 @@
-"""Images of a board in recorded clips, and where its corners are.
+"""Images of a board in recorded clips, and the positions of its corners.
 
 An image is the count of a window of ticks that all cameras share (TFP). A board that moves during the window is
 blurred along its path, in every camera around the same instant, and its corners are found in the middle of the blur.
@@ -20,12 +20,12 @@ from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64, find_corners
-from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Sightings
+from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Detections
 
 
 @dataclass(frozen=True, eq=False)
 class BoardRecording:
-    """A clip of the board: the streams by camera, and the cameras as far as the clip knows them."""
+    """A clip of the board: the streams by camera, and the cameras as far as the clip has them."""
 
     name: str
     streams: Mapping[str, SpikeStream]
@@ -34,7 +34,7 @@ class BoardRecording:
 
 @dataclass(frozen=True)
 class View:
-    """A moment at which all cameras are looked at: ticks [start, stop) of a recording."""
+    """A window that all cameras share: ticks [start, stop) of a recording."""
 
     recording: int
     start: int
@@ -43,14 +43,14 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """The views in which some camera saw the board, and where its corners are; sightings count these views."""
+    """The views with the board in some camera, and the positions of its corners; detections count these views."""
 
     views: tuple[View, ...]
-    sightings: Sightings
+    detections: Detections
 
 
 def open_recording(path: Path, allow_gaps: bool) -> BoardRecording:
-    """A recorded clip, with or without poses. Raises UserError as `open_scene` does."""
+    """Return a recorded clip, with or without poses. Raises UserError as `open_scene` does."""
     if (path / STREAM_FOLDER).is_file():
         return BoardRecording(path.name, open_stream_folder(path, allow_gaps), {})
     scene = open_scene(path, allow_gaps)
@@ -58,7 +58,7 @@ def open_recording(path: Path, allow_gaps: bool) -> BoardRecording:
 
 
 def choose_views(recordings: Sequence[BoardRecording], n: int, window_ticks: int) -> list[View]:
-    """About `n` views, even over the recordings and within each. Raises UserError for a clip shorter than a window."""
+    """Return about `n` views, even over the recordings and within each. Raises UserError for too short a clip."""
     views = []
     for i, recording in enumerate(recordings):
         ticks = min(s.n_ticks for s in recording.streams.values())
@@ -71,7 +71,7 @@ def choose_views(recordings: Sequence[BoardRecording], n: int, window_ticks: int
 
 
 def make_image(recording: BoardRecording, camera: str, view: View) -> Float32 | None:
-    """Spikes per tick [H, W] of a camera in a view; None where the recording lacks some of its ticks."""
+    """Return spikes per tick [H, W] of a camera in a view; None where the recording lacks some of its ticks."""
     stream = recording.streams[camera]
     if any(gap.first_tick < view.stop and view.start < gap.stop_tick for gap in stream.gaps):
         return None
@@ -79,7 +79,7 @@ def make_image(recording: BoardRecording, camera: str, view: View) -> Float32 | 
 
 
 def common_cameras(recordings: Sequence[BoardRecording]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """The cameras of the recordings and their width and height. Raises UserError where these are not all the same."""
+    """Return the recordings' cameras and their width and height. Raises UserError where these are not all the same."""
     kinds = {tuple(sorted((c, s.width, s.height) for c, s in r.streams.items())) for r in recordings}
     sizes = {(width, height) for kind in kinds for _, width, height in kind}
     if len(kinds) != 1 or len(sizes) != 1:
@@ -91,19 +91,19 @@ def common_cameras(recordings: Sequence[BoardRecording]) -> tuple[tuple[str, ...
 def find_all(
     recordings: Sequence[BoardRecording], names: Sequence[str], views: Sequence[View], board: Board
 ) -> BoardViews:
-    """The board in every image where it is seen whole. Raises UserError where there is none."""
+    """Return the board in every image that shows all of it. Raises UserError where there is none."""
 
-    def look(c: int, v: int) -> Float64 | None:
+    def find(c: int, v: int) -> Float64 | None:
         image = make_image(recordings[views[v].recording], names[c], views[v])
         return None if image is None else find_corners(image, board)
 
     pairs = [(c, v) for v in range(len(views)) for c in range(len(names))]
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(lambda pair: look(*pair), pairs))
+        found = list(pool.map(lambda pair: find(*pair), pairs))
     seen = [(c, v, uv) for (c, v), uv in zip(pairs, found, strict=True) if uv is not None]
     if not seen:
-        fix = "check --columns and --rows (inner corners), the light, and that the board is seen whole"
+        fix = "check --columns and --rows (inner corners), the light, and that images show the whole board"
         raise problem("board", f"{board.columns} x {board.rows} corners in some image", "none", fix)
     kept, view = np.unique([s[1] for s in seen], return_inverse=True)
     camera, uv = np.array([s[0] for s in seen]), np.stack([s[2] for s in seen])
-    return BoardViews(tuple(views[v] for v in kept), Sightings(camera, view, uv, np.ones(uv.shape[:2], bool)))
+    return BoardViews(tuple(views[v] for v in kept), Detections(camera, view, uv, np.ones(uv.shape[:2], bool)))

@@ -1,10 +1,9 @@
-"""Bundle adjustment of an array that has seen a board: intrinsics, camera poses and board poses with the least error.
+"""Bundle adjustment of an array from views of a board: intrinsics, camera poses and board poses of least error.
 
-The unknowns are few (6 a board pose, up to 9 a camera), so the normal equations are added up sighting by sighting from
-exact derivatives and solved densely; damping is Levenberg's and Marquardt's. Poses change by a small motion from the
-left: X -> exp(w) X + v. The reference camera stays where it is, which fixes the frame; the board's size fixes the
-scale.
-Pinholes with square pixels; no distortion, because a scene's cameras have none.
+The unknowns are few (6 a board pose, up to 9 a camera), so the normal equations are added up detection by detection
+from exact derivatives and solved densely, with Levenberg-Marquardt damping. Poses change by a small motion from the
+left: X -> exp(w) X + v. The pose of the reference camera is constant, which fixes the frame; the board's size fixes the
+scale. Pinholes with square pixels; no distortion, because a scene's cameras have none.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ Int64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 _MOST_STEPS = 60
 _CONVERGED = 1e-9  # relative decrease of the sum of squares of a last step
-_FINEST_PX = 1e-3  # corners are never told better
+_FINEST_PX = 1e-3  # the accuracy of corners is never better
 _PER_CAMERA = 9  # w, v, focal length, principal point
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """S images in which the board was found: by which camera, in which view (a moment that all cameras share)."""
+class Detections:
+    """S images in which the board was found: by which camera, in which view (a window that all cameras share)."""
 
     camera: Int64  # [S]
     view: Int64  # [S]
     uv: Float64  # [S, N, 2] px
     used: Mask  # [S, N] corners that count
 
-    def of(self, chosen: Mask) -> Sightings:
-        """Some of them, [S] bool."""
-        return Sightings(self.camera[chosen], self.view[chosen], self.uv[chosen], self.used[chosen])
+    def of(self, chosen: Mask) -> Detections:
+        """Return a selection, [S] bool."""
+        return Detections(self.camera[chosen], self.view[chosen], self.uv[chosen], self.used[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,36 +43,36 @@ class Rig:
     """C cameras and T board poses, OpenCV axes: x_cam = R x + t, x = board_R x_board + board_t."""
 
     focal: Float64  # [C] px
-    middle: Float64  # [C, 2] principal points, px
+    principal: Float64  # [C, 2] principal points, px
     R: Float64  # [C, 3, 3]
     t: Float64  # [C, 3]
     board_R: Float64  # [T, 3, 3]
     board_t: Float64  # [T, 3]
 
-    def residuals(self, s: Sightings, points: Float64) -> Float64:
-        """Where the board's points [N, 3] should be in the images, minus where they were found [S, N, 2], px."""
+    def residuals(self, s: Detections, points: Float64) -> Float64:
+        """Return the projections of the board's points [N, 3] minus the detected corners [S, N, 2], px."""
         turned, world = self.turned(s, points)
         x = turned + self.t[s.camera][:, None]
-        seen = self.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + self.middle[s.camera][:, None]
+        seen = self.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + self.principal[s.camera][:, None]
         return np.asarray(seen - s.uv)
 
-    def turned(self, s: Sightings, points: Float64) -> tuple[Float64, Float64]:
-        """The points as the cameras see them but for t [S, N, 3], and in the world [S, N, 3]."""
+    def turned(self, s: Detections, points: Float64) -> tuple[Float64, Float64]:
+        """Return the points in the cameras' frames but for t [S, N, 3], and in the world [S, N, 3]."""
         world = points @ self.board_R[s.view].transpose(0, 2, 1) + self.board_t[s.view][:, None]
         return world @ self.R[s.camera].transpose(0, 2, 1), world
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which intrinsics are unknown."""
+    """The unknown intrinsics."""
 
     shared_focal: bool = False  # one focal length for all cameras, instead of one each
-    centered: bool = False  # principal points stay where they are
+    centered: bool = False  # principal points stay in the middle
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """What `adjust` found. Standard deviations are those of the normal equations, relative to the reference camera."""
+    """The result of `adjust`. Standard deviations are from the normal equations, relative to the reference camera."""
 
     rig: Rig
     sigma_px: float  # of a coordinate of a corner
@@ -82,15 +81,17 @@ class Adjusted:
     focal_px: Float64  # [C]
 
 
-def adjust(rig: Rig, sightings: Sightings, points: Float64, reference: int, freedom: Freedom | None = None) -> Adjusted:
-    """Least squares from a start near the solution. `points` [N, 3]: the board's corners in its own frame."""
+def adjust(
+    rig: Rig, detections: Detections, points: Float64, reference: int, freedom: Freedom | None = None
+) -> Adjusted:
+    """Minimise the squares from an initial rig near the solution. `points` [N, 3]: the board's corners."""
     columns = _columns(len(rig.focal), len(rig.board_t), reference, freedom or Freedom())
     damping = 1e-3
-    cost, H, g = _normal(rig, sightings, points, columns)
+    cost, H, g = _normal(rig, detections, points, columns)
     for _ in range(_MOST_STEPS):
         step = np.asarray(np.linalg.solve(H + damping * np.diag(np.diag(H)), -g), np.float64)
         moved = _moved(rig, step, columns)
-        new, new_H, new_g = _normal(moved, sightings, points, columns)
+        new, new_H, new_g = _normal(moved, detections, points, columns)
         if not new < cost:
             if damping > 1e8:
                 break
@@ -100,25 +101,25 @@ def adjust(rig: Rig, sightings: Sightings, points: Float64, reference: int, free
         rig, cost, H, g, damping = moved, new, new_H, new_g, damping / 5
         if converged:
             break
-    variance = cost / max(2 * int(sightings.used.sum()) - columns.n, 1)
+    variance = cost / max(2 * int(detections.used.sum()) - columns.n, 1)
     covariance = np.asarray(variance * np.linalg.pinv(H, hermitian=True), np.float64)
     return Adjusted(rig, math.sqrt(variance), *_deviations(covariance, columns))
 
 
-def trimmed(rig: Rig, sightings: Sightings, points: Float64, sigmas: float = 4.0) -> Sightings:
-    """The sightings without corners that are off by more than `sigmas` robust standard deviations of all corners."""
-    errors = np.linalg.norm(rig.residuals(sightings, points), axis=-1)
+def trimmed(rig: Rig, detections: Detections, points: Float64, sigmas: float = 4.0) -> Detections:
+    """Return the detections without corners that are off by more than `sigmas` robust standard deviations."""
+    errors = np.linalg.norm(rig.residuals(detections, points), axis=-1)
     sigma = float(np.median(errors)) / math.sqrt(2 * math.log(2))  # Rayleigh's median is 1.18 sigma
-    return replace(sightings, used=errors <= sigmas * max(sigma, _FINEST_PX))
+    return replace(detections, used=errors <= sigmas * max(sigma, _FINEST_PX))
 
 
-def rms_px(rig: Rig, sightings: Sightings, points: Float64) -> float:
-    """Reprojection error: root mean square distance of the corners that count."""
-    errors = rig.residuals(sightings, points)[sightings.used]
+def rms_px(rig: Rig, detections: Detections, points: Float64) -> float:
+    """Return the reprojection error: root mean square distance of the used corners."""
+    errors = rig.residuals(detections, points)[detections.used]
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1))))
 
 
-# ------------------------------------------------------------ the unknowns: which column belongs to what
+# ------------------------------------------------------------ columns of the unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,19 +143,19 @@ def _columns(n_cameras: int, n_views: int, reference: int, freedom: Freedom) -> 
     return _Columns(camera, board, int(unknown.sum()) + 6 * n_views)
 
 
-def _normal(rig: Rig, sightings: Sightings, points: Float64, columns: _Columns) -> tuple[float, Float64, Float64]:
-    """Sum of squares, J^T J [P, P] and J^T r [P]."""
-    r, J = _linearised(rig, sightings, points)
-    at = np.concatenate([columns.camera[sightings.camera], columns.board[sightings.view]], axis=1)  # [S, 15]
-    at = np.where(at >= 0, at, columns.n)  # what is known goes to a row and column that are dropped
+def _normal(rig: Rig, detections: Detections, points: Float64, columns: _Columns) -> tuple[float, Float64, Float64]:
+    """Return the sum of squares, J^T J [P, P] and J^T r [P]."""
+    r, J = _linearised(rig, detections, points)
+    at = np.concatenate([columns.camera[detections.camera], columns.board[detections.view]], axis=1)  # [S, 15]
+    at = np.where(at >= 0, at, columns.n)  # known values go to a row and column that are dropped
     H, g = np.zeros((columns.n + 1, columns.n + 1)), np.zeros(columns.n + 1)
     np.add.at(H, (at[:, :, None], at[:, None, :]), J.transpose(0, 2, 1) @ J)
     np.add.at(g, at, (J.transpose(0, 2, 1) @ r[..., None])[..., 0])
     return float(np.sum(r * r)), H[:-1, :-1], g[:-1]
 
 
-def _linearised(rig: Rig, s: Sightings, points: Float64) -> tuple[Float64, Float64]:
-    """Residuals [S, 2 N], 0 where a corner does not count, and derivatives [S, 2 N, 9 + 6]: by camera, by board."""
+def _linearised(rig: Rig, s: Detections, points: Float64) -> tuple[Float64, Float64]:
+    """Return residuals [S, 2 N], 0 for unused corners, and derivatives [S, 2 N, 9 + 6]: by camera, by board."""
     turned, world = rig.turned(s, points)
     x = turned + rig.t[s.camera][:, None]
     f = rig.focal[s.camera][:, None]
@@ -168,7 +169,7 @@ def _linearised(rig: Rig, s: Sightings, points: Float64) -> tuple[Float64, Float
     J[..., 0, 6], J[..., 1, 6] = a, b
     J[..., 7:9] = np.eye(2)
     J[..., 9:12], J[..., 12:15] = -by_board @ _cross(world), by_board
-    r = np.stack([f * a, f * b], -1) + rig.middle[s.camera][:, None] - s.uv
+    r = np.stack([f * a, f * b], -1) + rig.principal[s.camera][:, None] - s.uv
     counts = s.used[..., None]
     return np.where(counts, r, 0).reshape(len(r), -1), np.where(counts[..., None], J, 0).reshape(
         len(r), -1, J.shape[-1]
@@ -176,7 +177,7 @@ def _linearised(rig: Rig, s: Sightings, points: Float64) -> tuple[Float64, Float
 
 
 def _cross(v: Float64) -> Float64:
-    """Matrices [..., 3, 3] with [v]x w = v x w."""
+    """Return matrices [..., 3, 3] with [v]x w = v x w."""
     m = np.zeros((*v.shape, 3))
     m[..., 2, 1], m[..., 0, 2], m[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     return m - np.swapaxes(m, -1, -2)
@@ -187,26 +188,26 @@ def _moved(rig: Rig, step: Float64, columns: _Columns) -> Rig:
     board = step[columns.board]
     R, t = _nudged(rig.R, rig.t, camera[:, :6])
     board_R, board_t = _nudged(rig.board_R, rig.board_t, board)
-    return Rig(rig.focal + camera[:, 6], rig.middle + camera[:, 7:], R, t, board_R, board_t)
+    return Rig(rig.focal + camera[:, 6], rig.principal + camera[:, 7:], R, t, board_R, board_t)
 
 
 def _nudged(R: Float64, t: Float64, motion: Float64) -> tuple[Float64, Float64]:
-    """Poses [n] after small motions [n, 6] from the left."""
+    """Return poses [n] after small motions [n, 6] from the left."""
     turn = exp_so3(motion[:, :3])
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + motion[:, 3:]
 
 
 def exp_so3(w: Float64) -> Float64:
-    """Rotation matrices [n, 3, 3] of rotation vectors [n, 3] (Rodrigues)."""
+    """Return rotation matrices [n, 3, 3] of rotation vectors [n, 3] (Rodrigues)."""
     angle = np.linalg.norm(w, axis=1)[:, None, None]
     W = _cross(w)
     return np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * W @ W
 
 
 def _deviations(covariance: Float64, columns: _Columns) -> tuple[Float64, Float64, Float64]:
-    """Standard deviations of centres (which move by -R^T v, as far as v), rotations in degrees, and focal lengths.
+    """Return standard deviations of centres (-R^T v, as far as v moves them), rotations in degrees, and focal lengths.
 
-    They are 0 for what is known.
+    They are 0 for known values.
     """
     variance = np.where(columns.camera >= 0, np.diag(covariance)[columns.camera], 0.0)
     turn, center = np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(variance[:, 3:6].sum(axis=1))

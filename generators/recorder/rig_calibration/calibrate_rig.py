@@ -1,4 +1,4 @@
-"""`calibrate-rig`: from clips of a chessboard that was moved before the array to every camera's intrinsics and pose."""
+"""`calibrate-rig`: intrinsics and pose of every camera, from clips of a chessboard that moves in front of the array."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from spike4dgs.benchmark.files import atomic_path, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.recorder.profile.profile import calibration_toml
-from spike4dgs.generators.recorder.rig_calibration.array_start import first_rig
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
     BoardRecording,
@@ -29,45 +28,46 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
 )
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Adjusted,
+    Detections,
     Freedom,
     Rig,
-    Sightings,
     adjust,
     rms_px,
     trimmed,
 )
+from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_rig
 
-WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # with a worse reprojection error, or more corners that do not fit, it is no array
+WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # limits of reprojection error and of rejected corners; beyond, the fit has failed
 
 
 @dataclass(frozen=True, eq=False)
 class ArrayCalibration:
-    """What `calibrate_array` found. The cameras stand in the array's own frame, see `levelled`."""
+    """The result of `calibrate_array`. Cameras are in the array's own frame, see `levelled`."""
 
     cameras: tuple[Camera, ...]
     adjusted: Adjusted
-    sightings: Sightings
+    detections: Detections
     reference: int
-    reprojection_px: float  # root mean square over the corners that count
+    reprojection_px: float  # root mean square over the used corners
     per_camera_px: tuple[float, ...]
 
     @property
     def corners(self) -> tuple[int, int]:
-        """Number of corners that count, and of those left out."""
-        return int(self.sightings.used.sum()), int((~self.sightings.used).sum())
+        """Return the number of used corners, and of those left out."""
+        return int(self.detections.used.sum()), int((~self.detections.used).sum())
 
 
 def calibrate_array(
-    sightings: Sightings, board: Board, names: Sequence[str], size: tuple[int, int], freedom: Freedom
+    detections: Detections, board: Board, names: Sequence[str], size: tuple[int, int], freedom: Freedom
 ) -> ArrayCalibration:
-    """Intrinsics and poses from sightings; corners that do not fit the rest are left out. `size`: width, height.
+    """Return intrinsics and poses from detections; corners that do not fit are left out. `size`: width, height.
 
-    Raises UserError where a camera has seen too little, or where no array of pinholes explains what was seen.
+    Raises UserError where a camera has too few detections, or where no array of pinholes explains them.
     """
     points = board.corners
-    start, reference = first_rig(sightings, points, names, size)
-    rough = adjust(start, sightings, points, reference, freedom)
-    used = trimmed(rough.rig, sightings, points)
+    initial, reference = estimate_rig(detections, points, names, size)
+    rough = adjust(initial, detections, points, reference, freedom)
+    used = trimmed(rough.rig, detections, points)
     found = adjust(rough.rig, used, points, reference, freedom)
     error = rms_px(found.rig, used, points)
     left_out = float(np.mean(~used.used))
@@ -82,9 +82,9 @@ def calibrate_array(
 
 
 def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Camera, ...]:
-    """The cameras in the array's own frame: z up, y where the array looks, x to its right; all taken as means.
+    """Return the cameras in the array's own frame: z up, y the viewing direction, x to its right; all as means.
 
-    The origin is the middle of all places of the board: about what the array looks at.
+    The origin is the mean position of the board: about the point that the array looks at.
     """
     u, _, vt = np.linalg.svd(rig.R.sum(axis=0))
     right, down, forward = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -92,23 +92,23 @@ def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Cam
     frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
     return tuple(
         frame.camera(Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t))
-        for name, f, m, R, t in zip(names, rig.focal, rig.middle, rig.R, rig.t, strict=True)
+        for name, f, m, R, t in zip(names, rig.focal, rig.principal, rig.R, rig.t, strict=True)
     )
 
 
 def differences(found: Sequence[Camera], stated: Mapping[str, Camera]) -> dict[str, float] | None:
-    """How found cameras differ from those that a clip states, after the best similarity; None where it states none."""
+    """Return the errors against the cameras that a clip states, after the best similarity; None where it has none."""
     known = [stated[c.id] for c in found if c.id in stated]
     if len(known) < max(len(found), 2):
         return None
     errors, scale = pose_errors(found, known).summary(), align_cameras(found, known).scale
     names = ("rotation_deg", "rotation_max_deg", "translation_m", "translation_max_m")
     focal = [abs(a.fx / b.fx - 1) for a, b in zip(found, known, strict=True)]
-    middle = [np.hypot(a.cx - b.cx, a.cy - b.cy) for a, b in zip(found, known, strict=True)]
+    principal = [np.hypot(a.cx - b.cx, a.cy - b.cy) for a, b in zip(found, known, strict=True)]
     return {name: errors[name] for name in names} | {
         "scale": abs(1 / scale - 1),
         "focal_max": max(focal),
-        "principal_point_max_px": float(max(middle)),
+        "principal_point_max_px": float(max(principal)),
     }
 
 
@@ -129,12 +129,12 @@ def calibrate_rig(
 
     Args:
         clips: Recordings of the board (scene folders), all by the same cameras.
-        out: Folder for what is found.
+        out: Folder for the results.
         columns: Inner corners of the board from left to right.
         rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres; it sets the scale of everything.
-        views: Moments to look at, in all clips together.
-        window_ticks: Ticks that an image adds up: more is less noise and more motion blur.
+        square_m: Side of a square in metres; it sets the scale of the calibration.
+        views: Number of views (windows of ticks), in all clips together.
+        window_ticks: Ticks that an image adds up; more ticks give less noise and more motion blur.
         shared_focal: One focal length for all cameras.
         centered: Principal points stay in the middle of the image.
         allow_gaps: Use clips with gaps; images with missing ticks are left out.
@@ -145,7 +145,7 @@ def calibrate_rig(
     names, size = common_cameras(recordings)
     chosen = choose_views(recordings, views, window_ticks)
     seen = find_all(recordings, names, chosen, board)
-    found = calibrate_array(seen.sightings, board, names, size, Freedom(shared_focal, centered))
+    found = calibrate_array(seen.detections, board, names, size, Freedom(shared_focal, centered))
     report = {
         "clips": [r.name for r in recordings],
         "board": {"columns": columns, "rows": rows, "square_m": square_m},
@@ -155,14 +155,14 @@ def calibrate_rig(
     }
     write_text(out / "calibration.toml", calibration_toml(found.cameras))
     write_json(out / "report.json", report)
-    _draw(recordings, seen, found, out / "corners.png")
+    _plot(recordings, seen, found, out / "corners.png")
     _print(report)
     print(f"calibration, report and image: {out}")
     return 0
 
 
 def _results(found: ArrayCalibration) -> dict[str, Any]:
-    a, s = found.adjusted, found.sightings
+    a, s = found.adjusted, found.detections
     cameras = {
         camera.id: {
             "views": int(np.sum(s.camera == c)),
@@ -190,7 +190,7 @@ def _print(report: dict[str, Any]) -> None:
 
     title = f"reprojection error {report['reprojection_px']:.3f} px RMS"
     table = Table(
-        "camera", "views", "RMS, px", "focal, px", "+-", "middle, px", "place +-, mm", "turn +-, deg", title=title
+        "camera", "views", "RMS, px", "focal, px", "+-", "principal, px", "position +-, mm", "turn +-, deg", title=title
     )
     for name, c in report["cameras"].items():
         x, y = c["principal_point_px"]
@@ -202,20 +202,20 @@ def _print(report: dict[str, Any]) -> None:
         f"{views['with_board']} of {views['looked_at']} views have the board; "
         f"{corners['left_out']} of {sum(corners.values())} corners do not fit and are left out"
     )
-    print(f"standard deviations of place and turn are relative to {report['reference']}")
+    print(f"standard deviations of position and turn are relative to {report['reference']}")
     if d := report["against_clip"]:
-        place = f"{1e3 * d['translation_m']:.2f} and {1e3 * d['translation_max_m']:.2f} mm"
+        position = f"{1e3 * d['translation_m']:.2f} and {1e3 * d['translation_max_m']:.2f} mm"
         print("against the cameras that the clip states, mean and worst error:")
-        print(f"  rotation {d['rotation_deg']:.3f} and {d['rotation_max_deg']:.3f} deg, place {place}")
+        print(f"  rotation {d['rotation_deg']:.3f} and {d['rotation_max_deg']:.3f} deg, position {position}")
         print(f"  scale {100 * d['scale']:.3f} %, focal length at worst {100 * d['focal_max']:.3f} %,")
         print(f"  principal point at worst {d['principal_point_max_px']:.2f} px")
 
 
-def _draw(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCalibration, path: Path) -> None:
-    """Each camera's image in the view that most cameras saw, with its corners; small, the corners of all views."""
+def _plot(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCalibration, path: Path) -> None:
+    """Plot each camera's image in the view that most cameras saw, with its corners; small, the corners of all views."""
     from matplotlib.figure import Figure
 
-    s = found.sightings
+    s = found.detections
     best = int(np.argmax(np.bincount(s.view)))
     side = math.ceil(math.sqrt(len(found.cameras)))
     aspect = found.cameras[0].height / found.cameras[0].width
@@ -235,7 +235,7 @@ def _draw(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCa
             axes.plot(*uv.T, color="tab:cyan", linewidth=0.6, marker=".", markersize=4)
         axes.set_title(f"{name}: {len(mine.view)} views, {found.per_camera_px[c]:.3f} px", fontsize=9)
     figure.suptitle(
-        f"Corners that count (orange), left out (red), and the board in one view; {found.reprojection_px:.3f} px RMS"
+        f"Used corners (orange), left out (red), and the board in one view; {found.reprojection_px:.3f} px RMS"
     )
     with atomic_path(path) as part:
         figure.savefig(part, dpi=100)

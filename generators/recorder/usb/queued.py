@@ -1,9 +1,9 @@
 """Queued bulk reads on the libusb handle that pyusb has opened.
 
-pyusb itself only reads bulk endpoints one at a time. libusb's asynchronous calls are reached through the library and
-the handle that its backend holds: `backend.lib`, `backend.ctx` and `device._ctx.managed_open().handle`. The last is a
-private name, so `unavailable` looks before anything is used, and says what is missing; reads are then done one at a
-time. The transfer structure is libusb's public ABI (libusb.h 1.0), declared here and not taken from pyusb.
+pyusb itself reads bulk endpoints one at a time. libusb's asynchronous calls are reached through the library and the
+handle that its backend holds: `backend.lib`, `backend.ctx` and `device._ctx.managed_open().handle`. The last is a
+private name, so `unavailable` checks first and reports what is missing; reads are then done one at a time. The transfer
+structure is libusb's public ABI (libusb.h 1.0), declared here and not taken from pyusb.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ _FUNCTIONS = {  # prototypes of our own: pyusb's objects of the same functions k
 _BULK = 2  # LIBUSB_TRANSFER_TYPE_BULK
 _NO_DEVICE, _INTERRUPTED, _NO_MEM = -4, -10, -11  # enum libusb_error
 _ENDINGS = {1: STALL, 2: TIME_OUT, 3: CANCELLED, 4: STALL, 5: UNPLUGGED, 6: OVERFLOW}  # enum libusb_transfer_status
-_CANCEL_S = 5.0  # a host controller gives a cancelled read back within milliseconds
+_CANCEL_S = 5.0  # a host controller returns a cancelled read within milliseconds
 
-# Reads that libusb did not give back, with their memory: it may still be written to, so it is never freed.
+# Reads that libusb did not return, with their memory: libusb may still write to it, so it is never freed.
 _LOST: list[Any] = []
 
 
 def unavailable(device: usb.core.Device) -> str | None:
-    """Why no reads can be queued on this device, or None if they can be."""
+    """Return why no reads can be queued on this device, or None if they can be."""
     backend: Any = getattr(device, "backend", None)
     missing = [name for name in ("lib", "ctx") if not hasattr(backend, name)]
     if missing:
@@ -83,10 +83,10 @@ def unavailable(device: usb.core.Device) -> str | None:
 
 
 class QueuedReads:
-    """Up to `depth` bulk reads in flight; each thread that waits also serves libusb's events for the others.
+    """Up to `depth` bulk reads in flight; each waiting thread also serves libusb's events for the others.
 
-    For devices of which `unavailable` says None. The reads themselves have no time limit: cancelling one could lose
-    what just came. Who waits keeps the time.
+    For devices for which `unavailable` returns None. The reads themselves have no time limit, because cancelling one
+    could lose its latest bytes; the caller of `wait` keeps the time.
     """
 
     def __init__(self, device: usb.core.Device, endpoint: int, depth: int) -> None:
@@ -104,7 +104,7 @@ class QueuedReads:
 
     @property
     def in_flight(self) -> int:
-        """Reads that libusb has not given back."""
+        """Number of reads that libusb has not returned."""
         return len(self._flying) - len(self._ended)
 
     def submit(self, buffer: UInt8) -> None:
@@ -125,10 +125,10 @@ class QueuedReads:
             self._ended[address] = Completion(0, time.monotonic_ns(), status)
 
     def wait(self, timeout_s: float) -> Completion | None:
-        """The oldest read's end, or None."""
+        """Return the oldest read's end, or None."""
         deadline = time.monotonic() + timeout_s
         while self._flying:
-            self._completed.value = 0  # before looking: an end after this makes the call below return at once
+            self._completed.value = 0  # before checking: an end after this makes the call below return at once
             if (done := self._ended.pop(self._flying[0][0], None)) is not None:
                 self._idle.append(self._flying.popleft()[0])
                 return done
@@ -139,7 +139,7 @@ class QueuedReads:
 
     def cancel(self) -> list[Completion]:
         """End every read and free the transfers."""
-        for address, _ in reversed(self._flying):  # newest first, so that none goes on after an older one has ended
+        for address, _ in reversed(self._flying):  # newest first, so that none continues after an older one has ended
             if address not in self._ended:
                 self._call["libusb_cancel_transfer"](address)
         out = []
@@ -158,10 +158,10 @@ class QueuedReads:
         flag = c.addressof(self._completed)
         code = self._call["libusb_handle_events_timeout_completed"](self._context, c.byref(interval), flag)
         if code < 0 and code != _INTERRUPTED:
-            time.sleep(1e-3)  # an error that lasts must not become a busy loop; the caller's time runs out
+            time.sleep(1e-3)  # a lasting error must not become a busy loop; the caller's time runs out
 
     def _on_end(self, address: int) -> None:
-        """Called by libusb, in whichever thread serves its events."""
+        """Handle the end of a read; libusb calls this in whichever thread serves its events."""
         now = time.monotonic_ns()
         t = _Transfer.from_address(address)
         status = _ENDINGS.get(t.status, OK if t.actual_length == t.length else SHORT)

@@ -1,4 +1,4 @@
-"""One camera's thread: it keeps reads in flight, and does nothing for a single frame."""
+"""The reading thread of one camera: it keeps reads in flight, and does no work for single frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spike4dgs.generators.recorder.frames.ring import Block, Ring
 from spike4dgs.generators.recorder.usb.reads import FATAL, OK, SHORT, TIME_OUT, Completion, Transfers
 from spike4dgs.generators.recorder.usb.transport import Link
 
-_LOOK_S = 0.05  # how often a thread that waits for data looks whether it is to end
+_POLL_S = 0.05  # interval at which a thread that waits for data checks whether to end
 
 
 class Idle:
@@ -21,21 +21,21 @@ class Idle:
         self.reads = self.starved = self.total_ns = self.worst_ns = 0
         self._submitted = self._ended = 0
         self._arrival_ns = 0  # of the newest read that is known to have ended
-        self._open: deque[tuple[int, int]] = deque()  # submissions whose newest read before has not been told about
+        self._open: deque[tuple[int, int]] = deque()  # submissions whose newest earlier read has no known end yet
 
     def ended(self, arrival_ns: int) -> None:
-        """The next read, in the order of submission, has ended."""
+        """Record that the next read, in the order of submission, has ended."""
         self._ended, self._arrival_ns = self._ended + 1, arrival_ns
         if self._open and self._open[0][0] == self._ended:
             self._add(self._open.popleft()[1] - arrival_ns)
 
     def submitted(self, now_ns: int, starved: bool, counts: bool) -> None:
-        """A read was submitted; `starved`: when no other was in flight. Only those that count are part of the sums."""
+        """Record a submitted read; `starved`: no other was in flight. Only those that count are part of the sums."""
         self.reads += counts
         if starved and counts:
             if self._submitted == self._ended:
                 self._add(now_ns - self._arrival_ns)
-            else:  # the one before has ended too, and will be told about
+            else:  # the one before has ended too, and its end will be reported
                 self._open.append((self._submitted, now_ns))
         self._submitted += 1
 
@@ -48,7 +48,7 @@ class Idle:
 class Reader:
     """Reads one camera into its ring until `halt`, `wanted` bytes or a failure; for one start of the camera.
 
-    Other threads set `keep`, `begun_ns`, `wanted` and `halt`, and read the rest. What comes before `keep` is dropped.
+    Other threads set `keep`, `begun_ns`, `wanted` and `halt`, and read the rest. Data before `keep` are dropped.
     """
 
     def __init__(self, camera: str, link: Link, ring: Ring, layout: Layout, timeout_ms: int) -> None:
@@ -64,21 +64,21 @@ class Reader:
         self.idle = Idle()
         self._frame_bytes, self._tags = layout.frame_bytes, layout.has_tags()
         self._timeout_ns = timeout_ms * 1_000_000
-        self._last_ns = 0  # when bytes came last
+        self._last_ns = 0  # when the last bytes arrived
         self._thread = threading.Thread(target=self._run, name=camera, daemon=True)
 
     def begin(self) -> None:
-        """Start the thread; `ready` is set when its reads are in flight, or will never be."""
+        """Start the thread; `ready` is set when its reads are in flight, or never will be."""
         self._thread.start()
 
     @property
     def alive(self) -> bool:
-        """Whether it still reads."""
+        """True while the thread reads."""
         return self._thread.is_alive()
 
     @property
     def proven(self) -> bool:
-        """Whether the camera has delivered anything."""
+        """True if the camera has delivered any data."""
         return self.ring.position > 0
 
     def join(self) -> None:
@@ -96,18 +96,18 @@ class Reader:
                 self._read(transfers)
             finally:
                 rest = transfers.cancel()
-            if self.end in (None, TIME_OUT):  # these reads follow without a hole: what they hold belongs to the stream
+            if self.end in (None, TIME_OUT):  # these reads follow without a loss: their bytes belong to the stream
                 for done in rest:
                     if done.bytes:
                         self._put(done)
-        except Exception as e:  # raised again by the thread that captures
+        except Exception as e:  # raised again by the capturing thread
             self.error = e
         self.end = self.end or OK
         self.ready.set()
 
     def _read(self, transfers: Transfers) -> None:
         while not self.halt.is_set() and (self.wanted is None or self.ring.position < self.wanted):
-            done = transfers.wait(_LOOK_S)
+            done = transfers.wait(_POLL_S)
             if done is not None:
                 starved = not transfers.in_flight
                 self.idle.ended(done.arrival_ns)
@@ -124,7 +124,7 @@ class Reader:
         self.idle.submitted(time.monotonic_ns(), starved, self.keep.is_set() and self.begun_ns is not None)
 
     def _put(self, done: Completion) -> str | None:
-        """Hand a read's bytes on. Returns why the camera cannot go on, or None."""
+        """Put a read's bytes into the ring. Return why the camera cannot go on, or None."""
         keep = self.keep.is_set()
         if keep and self.origin is None:
             self.origin = self.ring.position
@@ -135,7 +135,7 @@ class Reader:
         if done.status == SHORT:
             self.short_reads += keep
             if not self._tags and self.ring.position % self._frame_bytes:
-                return SHORT  # without tags nothing tells whether the rest of the frame follows
+                return SHORT  # without tags it is unknown whether the rest of the frame follows
         # A time-out of one read is no end: it may have been queued before the camera was started.
         return done.status if done.status in FATAL else None
 

@@ -1,4 +1,4 @@
-"""Bulk reads in flight: what every kind of them offers, and the kind that any pyusb backend can do, one at a time."""
+"""Bulk reads in flight: their common protocol, and single reads, which work with any pyusb backend."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STAL
 UInt8 = NDArray[np.uint8]
 
 OK, SHORT, CANCELLED = "ok", SHORT_READ, "cancelled"
-# After these a camera sends no more that could be used; each is the reason of the gap that follows.
+# After these a camera sends no usable data; each is the reason of the gap that follows.
 FATAL = frozenset((STALL, OVERFLOW, UNPLUGGED))
 
-# Whatever else goes wrong on the wire (EIO, EPROTO, ...) halts the endpoint in the same way as a stall.
+# All other errors on the wire (EIO, EPROTO, ...) halt the endpoint in the same way as a stall.
 _STATUS = {errno.ENODEV: UNPLUGGED, errno.ENOENT: UNPLUGGED, errno.EOVERFLOW: OVERFLOW, errno.ETIMEDOUT: TIME_OUT}
 
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """A read that ended: the bytes it brought, when (CLOCK_MONOTONIC, ns), and how.
+    """A read that ended: its bytes, its time (CLOCK_MONOTONIC, ns), and its status.
 
     `status` is OK, SHORT, CANCELLED, TIME_OUT (whose bytes are good) or one of FATAL.
     """
@@ -39,36 +39,36 @@ class Completion:
 class Transfers(Protocol):
     """Reads in flight on one camera's data endpoint. They fill their buffers in the order of submission.
 
-    Made for one pass: after `cancel` it takes no more reads.
+    For one pass: after `cancel` it accepts no more reads.
     """
 
     depth: int  # reads that may be in flight at once
 
     @property
     def in_flight(self) -> int:
-        """Reads that have not ended yet, whether or not `wait` has told."""
+        """Number of reads that have not ended yet, whether or not `wait` has returned them."""
 
     def submit(self, buffer: UInt8) -> None:
         """Queue a read that fills `buffer` [transfer_bytes]; the buffer belongs to the read until it has ended."""
 
     def wait(self, timeout_s: float) -> Completion | None:
-        """The oldest read that `wait` has not told about, once it has ended; None if that takes over `timeout_s`."""
+        """Return the oldest read not yet returned, once it has ended; None if that takes over `timeout_s`."""
 
     def cancel(self) -> list[Completion]:
-        """End every read, and return what each brought, oldest first. No buffer is written to after this."""
+        """End every read, and return them, oldest first. No buffer is written to after this."""
 
 
 class SingleReads:
-    """One read at a time, by pyusb's blocking call: between two of them the camera's own memory has to hold.
+    """One read at a time, by pyusb's blocking call: between two reads the camera's own memory must suffice.
 
-    A read happens within `wait`, which takes up to `timeout_ms` whatever it is asked; it ends with TIME_OUT then.
+    A read happens within `wait`, which takes up to `timeout_ms` regardless of its argument; it then ends with TIME_OUT.
     """
 
     depth = 1
 
     def __init__(self, device: usb.core.Device, endpoint: int, transfer_bytes: int, timeout_ms: int) -> None:
         self._device, self._endpoint, self._timeout_ms = device, endpoint, timeout_ms
-        self._array = array.array("B", bytes(transfer_bytes))  # pyusb fills an array.array in place, and nothing else
+        self._array = array.array("B", bytes(transfer_bytes))  # pyusb fills only an array.array in place
         self._filled = np.frombuffer(self._array, np.uint8)
         self._buffer: UInt8 | None = None
 
@@ -78,7 +78,7 @@ class SingleReads:
         return int(self._buffer is not None)
 
     def submit(self, buffer: UInt8) -> None:
-        """Note where the next read's bytes go."""
+        """Store the buffer of the next read."""
         self._buffer = buffer
 
     def wait(self, timeout_s: float) -> Completion | None:
@@ -98,13 +98,13 @@ class SingleReads:
         return done
 
     def cancel(self) -> list[Completion]:
-        """Forget the submitted buffer: nothing is being read."""
+        """Forget the submitted buffer: no read is in progress."""
         self._buffer = None
         return []
 
     def _ending(self, n: int, begun_ns: int) -> str:
         if n == len(self._filled):
             return OK
-        # libusb returns what came before a time-out as a read that is short.
+        # libusb returns the data before a time-out as a short read.
         late = time.monotonic_ns() - begun_ns >= 1_000_000 * self._timeout_ms
         return TIME_OUT if late else SHORT

@@ -1,7 +1,7 @@
-"""One opened camera: its start and stop sequences, and reads on it, several in flight where that is possible.
+"""One opened camera: its start and stop sequences, and reads on it, several in flight where possible.
 
-A camera sends without pause, so that a moment without a read in flight lets its small memory run over. `open_link`
-takes libusb's queue (`queued.py`), or the queue that a backend brings itself, else reads one at a time (`reads.py`).
+A camera sends without pause, so its small memory overflows at any moment without a read in flight. `open_link` uses
+libusb's queue (`queued.py`) or a queue of the backend itself, else reads one at a time (`reads.py`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from spike4dgs.generators.recorder.usb.reads import Completion, SingleReads, Tra
 
 __all__ = ["Completion", "Link", "QueueingBackend", "Transfers", "UsbLink", "open_link"]
 
-_DRAIN_MS = 20  # a device that is silent for so long has sent what it still held
-_DRAIN_BYTES = 64 << 20  # more than a bridge or a camera holds: what sends so much was not stopped
+_DRAIN_MS = 20  # a device that is silent for so long has sent the rest of its data
+_DRAIN_BYTES = 64 << 20  # more than a bridge or a camera holds: a device that sends so much was not stopped
 
 _FIX_START = "check endpoint_out and start in the rig profile, then plug the camera in again"
 
@@ -37,23 +37,23 @@ class Link(Protocol):
 
     @property
     def queued(self) -> bool:
-        """Whether several reads can be in flight."""
+        """True if several reads can be in flight."""
 
     @property
     def restartable(self) -> bool:
-        """Whether it can be stopped and started anew, and then begins with a whole frame."""
+        """True if the camera can be stopped and restarted, and then begins with a whole frame."""
 
     def start(self) -> None:
-        """Send the camera's start sequence. Raises UserError where the camera does not take it."""
+        """Send the camera's start sequence. Raises UserError where the camera refuses it."""
 
     def stop(self) -> None:
-        """Send the stop sequence; a camera that is gone has stopped already."""
+        """Send the stop sequence; a camera that is gone has already stopped."""
 
     def drain(self) -> int:
-        """Read and drop what the camera still holds after `stop`; the number of bytes."""
+        """Read and drop the rest of the camera's data after `stop`. Return the number of bytes."""
 
     def transfers(self) -> Transfers:
-        """New machinery for reads on this camera, for one pass."""
+        """Return new reads on this camera, for one pass."""
 
     def close(self) -> None:
         """Release the device."""
@@ -64,7 +64,7 @@ class QueueingBackend(Protocol):
     """A pyusb backend with a queue of its own, such as an emulator's."""
 
     def open_transfers(self, device: usb.core.Device, endpoint: int, transfer_bytes: int, depth: int) -> Transfers:
-        """Machinery that keeps up to `depth` bulk reads of `transfer_bytes` in flight on `endpoint`."""
+        """Return a queue of up to `depth` bulk reads of `transfer_bytes` in flight on `endpoint`."""
 
 
 @dataclass(eq=False)
@@ -83,7 +83,7 @@ class UsbLink:
 
     @property
     def restartable(self) -> bool:
-        """Whether the profile says how to start and to stop it."""
+        """True if the profile has its start and stop sequences."""
         return bool(self.camera.start and self.camera.stop)
 
     def start(self) -> None:
@@ -100,7 +100,7 @@ class UsbLink:
             self._write(self.camera.stop)
 
     def drain(self) -> int:
-        """Read until the camera is silent; a camera that never is, is left after 64 MiB."""
+        """Read until the camera is silent, but at most 64 MiB."""
         size = self.profile.transfer_bytes
         reads = SingleReads(self.device, self.camera.endpoint_in, size, _DRAIN_MS)
         into, total = np.empty(size, np.uint8), 0
@@ -113,7 +113,7 @@ class UsbLink:
         return total
 
     def transfers(self) -> Transfers:
-        """Queued reads, or single ones."""
+        """Return queued reads, or single ones."""
         endpoint, size, depth = self.camera.endpoint_in, self.profile.transfer_bytes, self.profile.transfers
         if not self.queued:
             return SingleReads(self.device, endpoint, size, self.profile.timeout_ms)
@@ -134,8 +134,8 @@ class UsbLink:
 def open_link(device: usb.core.Device, camera: CameraProfile, profile: RigProfile, queued: bool | None = None) -> Link:
     """Open a camera that `find_cameras` has found, and claim its interfaces.
 
-    `queued`: True insists on queued reads, False on one at a time, None takes the queue where there is one. Raises
-    UserError where the device cannot be opened, or has no queue and one is insisted on.
+    `queued`: True requires queued reads, False reads one at a time, None uses the queue where there is one. Raises
+    UserError where the device cannot be opened, or lacks the required queue.
     """
     try:
         _claim(device, camera)
@@ -156,7 +156,7 @@ def _claim(device: usb.core.Device, camera: CameraProfile) -> None:
             raise
         device.set_configuration()
     for interface in {camera.interface, camera.control_interface} - {None}:
-        # Some systems and backends have no kernel drivers; one that stays is found out by the claim.
+        # Some systems and backends have no kernel drivers; one that stays attached makes the claim fail.
         with contextlib.suppress(NotImplementedError, usb.core.USBError):
             if device.is_kernel_driver_active(interface):
                 device.detach_kernel_driver(interface)
@@ -164,7 +164,7 @@ def _claim(device: usb.core.Device, camera: CameraProfile) -> None:
 
 
 def _refused(camera: CameraProfile, error: usb.core.USBError) -> UserError:
-    """What the system's refusal to open a camera means."""
+    """Return the error for the system's refusal to open a camera."""
     expected = "a camera that can be opened"
     if error.errno == errno.EACCES:
         found, fix = "no permission", udev_fix(camera.vendor_id)
@@ -176,7 +176,7 @@ def _refused(camera: CameraProfile, error: usb.core.USBError) -> UserError:
 
 
 def udev_fix(vendor_id: int) -> str:
-    """What to do where the system does not let this user open a device."""
+    """Return the instruction that lets this user open a device."""
     rule = f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{vendor_id:04x}", MODE="0666"'
     return f"put the line {rule} into /etc/udev/rules.d/70-spike4dgs.rules and plug the camera in again"
 

@@ -1,1 +1,1 @@
-"""Parts that worlds share, such as the street, the desk and the human figure."""
+"""Parts shared by several worlds: the street and its vehicles, the desk, the garden, the human figure, the bird."""

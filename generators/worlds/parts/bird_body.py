@@ -33,7 +33,7 @@ class Plumage:
 
 @dataclass(frozen=True)
 class Beat:
-    """How the wings move: beats per second, half the stroke and its middle (radians), lag of the tip, twist."""
+    """Motion of the wings: beats per second, half the stroke and its middle (radians), lag of the tip, twist."""
 
     hz: float = 12.0
     stroke: float = 0.68
@@ -43,19 +43,19 @@ class Beat:
     phase: float = 0.0
 
     def angles(self, t_s: float, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rise of the wing's line above the horizontal, and pitch of its chord, at shares `s` of the span."""
+        """Return the rise of the wing's line above the horizontal and its chord's pitch, at shares `s` of the span."""
         turn = 2 * np.pi * self.hz * t_s + self.phase - self.lag * s
         rise = self.middle + self.stroke * (0.55 + 0.45 * s) * np.cos(turn) - 0.10 * s
         return rise, self.twist * s * np.sin(turn)
 
     def tail(self, t_s: float) -> tuple[float, float]:
-        """Half the angle that the tail spreads, and its pitch (radians): it opens and sinks as the wings go down."""
+        """Return half the spread angle of the tail and its pitch (radians): it opens and sinks on the downstroke."""
         down = np.sin(2 * np.pi * self.hz * t_s + self.phase)
         return 0.42 + 0.07 * float(down), -0.05 * float(down)
 
 
 def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Body with head, beak, eyes and feet."""
+    """Return the body with head, beak, eyes and feet."""
     stations = np.array(  # x, height of the middle, half height, half width
         [(-0.105, 0.010, 0.010, 0.013), (-0.085, 0.008, 0.020, 0.023), (-0.045, 0.002, 0.036, 0.036)]
         + [(0.0, -0.002, 0.044, 0.041), (0.04, 0.004, 0.041, 0.037), (0.07, 0.018, 0.033, 0.030)]
@@ -91,18 +91,18 @@ def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
 
 
 def wings_part(plumage: Plumage, rng: np.random.Generator) -> Part:
-    """Both wings as one mesh; its vertices are those of `wing_points` at t = 0."""
+    """Return both wings as one mesh; its vertices are those of `wing_points` at t = 0."""
     mesh = merge([surface(np.zeros((_ALONG, _ACROSS, 3)))] * 2)
     return Part(Mesh(wing_points(Beat(), 0.0), mesh.faces, mesh.uv, smooth=True), Material(_feathers(plumage, 11, rng)))
 
 
 def wing_bodies() -> np.ndarray:
-    """Left wing 0, right wing 1, for every face."""
+    """Return the body of every face: left wing 0, right wing 1."""
     return np.repeat([0, 1], 2 * (_ALONG - 1) * (_ACROSS - 1))
 
 
 def wing_points(beat: Beat, t_s: float) -> np.ndarray:
-    """Vertices [N, 3] of both wings in the body's coordinates; the right one is the left one's mirror image.
+    """Return vertices [N, 3] of both wings in the body's coordinates; the right one mirrors the left one.
 
     The line along the span is a chain of equal pieces that only turn, so it keeps its length; each chord keeps its own.
     """
@@ -124,20 +124,20 @@ def wing_points(beat: Beat, t_s: float) -> np.ndarray:
 
 
 def _chord(s: np.ndarray) -> np.ndarray:
-    """Depth of the wing at shares of its span, with the tips of the flight feathers."""
+    """Return the depth of the wing at shares of its span, with the tips of the flight feathers."""
     smooth = 0.118 * (1 - 0.10 * s) * np.sqrt(np.clip(1 - np.clip((s - 0.45) / 0.56, 0, 1) ** 2.4, 0.02, 1))
     return np.asarray(smooth * (1 + 0.07 * np.cos(2 * np.pi * 11 * s)))
 
 
 def tail_part(plumage: Plumage, rng: np.random.Generator) -> Part:
-    """The tail as one mesh; its vertices are those of `tail_points` at t = 0."""
+    """Return the tail as one mesh; its vertices are those of `tail_points` at t = 0."""
     mesh = surface(np.zeros((_FAN, _BACK, 3)))
     points = tail_points(Beat(), 0.0)
     return Part(Mesh(points, mesh.faces, mesh.uv, smooth=True), Material(_feathers(plumage, 5, rng)))
 
 
 def tail_points(beat: Beat, t_s: float) -> np.ndarray:
-    """Vertices [N, 3] of the tail in the body's coordinates: a fan of feathers that keep their length."""
+    """Return the vertices [N, 3] of the tail in the body's coordinates: a fan of feathers that keep their length."""
     spread, pitch = beat.tail(t_s)
     side = np.linspace(-1, 1, _FAN)[:, None]
     back = np.linspace(0, 1, _BACK)
@@ -151,7 +151,7 @@ def tail_points(beat: Beat, t_s: float) -> np.ndarray:
 
 
 def _body_image(plumage: Plumage, rng: np.random.Generator) -> np.ndarray:
-    """u runs from tail to head (columns), v around it from the back (rows, 0 and 1 are the back)."""
+    """Return the body's image: u from tail to head (columns), v around it (rows; 0 and 1 are the back)."""
     h, w = 128, 256
     v, u = np.mgrid[:h, :w] / np.array([h, w]).reshape(2, 1, 1)
     belly = np.clip((np.abs(v - 0.5) < 0.21 + 0.05 * np.sin(9 * u)) * 1.0, 0, 1)
@@ -167,7 +167,7 @@ def _body_image(plumage: Plumage, rng: np.random.Generator) -> np.ndarray:
 
 
 def _feathers(plumage: Plumage, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Feathers side by side along u, from the front (row 0) to their tips: coverts, a bar, shafts, dark tips."""
+    """Return feathers side by side along u, from the front (row 0) to their tips: coverts, a bar, shafts, dark tips."""
     h, w = 96, 288
     c = Canvas(plain((h, w), plumage.wing), 96)
     c.rectangle(0, 0, 3, 0.30, plumage.back)

@@ -1,4 +1,4 @@
-"""What bicycle and motorcycle share: wheels that roll, and a rider who is placed by saddle, bars and foot rests.
+"""Parts of bicycle and motorcycle: wheels that roll, and a rider posed by saddle, bars and foot rests.
 
 A wheel's own coordinates: its axle is the y axis. A cycle's: x forward, y to the left, z up, origin on the ground.
 """
@@ -16,19 +16,19 @@ RUBBER = Material((0.028, 0.028, 0.03))
 
 
 def tyre(radius_m: float, thick_m: float) -> Mesh:
-    """A round tyre of this outer radius."""
+    """Return a round tyre of this outer radius."""
     a = np.linspace(0, 2 * np.pi, 13)
     return revolve(np.stack([radius_m - thick_m + thick_m * np.cos(a), thick_m * np.sin(a)], 1), 48, "y")
 
 
 def rim(radius_m: float, depth_m: float, half_width_m: float) -> Mesh:
-    """A rim: a band of this outer radius."""
+    """Return a rim: a band of this outer radius."""
     r0, w = radius_m - depth_m, half_width_m
     return revolve(np.array([(radius_m, -w), (r0, -0.6 * w), (r0, 0.6 * w), (radius_m, w), (radius_m, -w)]), 48, "y")
 
 
 def spokes(radius_m: float, hub_m: float, count: int, thick_m: float, spread_m: float) -> Mesh:
-    """Round spokes from a hub, in turn from its left and right side."""
+    """Return round spokes from a hub, in turn from its left and right side."""
     found = []
     for k in range(count):
         y = spread_m * (1 if k % 2 else -1)
@@ -37,12 +37,12 @@ def spokes(radius_m: float, hub_m: float, count: int, thick_m: float, spread_m: 
 
 
 def reflector(radius_m: float, colour: Colour) -> Part:
-    """A plate between the spokes, by which a whole turn can be told from a part of one."""
+    """Return a plate between the spokes, which distinguishes a whole turn of the wheel from a fraction."""
     return Part(box((0.10, 0.02, 0.055), (0, 0, 0.72 * radius_m)), Material(colour))
 
 
 def rolling(center: tuple[float, float, float], radius_m: float, travelled_m: float) -> np.ndarray:
-    """Pose of a wheel in the cycle's coordinates after the way it has rolled."""
+    """Return the pose of a wheel in the cycle's coordinates after it has rolled `travelled_m`."""
     return translation(*center) @ rotation("y", travelled_m / radius_m)
 
 
@@ -54,7 +54,7 @@ def seated(
     feet: dict[str, tuple[float, float, float]],
     head_down: float,
 ) -> dict[str, np.ndarray]:
-    """Poses of a rider: places in the cycle's coordinates, `grips` of the left hand, `feet` the ankles by side."""
+    """Return a rider's poses from points in the cycle's coordinates: `grips`: left hand, `feet`: ankles by side."""
 
     def world(p: tuple[float, float, float]) -> np.ndarray:
         return np.asarray(cycle[:3, :3] @ np.array(p) + cycle[:3, 3])

@@ -1,4 +1,4 @@
-"""The still room around the turntable: desk, wall, posters and the things that lie on the desk."""
+"""The static room around the turntable: desk, wall, posters and the objects on the desk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLOCKS: tuple[Colour, ...] = ((0.75, 0.22, 0.14), (0.20, 0.50, 0.24), (0.78, 0.5
 
 
 def room(rng: np.random.Generator) -> dict[str, Part]:
-    """All static surfaces, name -> part."""
+    """Return all static surfaces, name -> part."""
     desk = quad((0, 0.05, 0), (2.6, 0, 0), (0, 1.5, 0))
     wall = quad((0, 0.8, 0.75), (3.4, 0, 0), (0, 0, 2.1))
     parts = {
@@ -37,7 +37,7 @@ def room(rng: np.random.Generator) -> dict[str, Part]:
         "skirting": Part(box((3.4, 0.02, 0.06), (0, 0.785, 0.03)), Material((0.62, 0.60, 0.56))),
     }
     parts |= _posters(rng)
-    parts |= _desk_things(rng)
+    parts |= _desk_objects(rng)
     return parts
 
 
@@ -54,8 +54,8 @@ def _posters(rng: np.random.Generator) -> dict[str, Part]:
     return parts
 
 
-def _desk_things(rng: np.random.Generator) -> dict[str, Part]:
-    """Books, a mug, pencils, a ball, a ruler, sheets of paper: all away from the disc."""
+def _desk_objects(rng: np.random.Generator) -> dict[str, Part]:
+    """Return books, a mug, pencils, a ball, a ruler and sheets of paper, all away from the disc."""
     books: dict[str, Part] = {}
     x = 0.46
     for k, title in enumerate(("GAUSS", "RADON", "HODGE", "NOETHER", "EULER")):

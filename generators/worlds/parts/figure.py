@@ -1,7 +1,7 @@
-"""A clothed human figure of rigid limbs, placed by its joints.
+"""A clothed human figure of rigid limbs, posed by its joints.
 
-A limb's own coordinates: its upper joint in the origin, its lower joint on the +z axis, its front towards +x. World
-coordinates as everywhere: x the way it walks, y to its left, z up. Metres; 1.78 m tall.
+A limb's own coordinates: upper joint at the origin, lower joint on the +z axis, front towards +x. World coordinates:
+x the walking direction, y to the left, z up. Metres; the figure is 1.78 m tall.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Clothes:
 
 @dataclass(frozen=True)
 class Joints:
-    """Positions [3] of one side's or the middle joints; `heading`: the way the chest faces."""
+    """Positions [3] of the joints, in the middle or by side; `heading`: the direction that the chest faces."""
 
     hip: np.ndarray  # between the legs' joints
     neck: np.ndarray
@@ -51,7 +51,7 @@ class Joints:
 
 
 def groups(clothes: Clothes, rng: np.random.Generator) -> dict[str, tuple[Part, ...]]:
-    """The limbs' surfaces by name; the limbs of both sides look alike."""
+    """Return the limbs' surfaces by name; left and right limbs look alike."""
     jacket = cloth((64, 128), rng, [clothes.jacket, clothes.jacket, clothes.jacket, clothes.stripe], 8)
     sleeve = cloth((64, 64), rng, [clothes.jacket, clothes.jacket, clothes.jacket, clothes.stripe], 16)
     denim = mix(fractal((96, 96), rng, 12, 1), *(tuple(c * f for c in clothes.trousers) for f in (0.7, 1.25)))
@@ -70,20 +70,20 @@ def groups(clothes: Clothes, rng: np.random.Generator) -> dict[str, tuple[Part, 
 
 
 def instances(prefix: str = "") -> dict[str, str]:
-    """Instance name -> group name, both with the prefix."""
+    """Return instance name -> group name, both with the prefix."""
     pairs = {"torso": "torso", "head": "head"}
     pairs |= {f"{side}_{part}": part for side in SIDES for part in _LIMBS}
     return {prefix + k: prefix + v for k, v in pairs.items()}
 
 
 def poses(joints: Joints, prefix: str = "") -> dict[str, np.ndarray]:
-    """The pose [4, 4] of every limb. Knees bend forward, elbows backward and outward."""
+    """Return the pose [4, 4] of every limb. Knees bend forward, elbows backward and outward."""
     forward, left = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
     up = joints.neck - joints.hip
     chest = np.cross(left, up / np.linalg.norm(up))
     found = {"torso": frame(joints.hip, joints.neck, chest)}
-    look = rotation("y", joints.head_down)[:3, :3]
-    found["head"] = frame(joints.neck, joints.neck + look @ np.array([0, 0, 1.0]), look @ forward)
+    tilt = rotation("y", joints.head_down)[:3, :3]
+    found["head"] = frame(joints.neck, joints.neck + tilt @ np.array([0, 0, 1.0]), tilt @ forward)
     for side, sign in SIDES.items():
         shoulder = joints.neck - 0.06 * up / np.linalg.norm(up) + sign * SHOULDER_M * left
         hip = joints.hip + sign * HIP_M * left
@@ -103,7 +103,7 @@ def poses(joints: Joints, prefix: str = "") -> dict[str, np.ndarray]:
 def reach(
     start: np.ndarray, goal: np.ndarray, upper_m: float, lower_m: float, bend: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Middle joint and end of a two-bone limb from `start` to `goal`, bent towards `bend`; straight if too far."""
+    """Return middle joint and end of a two-bone limb from `start` to `goal`, bent towards `bend` or straight."""
     way = goal - start
     distance = np.clip(np.linalg.norm(way), abs(upper_m - lower_m) + 1e-6, (upper_m + lower_m) * 0.9999)
     way = way / np.linalg.norm(way)
@@ -114,7 +114,7 @@ def reach(
 
 
 def frame(origin: np.ndarray, towards: np.ndarray, front: np.ndarray) -> np.ndarray:
-    """Pose [4, 4] of a limb: z from `origin` to `towards`, x as near to `front` as that allows."""
+    """Return the pose [4, 4] of a limb: z from `origin` to `towards`, x as near to `front` as possible."""
     z = (towards - origin) / np.linalg.norm(towards - origin)
     x = front - z * (front @ z)
     if np.linalg.norm(x) < 1e-3:
@@ -126,7 +126,7 @@ def frame(origin: np.ndarray, towards: np.ndarray, front: np.ndarray) -> np.ndar
 
 
 def limb(length: float, start_radius: float, end_radius: float) -> Mesh:
-    """A rounded, tapering limb from 0 to `length` on the z axis; u runs around it."""
+    """Return a rounded, tapering limb from 0 to `length` on the z axis; u runs around it."""
     a = np.linspace(0, np.pi / 2, 6)
     low = np.stack([start_radius * np.sin(a), -start_radius * np.cos(a)], 1)
     high = np.stack([end_radius * np.cos(a), length + end_radius * np.sin(a)], 1)
@@ -137,7 +137,7 @@ def limb(length: float, start_radius: float, end_radius: float) -> Mesh:
 
 
 def _torso(clothes: Clothes, jacket: np.ndarray) -> tuple[Part, ...]:
-    """Hips, waist, chest and shoulders as one skin, and what is worn on them. z from the hip to the neck."""
+    """Return hips, waist, chest and shoulders as one skin, and the clothes on them. z from the hip to the neck."""
     profile = np.array(  # z, half depth (x), half width (y)
         [(-0.10, 0.02, 0.05), (-0.08, 0.085, 0.125), (-0.02, 0.11, 0.155), (0.06, 0.10, 0.14), (0.14, 0.10, 0.14)]
         + [(0.27, 0.12, 0.165), (0.38, 0.125, 0.185), (0.44, 0.10, 0.185), (0.48, 0.07, 0.13), (0.51, 0.05, 0.06)]
@@ -167,7 +167,7 @@ def _torso(clothes: Clothes, jacket: np.ndarray) -> tuple[Part, ...]:
 
 
 def _head(clothes: Clothes) -> tuple[Part, ...]:
-    """Neck, face, and hair or helmet. z up from the neck, face towards +x."""
+    """Return neck, face, and hair or helmet. z up from the neck, face towards +x."""
     neck = limb(0.10, 0.055, 0.052)
     skull = ellipsoid((0.098, 0.078, 0.122), (0.02, 0, 0.19), 24)
     nose = ellipsoid((0.022, 0.014, 0.024), (0.118, 0, 0.18), 10)
@@ -197,7 +197,7 @@ def _head(clothes: Clothes) -> tuple[Part, ...]:
 
 
 def _shoe(clothes: Clothes) -> tuple[Part, ...]:
-    """A shoe about the ankle, toes towards +x."""
+    """Return a shoe about the ankle, toes towards +x."""
     upper = [
         ellipsoid((0.13, 0.045, 0.045), (0.055, 0, -0.045), 18),
         ellipsoid((0.06, 0.045, 0.06), (-0.02, 0, -0.03), 14),

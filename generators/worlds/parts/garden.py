@@ -1,4 +1,4 @@
-"""The still garden around the bird: a wooden deck, a brick wall with ivy, pots with flowers, a can, a fence."""
+"""The static garden around the bird: a wooden deck, a brick wall with ivy, pots with flowers, a can, a fence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _POTS = ((-0.78, 0.62, 0.15), (-0.38, 0.86, 0.11), (0.46, 0.78, 0.13), (0.88, 0.
 
 
 def garden(rng: np.random.Generator) -> dict[str, Part]:
-    """All static surfaces, name -> part."""
+    """Return all static surfaces, name -> part."""
     deck = quad((0, 0.0, 0), (4.4, 0, 0), (0, 2.6, 0))
     wall = quad((0, WALL_Y, 0.9), (4.6, 0, 0), (0, 0, 1.8))
     bricks = paving((360, 920), rng, (15, 46), (0.36, 0.15, 0.09), (0.58, 0.30, 0.20), (0.46, 0.43, 0.38), 0.3, gap=2)
@@ -31,12 +31,12 @@ def garden(rng: np.random.Generator) -> dict[str, Part]:
         "lawn": Part(lawn, Material((0.10, 0.16, 0.05))),
         "sign": Part(quad((0.02, WALL_Y - 0.01, 0.34), (0.60, 0, 0), (0, 0, 0.275)), Material(sign.image)),
         **_plants(rng),
-        **_things(rng),
+        **_objects(rng),
     }
 
 
 def _plants(rng: np.random.Generator) -> dict[str, Part]:
-    """Pots with soil, leaves and flowers; ivy on the wall."""
+    """Return pots with soil, leaves and flowers, and ivy on the wall."""
     pot = np.array(
         [(0.0, 0.0), (0.68, 0.0), (0.92, 0.86), (1.0, 0.88), (1.0, 1.0), (0.90, 1.0), (0.86, 0.88), (0.0, 0.88)]
     )
@@ -74,7 +74,7 @@ def _plants(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def _leaf(root: np.ndarray, way: np.ndarray, length: float, rng: np.random.Generator) -> Mesh:
-    """A pointed leaf of six triangles, bent downwards."""
+    """Return a pointed leaf of six triangles, bent downwards."""
     side = np.cross(way, [0.0, 0.0, 1.0]) + 1e-6
     side *= 0.22 * length / np.linalg.norm(side)
     sag = np.array([0, 0, -0.25 * length])
@@ -87,8 +87,8 @@ def _leaf(root: np.ndarray, way: np.ndarray, length: float, rng: np.random.Gener
     return Mesh(points, faces, uv, smooth=False)
 
 
-def _things(rng: np.random.Generator) -> dict[str, Part]:
-    """A watering can, a bowl and a post with a lantern."""
+def _objects(rng: np.random.Generator) -> dict[str, Part]:
+    """Return a watering can, a bowl and a post with a lantern."""
     can = revolve(np.array([(0.0, 0.0), (0.11, 0.0), (0.11, 0.16), (0.085, 0.20), (0.04, 0.21), (0.0, 0.21)]), 28)
     spout = tube([(0.09, 0, 0.06), (0.22, 0, 0.19), (0.26, 0, 0.21)], [0.022, 0.016, 0.03], 12)
     a = np.linspace(0.2, np.pi - 0.2, 14)

@@ -19,7 +19,7 @@ from spike4dgs.generators.worlds.primitives.textures import Canvas, cloth, fract
 
 
 def shops(rng: np.random.Generator) -> dict[str, Part]:
-    """Three house fronts, each a wall with real window recesses, awnings and a name board."""
+    """Return three house fronts, each a wall with real window recesses, awnings and a name board."""
     walls: tuple[tuple[float, float, Colour, Colour], ...] = (
         (-16.0, -4.9, (0.44, 0.20, 0.13), (0.62, 0.34, 0.24)),
         (-4.9, 3.6, (0.60, 0.55, 0.44), (0.78, 0.72, 0.60)),
@@ -77,7 +77,7 @@ def shops(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def _upper_windows(walls: Any) -> list[float]:
-    """Middles of the first-floor windows, as `shops` frames them."""
+    """Return the middles of the first-floor windows, as `shops` frames them."""
     at = []
     for left, right, *_ in walls:
         bays = np.linspace(left, right, 3)
@@ -86,7 +86,7 @@ def _upper_windows(walls: Any) -> list[float]:
 
 
 def _frame(x: float, width: float, low: float, high: float) -> Mesh:
-    """Four bars and a crossbar standing out from the wall."""
+    """Return four bars and a crossbar that stand out from the wall."""
     y, bar = FRONT_Y - 0.05, 0.09
     middle = (low + high) / 2
     upright = [box((bar, 0.14, high - low), (x + s * width / 2, y, middle)) for s in (-1, 0, 1)]
@@ -96,14 +96,14 @@ def _frame(x: float, width: float, low: float, high: float) -> Mesh:
 
 
 def _shop_window(x: float, width: float) -> Mesh:
-    """The pane of a shop window and of the door beside it."""
+    """Return the pane of a shop window and of the door beside it."""
     window = quad((x, FRONT_Y - 0.01, 1.485), (width, 0, 0), (0, 0, 1.73))
     door = quad((x + width / 2 + 0.67, FRONT_Y - 0.012, 1.245), (0.95, 0, 0), (0, 0, 2.21), (0.3, 1.0))
     return merge([window, door])
 
 
 def _display(rng: np.random.Generator) -> np.ndarray:
-    """What stands in a shop window: shelves of coloured goods in the dark."""
+    """Return the display of a shop window: shelves of coloured goods in the dark."""
     c = Canvas(mix(np.linspace(0, 1, 160)[:, None] * np.ones((1, 360)), (0.04, 0.04, 0.05), (0.11, 0.10, 0.09)), 100)
     for shelf in (0.5, 0.95, 1.5):
         x = 0.1
@@ -121,7 +121,7 @@ def _display(rng: np.random.Generator) -> np.ndarray:
 
 
 def _pane(rng: np.random.Generator) -> np.ndarray:
-    """A first-floor window with curtains."""
+    """Return a first-floor window with curtains."""
     c = Canvas(mix(np.linspace(0, 1, 96)[:, None] * np.ones((1, 66)), (0.12, 0.15, 0.19), (0.03, 0.03, 0.04)), 60)
     folds = cloth((96, 18), rng, [(0.62, 0.58, 0.50), (0.48, 0.44, 0.38)], 3)
     c.image[:, :18] = folds

@@ -1,4 +1,4 @@
-"""The static street of the car world: road with markings, pavements, shops, trees, lamps, signs, sky and sun.
+"""The static street: road with markings, pavements, shops, trees, lamps, signs, sky and sun.
 
 The road runs along x. y grows away from the cameras: near pavement, two lanes, far pavement, shop fronts.
 """
@@ -38,7 +38,7 @@ class Light:
 
 
 def emitters(light: Light, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
-    """Mitsuba emitters: a directional sun, sampled, and a clouded sky that only BSDF sampling finds (less noise)."""
+    """Return Mitsuba emitters: a directional sun, sampled, and a clouded sky, found by BSDF sampling only."""
     height, width = 64, 128
     up = np.sin(np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi)[:, None] * np.ones((1, width))
     rise = np.clip(up, 0, 1).astype(np.float32)
@@ -57,7 +57,7 @@ def emitters(light: Light, rng: np.random.Generator) -> dict[str, dict[str, Any]
 
 
 def street(rng: np.random.Generator) -> dict[str, Part]:
-    """All static surfaces, name -> part."""
+    """Return all static surfaces, name -> part."""
     parts = _ground(rng)
     parts |= shops(rng)
     parts |= trees(rng)
@@ -99,7 +99,7 @@ def _ground(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def _road_image(rng: np.random.Generator) -> np.ndarray:
-    """Asphalt with everything that is painted on it or let into it."""
+    """Return asphalt with all its markings, covers, gutter grates and repairs."""
     x0, x1 = ROAD_X
     depth = ROAD_Y[1] - ROAD_Y[0]
     c = Canvas(asphalt((round(depth * _TEXELS), round((x1 - x0) * _TEXELS)), rng), _TEXELS)
@@ -133,7 +133,7 @@ def _road_image(rng: np.random.Generator) -> np.ndarray:
 
 
 def _road_marks(c: Canvas, at: Any) -> None:
-    """Paint: dashed middle line, edge lines, a zebra crossing, an arrow and words."""
+    """Paint a dashed middle line, edge lines, a zebra crossing, an arrow and words."""
     x0, x1 = ROAD_X
     for x in np.arange(x0 + 0.6, x1, 3.2):
         if not -4.6 < x < -0.6:

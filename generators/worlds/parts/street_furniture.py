@@ -1,4 +1,4 @@
-"""What stands on the pavements of the street: trees, lamps, signs, a bench, bollards, flower boxes."""
+"""Furniture of the street's pavements: trees, lamps, signs, a bench, bollards, flower boxes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from spike4dgs.generators.worlds.primitives.textures import Canvas, fractal, mix
 
 
 def trees(rng: np.random.Generator) -> dict[str, Part]:
-    """Three street trees in planters: trunk, branches and some hundred leaf cards each."""
+    """Return three street trees in planters: trunk, branches and some hundred leaf cards each."""
     trunks, leaves, tubs, soil = [], [], [], []
     for x in (-7.3 + rng.uniform(-0.4, 0.4), 1.9 + rng.uniform(-0.4, 0.4), 9.4 + rng.uniform(-0.4, 0.4)):
         y = 6.5
@@ -54,7 +54,7 @@ def trees(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def furniture(rng: np.random.Generator) -> dict[str, Part]:
-    """Lamps, signs, a bench, a bin, a hydrant, a letter box, bollards and flower boxes."""
+    """Return lamps, signs, a bench, a bin, a hydrant, a letter box, bollards and flower boxes."""
     z = PAVEMENT_Z
     poles, boards = [], {}
     for x in (-4.9, 5.6):

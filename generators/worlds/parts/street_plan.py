@@ -1,4 +1,4 @@
-"""Where the street's parts stand, in metres, and the colours that they share."""
+"""Layout of the street in metres, and the colours that its parts share."""
 
 from __future__ import annotations
 

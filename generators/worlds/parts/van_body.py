@@ -45,7 +45,7 @@ _BOTTOM = np.array([(-2.45, 0.42), (-2.38, 0.32), (2.3, 0.28), (2.45, 0.42)])
 
 @dataclass(frozen=True)
 class Livery:
-    """Colours, linear RGB, and what is written on the van."""
+    """Colours, linear RGB, and the lettering of the van."""
 
     body: Colour
     second: Colour
@@ -55,7 +55,7 @@ class Livery:
 
 
 def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Everything that only translates."""
+    """Return all parts that only translate."""
     skin = _ATLAS.wrap(loft(np.stack([_ring(x) for x in _stations()])))
     floor = box((4.5, 1.35, 0.55), (0, 0, 0.50))
     sills = [box((2.1, 0.04, 0.13), (0.05, s * 0.955, 0.36)) for s in (-1, 1)]
@@ -86,7 +86,7 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
 
 
 def rim_parts(colour: Colour) -> tuple[Part, ...]:
-    """A steel wheel about its axle (the y axis), alike from both sides: holes around a hub, one nut painted."""
+    """Return a steel wheel about its axle (the y axis), alike from both sides: holes around a hub, one nut painted."""
     dish = [
         revolve(np.array([(RIM_M, s * 0.10), (RIM_M - 0.03, s * 0.085), (0.09, s * 0.10), (0.0, s * 0.115)]), 40, "y")
         for s in (-1, 1)
@@ -108,7 +108,7 @@ def rim_parts(colour: Colour) -> tuple[Part, ...]:
 
 
 def wheel_positions() -> list[tuple[float, float, float]]:
-    """Wheel centres in the van's coordinates."""
+    """Return the wheel centres in the van's coordinates."""
     return [(x, s * _TRACK_Y_M, WHEEL_M) for x in AXLES_X_M for s in (-1, 1)]
 
 
@@ -120,7 +120,7 @@ def _stations() -> np.ndarray:
 
 
 def _ring(x: float) -> np.ndarray:
-    """Cross-section at x: a rounded box whose sides lean in above the belt line, cut by the wheel arches."""
+    """Return the cross-section at x: a rounded box whose sides lean in above the belt line, cut by the wheel arches."""
     top, bottom = np.interp(x, _TOP[:, 0], _TOP[:, 1]), np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1])
     for axle in AXLES_X_M:
         if abs(x - axle) <= ARCH_M:
@@ -161,7 +161,7 @@ def _paint(livery: Livery, rng: np.random.Generator) -> np.ndarray:
 
 def _paint_side(c: Canvas, chart: str, livery: Livery) -> None:
     def at(xz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.place(chart, np.array([(x, 0.0, z) for x, z in xz]))
+        return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
 
     c.polygon(at([(-2.5, 0.62), (2.5, 0.86), (2.5, 0.2), (-2.5, 0.2)]), livery.second)
     c.polygon(at([(-2.5, 0.70), (2.5, 0.94), (2.5, 0.88), (-2.5, 0.64)]), livery.ink)
@@ -184,7 +184,7 @@ def _paint_side(c: Canvas, chart: str, livery: Livery) -> None:
 
 def _paint_end(c: Canvas, chart: str, livery: Livery, is_front: bool) -> None:
     def at(yz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.place(chart, np.array([(0.0, y, z) for y, z in yz]))
+        return _ATLAS.project(chart, np.array([(0.0, y, z) for y, z in yz]))
 
     if is_front:
         c.polygon(at([(-0.62, 0.78), (0.62, 0.78), (0.58, 0.56), (-0.58, 0.56)]), DARK)
@@ -199,7 +199,7 @@ def _paint_end(c: Canvas, chart: str, livery: Livery, is_front: bool) -> None:
 
 def _paint_top(c: Canvas, livery: Livery) -> None:
     def at(xy: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.place("top", np.array([(x, y, 0.0) for x, y in xy]))
+        return _ATLAS.project("top", np.array([(x, y, 0.0) for x, y in xy]))
 
     c.polygon(at([(1.02, -0.76), (1.64, -0.86), (1.64, 0.86), (1.02, 0.76)]), GLASS)
     c.polygon(at([(1.2, -0.55), (1.5, -0.60), (1.5, -0.25), (1.2, -0.22)]), (0.15, 0.17, 0.19), 0.8)

@@ -49,7 +49,7 @@ _ROOF = np.array(
 
 @dataclass(frozen=True)
 class Livery:
-    """Colours of one car: linear RGB, and the number on its doors."""
+    """Colours (linear RGB) of one car, and the number on its doors."""
 
     body: Colour
     second: Colour
@@ -57,7 +57,7 @@ class Livery:
 
 
 def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Everything that only translates. The tyres belong here: they look the same at every angle."""
+    """Return all parts that only translate. The tyres are among them: they look the same at every angle."""
     shell = _ATLAS.wrap(loft(np.stack([_body_ring(x) for x in _stations()])))
     glasshouse = _ATLAS.wrap(loft(np.stack([_cabin_ring(x) for x in np.linspace(-1.87, 0.98, 46)])))
     tyre = revolve(_tyre_profile(), 40, "y")
@@ -86,7 +86,7 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
 
 
 def rim_parts() -> tuple[Part, ...]:
-    """One rim about its own axle (the y axis): ring, five double spokes, hub; alike from both sides."""
+    """Return one rim about its own axle (the y axis): ring, five double spokes, hub; alike from both sides."""
     ring = [(0.205, -0.115), (RIM_RADIUS_M, -0.11), (RIM_RADIUS_M, 0.11), (0.205, 0.115), (0.195, 0.09), (0.195, -0.09)]
     bright: list[Mesh] = [revolve(np.array(ring + ring[:1]), 40, "y")]
     for k in range(5):
@@ -110,7 +110,7 @@ def rim_parts() -> tuple[Part, ...]:
 
 
 def wheel_positions() -> list[tuple[float, float, float]]:
-    """Wheel centres in the car's coordinates."""
+    """Return the wheel centres in the car's coordinates."""
     return [(x, s * TRACK_Y_M, WHEEL_RADIUS_M) for x in AXLES_X_M for s in (-1, 1)]
 
 
@@ -118,7 +118,7 @@ def wheel_positions() -> list[tuple[float, float, float]]:
 
 
 def _stations() -> np.ndarray:
-    """Cross-section positions: even, and dense along the wheel arches."""
+    """Return the positions of the cross-sections: even, and dense along the wheel arches."""
     angle = np.linspace(0, np.pi, 21)
     edge = ARCH_RADIUS_M + 0.004
     arches = [np.concatenate([x + ARCH_RADIUS_M * np.cos(angle), [x - edge, x + edge]]) for x in AXLES_X_M]
@@ -127,7 +127,7 @@ def _stations() -> np.ndarray:
 
 
 def _body_ring(x: float) -> np.ndarray:
-    """Cross-section of the lower body at x: a rounded rectangle between the outlines, cut by the wheel arches."""
+    """Return the lower body's cross-section at x: a rounded rectangle between the outlines, cut by the wheel arches."""
     top = np.interp(x, _TOP[:, 0], _TOP[:, 1])
     bottom = np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1])
     for axle in AXLES_X_M:
@@ -139,7 +139,7 @@ def _body_ring(x: float) -> np.ndarray:
 
 
 def _cabin_ring(x: float) -> np.ndarray:
-    """Cross-section of the glasshouse at x, narrowing towards the roof."""
+    """Return the cross-section of the glasshouse at x, narrowing towards the roof."""
     roof = np.interp(x, _ROOF[:, 0], _ROOF[:, 1])
     half = 0.80 * (1 - 0.10 * abs((x + 0.45) / 1.45) ** 3)
     return _rounded(x, half, 0.70, max(roof, 0.72), round_top=0.10, round_bottom=0.01, lean=0.24, crown=0.03)
@@ -156,7 +156,7 @@ def _rounded(
     lean: float,
     crown: float,
 ) -> np.ndarray:
-    """Ring [m, 3] at x: sides lean inwards by `lean` metres per 0.6 m of height, the top bulges by `crown`."""
+    """Return a ring [m, 3] at x: sides lean inwards by `lean` metres per 0.6 m of height, the top bulges by `crown`."""
     r1, r0 = min(round_top, 0.45 * (top - bottom)), min(round_bottom, 0.3 * (top - bottom))
     a = np.linspace(0, np.pi / 2, 7)
     low = np.stack([half - r0 + r0 * np.sin(a), bottom + r0 - r0 * np.cos(a)], 1)
@@ -172,7 +172,7 @@ def _rounded(
 
 
 def _tyre_profile() -> np.ndarray:
-    """Half cross-section of a tyre, a flattened ring between rim and tread."""
+    """Return the half cross-section of a tyre, a flattened ring between rim and tread."""
     r0, r1 = RIM_RADIUS_M - 0.005, WHEEL_RADIUS_M
     profile = [(r0, -0.10), (r0 + 0.05, -0.122), (r1 - 0.02, -0.115), (r1 - 0.004, -0.095), (r1, -0.05), (r1, 0.05)]
     return np.array(profile + [(r1 - 0.004, 0.095), (r1 - 0.02, 0.115), (r0 + 0.05, 0.122), (r0, 0.10)])
@@ -189,13 +189,13 @@ def _canvas(colour: Colour, rng: np.random.Generator | None = None) -> Canvas:
 
 
 def _side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
-    """Points (x, z) on a flank -> texture metres."""
-    return _ATLAS.place(chart, np.array([(x, 0.0, z) for x, z in xz]))
+    """Convert points (x, z) on a flank to texture metres."""
+    return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
 
 
 def _top(xy: list[tuple[float, float]]) -> np.ndarray:
-    """Points (x, y) seen from above -> texture metres."""
-    return _ATLAS.place("top", np.array([(x, y, 0.0) for x, y in xy]))
+    """Convert points (x, y) seen from above to texture metres."""
+    return _ATLAS.project("top", np.array([(x, y, 0.0) for x, y in xy]))
 
 
 def _paint_body(livery: Livery, rng: np.random.Generator) -> np.ndarray:
@@ -226,13 +226,13 @@ def _paint_body(livery: Livery, rng: np.random.Generator) -> np.ndarray:
         c.text("S P I K E", x, y, 0.105, white)
     _paint_bonnet(c, livery, white)
     for chart, grille in (("front", True), ("back", False)):
-        x, y = _ATLAS.place(chart, np.array([(0, 0, 0.42)]))[0]
+        x, y = _ATLAS.project(chart, np.array([(0, 0, 0.42)]))[0]
         c.rectangle(x - 0.62, y - 0.07, x + 0.62, y + 0.07, DARK if grille else livery.second)
     return c.image
 
 
 def _paint_bonnet(c: Canvas, livery: Livery, white: Colour) -> None:
-    """Stripes, seams, vents and a number on the bonnet and the boot lid."""
+    """Paint stripes, seams, vents and a number on the bonnet and the boot lid."""
     for y0, y1 in ((-0.30, -0.10), (0.10, 0.30)):
         c.polygon(_top([(0.8, y0), (2.1, y0), (2.1, y1), (0.8, y1)]), livery.second)
         c.polygon(_top([(-2.1, y0), (-1.6, y0), (-1.6, y1), (-2.1, y1)]), livery.second)
@@ -276,7 +276,7 @@ def _paint_cabin(livery: Livery) -> np.ndarray:
 
 
 def _tyre_image() -> np.ndarray:
-    """Rows run across the profile (sidewall, tread, sidewall); the same all around."""
+    """Return the tyre's image: rows run across the profile (sidewall, tread, sidewall) and are the same all around."""
     rows = np.full((64, 4), 0.03, np.float32)
     rows[::7] = 0.012
     rows[8:11] = rows[53:56] = 0.30  # a white ring on each sidewall

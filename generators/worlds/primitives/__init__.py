@@ -1,1 +1,1 @@
-"""What every world is made of: meshes, materials, textures, rigid bodies, the lamp."""
+"""Building blocks of every world: meshes, materials, textures, rigid bodies, the lamp."""

@@ -1,4 +1,4 @@
-"""Light of the tabletop worlds: one square lamp, sampled, and weak light from everywhere."""
+"""Light of the tabletop worlds: one square lamp, sampled, and weak light from all directions."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ _HALF_M = 0.16
 
 @dataclass(frozen=True)
 class Lamp:
-    """Where the lamp hangs, metres, how strong it is, and the point that it shines on."""
+    """A hanging lamp: its position in metres, its strength, and the point that it shines on."""
 
-    place: tuple[float, float, float] = (-0.85, -0.75, 1.7)
+    position: tuple[float, float, float] = (-0.85, -0.75, 1.7)
     power: float = 1.0
     target: tuple[float, float, float] = (0.0, 0.0, 0.1)
 
     @property
     def frame(self) -> np.ndarray:
         """Pose [4, 4] of the square: its z axis points at the target."""
-        origin = np.array(self.place)
+        origin = np.array(self.position)
         forward = np.array(self.target) - origin
         forward /= np.linalg.norm(forward)
         left = np.cross([0.0, 0.0, 1.0], forward)
@@ -38,7 +38,7 @@ class Lamp:
         return np.asarray(corners @ self.frame.T)
 
     def emitters(self, room: float = 1.0) -> dict[str, dict[str, Any]]:
-        """Mitsuba emitters: the lamp, sampled, and weak light of the room, found by BSDF sampling only (less noise)."""
+        """Return Mitsuba emitters: the lamp, sampled, and weak room light, found by BSDF sampling only."""
         power = 62.0 * self.power
         scale = np.diag([_HALF_M, _HALF_M, 1.0, 1.0])
         return {

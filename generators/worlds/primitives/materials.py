@@ -1,4 +1,4 @@
-"""What surfaces are made of, and how Mitsuba is told."""
+"""Materials of surfaces, and their conversion to Mitsuba."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Material:
     Attributes:
         albedo: linear RGB in 0..1, one colour or an image [H, W, 3] whose top row is v = 0.
         gloss: None for a matte surface, else the roughness of a clear coat over the albedo (0.05 polished, 0.3 satin).
-        metal: the albedo is the mirror colour of rough metal instead; needs `gloss`.
+        metal: rough metal instead, with the albedo as its mirror colour; needs `gloss`.
     """
 
     albedo: Colour | np.ndarray
@@ -28,7 +28,7 @@ class Material:
     metal: bool = False
 
     def to_mitsuba(self) -> dict[str, Any]:
-        """A BSDF dictionary for `mitsuba.load_dict`; the current variant must be set."""
+        """Return a BSDF dictionary for `mitsuba.load_dict`; the current variant must be set."""
         if self.metal:
             inner = {"type": "roughconductor", "alpha": self.gloss, "specular_reflectance": _texture(self.albedo)}
         elif self.gloss is not None:
@@ -39,7 +39,7 @@ class Material:
 
 
 def _texture(albedo: Colour | np.ndarray) -> dict[str, Any]:
-    """A constant colour or a repeating image, kept inside what real surfaces reflect."""
+    """Return a constant colour or a repeating image, clipped to the reflectance of real surfaces."""
     import mitsuba as mi
 
     if not isinstance(albedo, np.ndarray):
@@ -49,7 +49,7 @@ def _texture(albedo: Colour | np.ndarray) -> dict[str, Any]:
 
 
 def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
-    """A `mitsuba.Mesh` that can stand as a value in a scene dictionary, also inside a shape group."""
+    """Return a `mitsuba.Mesh` that can be a value in a scene dictionary, also inside a shape group."""
     import mitsuba as mi
 
     from spike4dgs.generators.worlds.primitives.meshes import vertex_normals

@@ -21,11 +21,11 @@ class Mesh:
     smooth: bool = True
 
     def moved(self, matrix: np.ndarray) -> Mesh:
-        """The mesh after a [4, 4] affine map."""
+        """Return the mesh transformed by a [4, 4] affine matrix."""
         return replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
     def at(self, x: float, y: float, z: float) -> Mesh:
-        """The mesh shifted by (x, y, z)."""
+        """Return the mesh shifted by (x, y, z)."""
         return self.moved(translation(x, y, z))
 
 
@@ -33,14 +33,14 @@ class Mesh:
 
 
 def translation(x: float, y: float, z: float) -> np.ndarray:
-    """[4, 4] shift."""
+    """Return the [4, 4] translation."""
     m = np.eye(4)
     m[:3, 3] = x, y, z
     return m
 
 
 def rotation(axis: str, angle_rad: float) -> np.ndarray:
-    """[4, 4] right-handed rotation about the axis "x", "y" or "z"."""
+    """Return the [4, 4] right-handed rotation about the axis "x", "y" or "z"."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     m = np.eye(4)
     m[i, i] = m[j, j] = np.cos(angle_rad)
@@ -50,7 +50,7 @@ def rotation(axis: str, angle_rad: float) -> np.ndarray:
 
 
 def scaling(x: float, y: float, z: float) -> np.ndarray:
-    """[4, 4] scale."""
+    """Return the [4, 4] scaling."""
     return np.diag([x, y, z, 1.0])
 
 
@@ -58,7 +58,7 @@ def scaling(x: float, y: float, z: float) -> np.ndarray:
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh out of several (they keep their own texture coordinates)."""
+    """Return several meshes as one (they keep their own texture coordinates)."""
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     return Mesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -71,7 +71,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 def quad(
     center: Sequence[float], right: Sequence[float], up: Sequence[float], uv_size: Sequence[float] = (1, 1)
 ) -> Mesh:
-    """A parallelogram: `right` and `up` are its full edge vectors; an image on it stands upright along `up`."""
+    """Return a parallelogram: `right` and `up` are its full edge vectors; an image on it is upright along `up`."""
     c, r, u = (np.asarray(a, np.float64) for a in (center, right, up))
     corners = np.array([c - r / 2 - u / 2, c + r / 2 - u / 2, c + r / 2 + u / 2, c - r / 2 + u / 2])
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float64) * np.asarray(uv_size, np.float64)
@@ -81,7 +81,7 @@ def quad(
 def box(
     size: Sequence[float], center: Sequence[float] = (0, 0, 0), uv_per_m: float | None = None, bottom: bool = True
 ) -> Mesh:
-    """A box whose faces each carry the whole image upright, or `uv_per_m` repeats per metre."""
+    """Return a box whose faces each carry the whole image upright, or `uv_per_m` repeats per metre."""
     sx, sy, sz = size
     # (outward direction, image's right edge, image's up edge): right x up = outward, so text reads from outside
     faces = [
@@ -101,7 +101,7 @@ def box(
 
 
 def surface(points: np.ndarray, smooth: bool = True) -> Mesh:
-    """A grid of points [n, m, 3] as a surface; u runs along the first index, v along the second."""
+    """Return a grid of points [n, m, 3] as a surface; u runs along the first index, v along the second."""
     n, m = points.shape[:2]
     i, j = np.meshgrid(np.arange(n - 1), np.arange(m - 1), indexing="ij")
     a = (i * m + j).ravel()
@@ -111,7 +111,7 @@ def surface(points: np.ndarray, smooth: bool = True) -> Mesh:
 
 
 def fan(ring: np.ndarray) -> Mesh:
-    """A flat cap over a convex closed ring [n, 3]."""
+    """Return a flat cap over a convex closed ring [n, 3]."""
     n = len(ring)
     i = np.arange(n)
     vertices = np.concatenate([ring, ring.mean(0, keepdims=True)])
@@ -119,14 +119,14 @@ def fan(ring: np.ndarray) -> Mesh:
 
 
 def loft(rings: np.ndarray, caps: bool = True) -> Mesh:
-    """A skin over closed rings [n, m, 3]."""
+    """Return a skin over closed rings [n, m, 3]."""
     closed = np.concatenate([rings, rings[:, :1]], 1)
     skin = surface(closed)
     return merge([skin, fan(rings[0]), fan(rings[-1][::-1])]) if caps else skin
 
 
 def revolve(profile: np.ndarray, segments: int = 48, axis: str = "z") -> Mesh:
-    """A profile [m, 2] of (radius, offset along the axis) turned about "z" or "y"; u runs around."""
+    """Return the surface of a profile [m, 2] (radius, offset along the axis) turned about "z" or "y"; u runs around."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     radius, offset = np.asarray(profile, np.float64).T
     a, b = np.cos(angle)[:, None] * radius, np.sin(angle)[:, None] * radius
@@ -135,12 +135,12 @@ def revolve(profile: np.ndarray, segments: int = 48, axis: str = "z") -> Mesh:
 
 
 def tube(path: Sequence[Sequence[float]], radius: float | Sequence[float], sides: int = 10) -> Mesh:
-    """A round tube along a polyline; one radius, or one per point."""
+    """Return a round tube along a polyline; one radius, or one per point."""
     p = np.asarray(path, np.float64)
     r = np.broadcast_to(np.asarray(radius, np.float64), (len(p),))
     tangent = np.gradient(p, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    helper = np.eye(3)[np.argmin(np.abs(tangent).max(0))]  # the axis that no part of the line is nearly parallel to
+    helper = np.eye(3)[np.argmin(np.abs(tangent).max(0))]  # the axis to which no part of the line is nearly parallel
     n = np.cross(tangent, helper)
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     b = np.cross(tangent, n)
@@ -150,7 +150,7 @@ def tube(path: Sequence[Sequence[float]], radius: float | Sequence[float], sides
 
 
 def disc(radius: float, height: float = 0.0, segments: int = 96) -> Mesh:
-    """A horizontal disc facing up; the image's inscribed circle lies on it, its top towards +Y."""
+    """Return a horizontal disc facing up; the image's inscribed circle lies on it, its top towards +Y."""
     a = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     ring = np.stack([radius * np.cos(a), radius * np.sin(a), np.full(segments, height)], 1)
     cap = fan(ring)
@@ -160,14 +160,14 @@ def disc(radius: float, height: float = 0.0, segments: int = 96) -> Mesh:
 
 
 def ellipsoid(radii: Sequence[float], center: Sequence[float] = (0, 0, 0), segments: int = 24) -> Mesh:
-    """An ellipsoid with radii (x, y, z)."""
+    """Return an ellipsoid with radii (x, y, z)."""
     theta = np.linspace(0, np.pi, segments // 2 + 1)
     ball = revolve(np.stack([np.sin(theta), np.cos(theta)], 1), segments)
     return ball.moved(translation(*center) @ scaling(*radii))
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Area-weighted normals [N, 3], shared by vertices at the same place so that texture seams do not show."""
+    """Return area-weighted normals [N, 3], shared by vertices at equal positions so that texture seams do not show."""
     corners = mesh.vertices[mesh.faces]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     _, same = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
@@ -202,8 +202,8 @@ class Atlas:
         rows = 3 * self.height + self.width
         return round(rows * self.texels_per_m), round(max(self.length, 2 * self.width) * self.texels_per_m)
 
-    def place(self, chart: str, p: np.ndarray) -> np.ndarray:
-        """Points [N, 3] on the body -> metres [N, 2] (right, down) in the texture; chart near|far|top|front|back."""
+    def project(self, chart: str, p: np.ndarray) -> np.ndarray:
+        """Map points [N, 3] on the body to texture metres [N, 2] (right, down); chart near|far|top|front|back."""
         x, y, z = np.asarray(p, np.float64).T
         across, h = self.length / 2, self.height
         if chart == "near":
@@ -217,10 +217,10 @@ class Atlas:
         return np.stack([1.5 * self.width - y, 3 * h + self.width - z], 1)
 
     def wrap(self, mesh: Mesh) -> Mesh:
-        """The mesh cut along chart borders, with uv into this atlas.
+        """Return the mesh cut along chart borders, with uv into this atlas.
 
         A vertex that several charts need is doubled; `vertex_normals` merges equal positions again, so the cuts do not
-        show in the shading. Each face goes to the chart it looks at, away from the middle of the body.
+        show in the shading. Each face goes to the chart that it faces, away from the middle of the body.
         """
         corners = mesh.vertices[mesh.faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -236,5 +236,5 @@ class Atlas:
             if len(faces):
                 used, compact = np.unique(faces, return_inverse=True)
                 points = mesh.vertices[used]
-                pieces.append(Mesh(points, compact.reshape(-1, 3), self.place(name, points) / size, mesh.smooth))
+                pieces.append(Mesh(points, compact.reshape(-1, 3), self.project(name, points) / size, mesh.smooth))
         return merge(pieces)

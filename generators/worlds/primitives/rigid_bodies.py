@@ -11,12 +11,12 @@ from spike4dgs.generators.worlds.primitives.meshes import Mesh
 
 STEP_S = 5e-5
 GRAVITY_M_S2 = 9.81
-SOFT_M = 1e-3  # what contacts may give way
+SOFT_M = 1e-3  # depth by which contacts may give way
 
 
 @dataclass(frozen=True)
 class Body:
-    """One body at the beginning.
+    """One body and its initial state.
 
     Attributes:
         shape: "box" (half sizes x, y, z), "sphere" (radius) or "cylinder" (radius, half height; axis z).
@@ -36,7 +36,7 @@ class Body:
     density: float = 700.0
 
     def flight(self, t_s: float) -> np.ndarray:
-        """Pose [4, 4] in free flight, `t_s` (also negative) from the beginning; the spin is taken as constant."""
+        """Return the pose [4, 4] in free flight at `t_s` (also negative) from the beginning, with constant spin."""
         angle = float(np.linalg.norm(self.spin)) * t_s
         axis = np.array(self.spin) / max(float(np.linalg.norm(self.spin)), 1e-12)
         turns = rotations(np.array([[np.cos(angle / 2), *(np.sin(angle / 2) * axis)], self.rotation]))
@@ -49,14 +49,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Block:
-    """Something that never moves, an upright box from corner `low` to corner `high`, metres."""
+    """A static obstacle: an upright box from corner `low` to corner `high`, metres."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     @classmethod
     def around(cls, mesh: Mesh) -> Block:
-        """The smallest block that holds a mesh."""
+        """Return the smallest block that holds a mesh."""
         return cls(tuple(mesh.vertices.min(0).tolist()), tuple(mesh.vertices.max(0).tolist()))
 
 
@@ -69,7 +69,7 @@ class Trajectory:
     quaternions: np.ndarray
 
     def at(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations [B, 3, 3] and positions [B, 3] at a time, linear between steps; clamped to the simulated span."""
+        """Return rotations [B, 3, 3] and positions [B, 3] at a time: linear between steps, clamped at both ends."""
         x = np.clip((t_s - self.start_s) / STEP_S, 0.0, len(self.positions) - 1.0)
         k = min(int(x), len(self.positions) - 2)
         f = x - k
@@ -79,13 +79,13 @@ class Trajectory:
         return rotations(q / np.linalg.norm(q, axis=1, keepdims=True)), position
 
     def vertices(self, t_s: float, local: np.ndarray, owner: np.ndarray) -> np.ndarray:
-        """World positions [N, 3] of points `local` [N, 3] in the coordinates of the bodies `owner` [N]."""
+        """Return world positions [N, 3] of points `local` [N, 3] in the coordinates of the bodies `owner` [N]."""
         turn, shift = self.at(t_s)
         return np.einsum("nij,nj->ni", turn[owner], local) + shift[owner]
 
 
 def rotations(q: np.ndarray) -> np.ndarray:
-    """Rotation matrices [B, 3, 3] of unit quaternions [B, 4] (w, x, y, z)."""
+    """Return the rotation matrices [B, 3, 3] of unit quaternions [B, 4] (w, x, y, z)."""
     w, x, y, z = q.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -98,10 +98,10 @@ def rotations(q: np.ndarray) -> np.ndarray:
 def simulate(
     bodies: Sequence[Body], start_s: float, end_s: float, friction: float = 0.5, blocks: Sequence[Block] = ()
 ) -> Trajectory:
-    """Let bodies move among `blocks` over a table at z = 0, under gravity. Equal arguments, equal bits.
+    """Simulate bodies among `blocks` over a table at z = 0, under gravity. Equal arguments give equal bits.
 
     Raises ValueError where bodies overlap at the beginning by more than SOFT_M (MuJoCo would shoot them apart), and
-    FloatingPointError where the motion is unstable (MuJoCo alone would start again without a word).
+    FloatingPointError where the motion is unstable (MuJoCo alone would restart silently).
     """
     import mujoco
 
@@ -127,7 +127,7 @@ def simulate(
 
 
 def owners(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
-    """Body of each vertex [N] and of each face [M] of the merged meshes, one mesh per body."""
+    """Return the body of each vertex [N] and of each face [M] of the merged meshes, one mesh per body."""
     numbers = range(len(meshes))
     vertex = [np.full(len(m.vertices), k) for k, m in zip(numbers, meshes, strict=True)]
     face = [np.full(len(m.faces), k) for k, m in zip(numbers, meshes, strict=True)]
@@ -135,7 +135,7 @@ def owners(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _xml(bodies: Sequence[Body], friction: float, blocks: Sequence[Block]) -> str:
-    """The model. A contact is a spring with `solref` = (1 / decay rate in s, damping ratio).
+    """Return MuJoCo's model. A contact is a spring with `solref` = (1 / decay rate in s, damping ratio).
 
     At 0.3 ms and 0.4 a body that hits at v m/s sinks in by about 0.1 v mm and leaves at a quarter of its speed.
     """

@@ -16,7 +16,7 @@ Colour = Sequence[float]
 
 
 def value_noise(shape: tuple[int, int], cell: float, rng: np.random.Generator) -> np.ndarray:
-    """Smoothed random lattice in 0..1, [H, W] float32, `cell` pixels per lattice step; repeats seamlessly."""
+    """Return a smoothed random lattice in 0..1, [H, W] float32, `cell` pixels per lattice step; repeats seamlessly."""
     height, width = shape
     rows, columns = max(round(height / cell), 1), max(round(width / cell), 1)
     lattice = rng.random((rows, columns), dtype=np.float32)
@@ -36,7 +36,7 @@ def value_noise(shape: tuple[int, int], cell: float, rng: np.random.Generator) -
 def fractal(
     shape: tuple[int, int], rng: np.random.Generator, coarse: float = 128, fine: float = 2, gain: float = 0.65
 ) -> np.ndarray:
-    """Sum of value noises from `coarse` down to `fine` pixels, each octave weaker by `gain`; spans 0..1."""
+    """Return the sum of value noises from `coarse` to `fine` pixels, each octave weaker by `gain`; spans 0..1."""
     total, weight, cell = np.zeros(shape, np.float32), 1.0, float(coarse)
     while cell >= fine:
         total += np.float32(weight) * value_noise(shape, cell, rng)
@@ -46,7 +46,7 @@ def fractal(
 
 
 def mix(amount: np.ndarray, low: Colour, high: Colour) -> np.ndarray:
-    """Colours [H, W, 3] between `low` (0) and `high` (1)."""
+    """Return the colours [H, W, 3] between `low` (0) and `high` (1)."""
     a, b = np.asarray(low, np.float32), np.asarray(high, np.float32)
     return a + (b - a) * amount[..., None]
 
@@ -55,7 +55,7 @@ def mix(amount: np.ndarray, low: Colour, high: Colour) -> np.ndarray:
 
 
 def asphalt(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """Road surface: worn patches, grain and single light and dark stones."""
+    """Return a road surface: worn patches, grain and single light and dark stones."""
     image = mix(fractal(shape, rng, 160, 4), (0.085, 0.085, 0.09), (0.19, 0.185, 0.18))
     grain = rng.random(shape, dtype=np.float32)
     image *= (0.75 + 0.5 * grain)[..., None]
@@ -75,7 +75,7 @@ def paving(
     spread: float = 0.28,
     gap: int = 1,
 ) -> np.ndarray:
-    """Stones or bricks in running bond; `stone` = (height, width) in pixels. Serves pavers, brick walls and tiles."""
+    """Return pavers, bricks or tiles in running bond; `stone` = (height, width) in pixels."""
     height, width = shape
     y, x = np.mgrid[:height, :width]
     row = y // stone[0]
@@ -87,7 +87,7 @@ def paving(
 
 
 def wood(shape: tuple[int, int], rng: np.random.Generator, planks: int = 6) -> np.ndarray:
-    """Planks along the image's rows with grain, knots and dark joints."""
+    """Return planks along the image's rows with grain, knots and dark joints."""
     height, width = shape
     plank = np.arange(height) * planks // height
     stretch = fractal((height, max(width // 8, 2)), rng, height / 4, 2)
@@ -104,7 +104,7 @@ def wood(shape: tuple[int, int], rng: np.random.Generator, planks: int = 6) -> n
 
 
 def cloth(shape: tuple[int, int], rng: np.random.Generator, colours: Sequence[Colour], stripe: int) -> np.ndarray:
-    """Vertical stripes of `stripe` pixels with a woven grain."""
+    """Return vertical stripes of `stripe` pixels with a woven grain."""
     index = np.arange(shape[1]) // stripe % len(colours)
     image = np.broadcast_to(np.asarray(colours, np.float32)[index], (*shape, 3))
     return image * (0.75 + 0.4 * fractal(shape, rng, 24, 2))[..., None]
@@ -115,7 +115,7 @@ def cloth(shape: tuple[int, int], rng: np.random.Generator, colours: Sequence[Co
 
 @lru_cache(maxsize=64)
 def _font(pixels: int) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans Bold as matplotlib ships it (found without importing matplotlib, which is slow)."""
+    """Return DejaVu Sans Bold as matplotlib ships it (found without the slow import of matplotlib)."""
     spec = importlib.util.find_spec("matplotlib")
     assert spec is not None and spec.submodule_search_locations, "matplotlib is a dependency of this package"
     folder = Path(next(iter(spec.submodule_search_locations))) / "mpl-data/fonts/ttf"
@@ -184,7 +184,7 @@ class Canvas:
         self._blend(lo, mask, colour, opacity)
 
     def _patch(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, Image.Image, ImageDraw.ImageDraw]:
-        """A fine drawing area over whole texels from `low` to `high`: its corner in texels, the mask, a pen."""
+        """Return a fine drawing area over whole texels from `low` to `high`: its corner in texels, the mask, a pen."""
         lo = np.floor(low).astype(int) - 1
         size = np.maximum(np.ceil(high).astype(int) + 2 - lo, 1)
         mask = Image.new("L", (int(size[0]) * self.FINE, int(size[1]) * self.FINE), 0)
@@ -204,5 +204,5 @@ class Canvas:
 
 
 def plain(shape: tuple[int, int], colour: Colour) -> np.ndarray:
-    """One colour."""
+    """Return an image of one colour."""
     return np.broadcast_to(np.asarray(colour, np.float32), (*shape, 3)).copy()

@@ -1,9 +1,7 @@
-"""Capture: what the cameras sent is what the clip holds, in its place, whatever goes wrong on the way."""
+"""Capture: the clip holds the frames that the cameras sent, at their ticks, also after faults."""
 
 from __future__ import annotations
 
-import itertools
-import math
 import threading
 import time
 from collections.abc import Mapping
@@ -11,19 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_camera import HEIGHT, WIDTH, FakeCamera, frames_of, layout_of, rig, rig_of
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from fake_camera import FakeCamera, frames_of, layout_of, rig, rig_of
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.capture import STATES, capture
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, Clip
 from spike4dgs.generators.recorder.frames.cutting import agree
 from spike4dgs.generators.recorder.frames.layouts import COUNTER, UInt8
-from spike4dgs.generators.recorder.frames.ring import Block, Ring
 from spike4dgs.generators.recorder.profile.profile import RigProfile
-from spike4dgs.generators.recorder.rates import Rate, spikes_per_tick
-from spike4dgs.generators.recorder.usb.reader import Idle
+from spike4dgs.generators.recorder.rates import Rate
 from spike4dgs.generators.recorder.usb.reads import OVERFLOW, SHORT, STALL, TIME_OUT, UNPLUGGED
 
 N = 200  # ticks of most clips
@@ -41,7 +35,7 @@ def by_name(clip: Clip) -> dict[str, CameraClip]:
 
 
 def check_frames(camera: CameraClip, frames: UInt8, n_ticks: int) -> None:
-    """Every frame is the source's at its tick, and gaps are exactly the other ticks."""
+    """Check that every frame is the source's at its tick, and that gaps are exactly the other ticks."""
     np.testing.assert_array_equal(camera.frames, frames[camera.ticks])
     absent = [t for g in camera.gaps for t in range(g.first_tick, g.stop_tick)]
     assert sorted([*camera.ticks.tolist(), *absent]) == list(range(n_ticks))
@@ -49,7 +43,7 @@ def check_frames(camera: CameraClip, frames: UInt8, n_ticks: int) -> None:
 
 
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
-def test_a_clip_is_what_the_cameras_sent(layout: str) -> None:
+def test_a_clip_holds_the_frames_that_the_cameras_sent(layout: str) -> None:
     profile, frames, links = make(3, layout)
     states: list[str] = []
     clip = capture(profile, links, SECONDS, on_state=states.append)
@@ -123,7 +117,7 @@ def test_a_camera_that_falls_silent_is_given_up_after_the_time_limit() -> None:
 @pytest.mark.parametrize(
     ("layout", "offset", "lost"), [("plain", 0, 0), ("plain", 13, 140), ("tagged-rows", 13, 0), ("tagged-rows", 0, 0)]
 )
-def test_a_short_read_ends_a_stream_only_where_nothing_tells_what_follows(layout: str, offset: int, lost: int) -> None:
+def test_a_short_read_ends_a_stream_only_where_no_tag_locates_the_rest(layout: str, offset: int, lost: int) -> None:
     profile, frames, links = make(2, layout)
     links["cam_00"].faults = {60 * layout_of(profile).frame_bytes + offset: SHORT}
     camera = by_name(capture(profile, links, SECONDS))["cam_00"]
@@ -176,7 +170,7 @@ def test_a_slow_consumer_costs_ticks_and_shifts_none(layout: str) -> None:
     assert first + len(raw) > camera.gaps[0].stop_tick, "later ticks have been kept"
 
 
-def test_an_interruption_keeps_what_every_camera_has() -> None:
+def test_an_interruption_keeps_the_ticks_that_every_camera_has() -> None:
     profile, frames, links = make(3, timeout_ms=60_000)
     links["cam_00"].stream, links["cam_01"].stream = frames[0][:150].reshape(-1), frames[1][:160].reshape(-1)
     links["cam_02"].faults = {30 * 20: UNPLUGGED}
@@ -228,7 +222,7 @@ def test_an_interruption_before_the_first_tick_is_an_error() -> None:
         capture(profile, links, SECONDS, stop=stop)
 
 
-def test_what_the_sink_raises_ends_the_capture() -> None:
+def test_an_error_of_the_sink_ends_the_capture() -> None:
     profile, _, links = make(2)
 
     def sink(camera: str, first_tick: int, raw: UInt8) -> None:
@@ -253,9 +247,9 @@ def test_cameras_that_cannot_be_stopped_go_on_from_the_rehearsal(layout: str) ->
         first = int(np.nonzero((source == camera.frames[0]).all(axis=1))[0][0])
         np.testing.assert_array_equal(camera.frames, source[first : first + N])
         starts.add(first)
-    assert min(starts) > 0, "what came before the trigger is dropped"
+    assert min(starts) > 0, "frames before the trigger are dropped"
     if layout == "tagged-rows":
-        assert len(starts) == 1, "the counters say which frames belong together"
+        assert len(starts) == 1, "the counters determine which frames belong together"
 
 
 def test_arrival_is_the_tick_that_was_complete_when_a_read_ended() -> None:
@@ -264,67 +258,3 @@ def test_arrival_is_the_tick_that_was_complete_when_a_read_ended() -> None:
     expected = [1024 * (i + 1) // 30 for i in range(len(camera.arrival))]
     assert camera.arrival[:, 0].tolist() == expected
     assert (np.diff(camera.arrival[:, 1]) >= 0).all()
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(1, 6), st.lists(st.sampled_from(["take", "put", "pop", "discard"]), max_size=60))
-def test_a_ring_never_overwrites_what_waits(slots: int, steps: list[str]) -> None:
-    ring, flying, waiting, number, position, popped = Ring(slots, 8), [], [], itertools.count(1), 0, False
-    kept = False
-    for step in steps:
-        if step == "take":
-            flying.append(ring.take())
-        elif step in ("put", "discard") and flying:
-            keep = kept = kept or step == "put"
-            n = next(number)
-            flying.pop(0)[:] = n % 256
-            block = ring.put(n % 9, n, keep)
-            assert (block.position, block.bytes) == (position, n % 9)
-            position += n % 9
-            if keep:
-                waiting.append((block, n))
-        elif step == "pop":
-            block = ring.pop()
-            popped = False
-            if waiting:
-                expected, n = waiting.pop(0)
-                popped = expected.data is not None
-                assert block is expected
-                assert block.data is None or (block.data == n % 256).all()
-            else:
-                assert block is None
-        for block, n in waiting:
-            assert block.data is None or (block.data == n % 256).all()
-        held = sum(b.data is not None for b, _ in waiting)
-        assert ring.waiting == held and held + popped <= slots
-    assert ring.position == position
-
-
-def test_an_empty_queue_is_timed_from_the_newest_end() -> None:
-    idle = Idle()
-    for t in (0, 1, 2):
-        idle.submitted(t, False, True)
-    idle.ended(100)
-    idle.submitted(130, True, True)  # the other two have ended as well, and are told about later
-    idle.ended(101)
-    idle.submitted(131, False, True)
-    assert idle.starved == 0
-    idle.ended(110)
-    assert (idle.starved, idle.total_ns, idle.worst_ns) == (1, 20, 20)
-    alone = Idle()
-    for at, end in ((0, 10), (14, 20), (22, 30)):
-        alone.submitted(at, at > 0, True)
-        alone.ended(end)
-    assert (alone.starved, alone.total_ns, alone.worst_ns, alone.reads) == (2, 6, 4, 3)
-
-
-@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
-def test_spike_rates_are_counted_in_whole_frames(layout: str) -> None:
-    shape = layout_of(rig(1, layout))
-    pixels = np.zeros((8, shape.payload_bytes), np.uint8)
-    pixels[:, 0] = 0b1011
-    stream = shape.pack(pixels).reshape(-1)
-    block = Block(stream[11:], 11, len(stream) - 11, 0)
-    assert spikes_per_tick(shape, block) == 3 / (WIDTH * HEIGHT)
-    assert math.isnan(spikes_per_tick(shape, Block(stream[11:30], 11, 19, 0)))
-    assert math.isnan(spikes_per_tick(shape, None))

@@ -1,4 +1,4 @@
-"""What is checked before a capture, and how a device is opened: every refusal says what to do."""
+"""Checks before a capture, and opening a device: every refusal states a fix."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ARRAY = rig(9, transfer_bytes=262144, transfers=16)
 
 
 def device(serial: Any, speed: int | None = 4, address: int = 1) -> Any:
-    """What `find_cameras` looks at; a serial that is an exception is raised."""
+    """Return a device for `find_cameras`; a serial that is an exception is raised."""
 
     class Device(SimpleNamespace):
         @property
@@ -77,7 +77,7 @@ def test_an_array_that_is_not_complete_is_refused(
         checks.find_cameras(rig(3))
 
 
-def test_a_machine_without_libusb_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_libusb_gets_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(**_: Any) -> list[Any]:
         raise usb.core.NoBackendError("No backend available")
 
@@ -120,7 +120,7 @@ def test_disk_space(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert "0.1 GB of free disk space, found 0.1 GB; free some space" in found
 
 
-def test_a_ring_is_more_than_what_is_in_flight() -> None:
+def test_a_ring_is_larger_than_the_reads_in_flight() -> None:
     assert checks.check_ring(replace(ARRAY, ring_seconds=30.0)) is None
     found = str(checks.check_ring(ARRAY))  # 0.5 s of 600 kB/s
     assert found.startswith("rig test: expected ring_seconds of 14 or more") and "raise ring_seconds" in found
@@ -201,7 +201,7 @@ def test_a_single_read_ends_as_pyusb_says(answer: Any, n: int, status: str) -> N
     assert into[:n].tobytes() == (answer if n else b"") and reads.in_flight == 0
 
 
-def test_bytes_that_came_before_a_time_out_are_good() -> None:
+def test_bytes_before_a_time_out_are_good() -> None:
     reads = SingleReads(Bus(b"abc"), 0x82, 8, 0)
     reads.submit(np.zeros(8, np.uint8))
     done = reads.wait(0)
@@ -214,14 +214,14 @@ def test_a_link_starts_stops_and_drains_its_camera(monkeypatch: pytest.MonkeyPat
     link = opened(monkeypatch, bus, start=(b"a", b"b"), stop=(b"refused",))
     assert bus.claimed == [0, 3] and not link.queued and link.restartable and link.serial == "S0"
     link.start()
-    link.stop()  # a camera that does not take it is left
+    link.stop()  # a camera that refuses it is left as it is
     assert bus.written == [(0x02, b"a"), (0x02, b"b"), (0x02, b"refused")]
     assert link.drain() == 1324
     link.close()
     assert not bus.claimed
 
 
-def test_a_start_sequence_that_is_refused_says_where_to_look(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_start_sequence_names_the_keys_to_check(monkeypatch: pytest.MonkeyPatch) -> None:
     link = opened(monkeypatch, Bus(), start=(b"refused",))
     with pytest.raises(UserError, match=r"camera cam_00 \(serial S0\): .* Pipe error while it was started; check"):
         link.start()

@@ -1,6 +1,6 @@
-"""Ten thousand hostile cases: frame tags, torn and lost blocks, profiles. Nothing but documented errors, no wrong tick.
+"""Ten thousand hostile cases: frame tags, torn and lost blocks, profiles. Only documented errors, no wrong tick.
 
-Hypothesis draws seeds, and each stands for a batch of cases; a failure names the seed and the case.
+Each seed from Hypothesis is a batch of cases; a failure names the seed and the case.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def test_frames_are_known_by_their_tags_and_one_wrong_tag_is_enough(seed: int) -
 
 @dataclass
 class Sent:
-    """What a camera sent: its frames, how they came, and which of them came in one piece."""
+    """The data of a camera: its frames, the events by which they arrive, and which of them arrive in one piece."""
 
     frames: np.ndarray  # [n, frame_bytes]
     first_count: int
@@ -70,18 +70,18 @@ class Sent:
 
 
 def camera_stream(rng: np.random.Generator, layout: Layout) -> Sent:
-    """Frames with a few faults: bytes known to be dropped, bytes lost with and without a word, noise, repeats.
+    """Return frames with a few faults: bytes known to be dropped, bytes lost with and without a report, noise, repeats.
 
-    `plain` has no silent faults, which nothing could tell, and `line-tagged` one, which is no whole number of frames.
+    `plain` has no silent faults, which it cannot detect, and `line-tagged` one, which is not a whole number of frames.
     """
     n, size = int(rng.integers(1, 14)), layout.frame_bytes
     first = int(rng.choice([0, 2**32 - 4, int(rng.integers(2**32))]))
     payload = rng.integers(0, 256, (n, layout.payload_bytes), dtype=np.uint8)
-    if layout.name == "tagged-rows" and rng.random() < 0.5:  # in the dark nothing but the tags tells frames apart
+    if layout.name == "tagged-rows" and rng.random() < 0.5:  # in the dark frames differ only in their tags
         payload[:] = 0
     sent = Sent(layout.pack(payload, first), first)
     data = sent.frames.ravel()
-    # Sometimes the computer comes in the middle of a frame.
+    # Sometimes reading begins in the middle of a frame.
     at = piece = int(rng.integers(size)) if layout.has_tags() and rng.random() < 0.3 else 0
     silent = {"plain": 0, "line-tagged": 1, "tagged-rows": 3}[layout.name]
     for cut in np.sort(rng.integers(at, data.size + 1, rng.integers(0, 5))).tolist():
@@ -111,7 +111,7 @@ def camera_stream(rng: np.random.Generator, layout: Layout) -> Sent:
 
 
 def replay(counter: TickCounter, sent: Sent, rng: np.random.Generator) -> list[Run]:
-    """Give a counter what the camera sent, cut at random."""
+    """Feed a counter with the camera's data, cut at random."""
     runs: list[Run] = []
     for kind, what in sent.events:
         if kind == "skip":
@@ -125,7 +125,7 @@ def replay(counter: TickCounter, sent: Sent, rng: np.random.Generator) -> list[R
 
 
 def check(layout: Layout, sent: Sent, rng: np.random.Generator) -> None:
-    """Every frame that comes out has its own tick, every tick is a frame's or a gap's, and what came whole is there."""
+    """Check that each frame has its own tick, each tick is in a frame or a gap, and whole frames are kept."""
     origin, lead = None, 0
     if layout.count_tags() and rng.random() < 0.5:
         lead = int(rng.integers(-3, 4))
@@ -133,7 +133,7 @@ def check(layout: Layout, sent: Sent, rng: np.random.Generator) -> None:
     counter = TickCounter(layout, "cam_00", origin)
     known = {"plain": 0, "tagged-rows": layout.width // 4 + 2, "line-tagged": layout.width // 16 + 2}[layout.name]
     runs, ticks = replay(counter, sent, rng), list[int]()
-    # Before the first tag that no dark image imitates nothing vouches for the pixels.
+    # Pixels before the first tag that no dark image imitates are not protected.
     if runs and layout.has_tags() and origin is None:  # the first whole frame is tick 0
         lead = int(np.nonzero((sent.frames[:, known:] == runs[0].frames[0, known:]).all(axis=1))[0][0])
         assert runs[0].first_tick == 0 and lead <= min(sent.whole, default=lead)
@@ -179,7 +179,7 @@ stop=["00"] endpoint_out=1 id="a" serial="1" a.b=1 fx=1 rotation=[[1,0,0],[0,1,0
 
 
 def mutated(text: str, rng: np.random.Generator) -> bytes:
-    """A profile with some lines and values changed, and now and then a byte."""
+    """Return a profile with some lines and values changed, and sometimes a byte."""
     lines = text.splitlines()
     for _ in range(rng.integers(1, 5)):
         i = int(rng.integers(len(lines)))
@@ -225,11 +225,11 @@ def test_a_profile_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
                 check_profile(profile)
 
     batch()
-    assert PROFILE_CASES / 50 < read < PROFILE_CASES / 2  # the mutations neither spare nor spoil everything
+    assert PROFILE_CASES / 50 < read < PROFILE_CASES / 2  # the mutations spoil some profiles, not all
 
 
 def check_profile(profile: RigProfile) -> None:
-    """What the recorder relies on."""
+    """Check the facts that the recorder relies on."""
     layout = make_layout(profile.layout, profile.width, profile.height)
     assert len({c.serial for c in profile.cameras}) == len({c.id for c in profile.cameras}) == len(profile.cameras) > 0
     assert [c.role for c in profile.cameras].count("primary") == 1

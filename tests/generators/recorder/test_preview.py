@@ -1,4 +1,4 @@
-"""What a capture shows: rates while it runs, and a sheet of images after it."""
+"""Display of a capture: rates while it runs, and a sheet of images after it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_image_is_the_mean_of_the_window_nearest_the_middle_without_a_gap():
     assert middle_image(stream(n_ticks=20))[0] == 0
 
 
-def test_the_sheet_has_a_image_of_each_camera_but_of_those_without_data(tmp_path):
+def test_the_sheet_has_an_image_of_each_camera_with_data(tmp_path):
     lost = Gap("cam_02", 0, 400, "unplugged")
     streams = {"cam_02": stream(gaps=[lost]), "cam_00": stream(), "cam_01": stream(seed=1)}
     write_sheet(tmp_path / "sheet.png", streams)

@@ -151,7 +151,7 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut("1024", "1000"), "transfer.bytes", "expected a multiple of 1024 bytes, 64 MiB at most, found 1000"),
         (cut("in_flight = 2", "in_flight = 0"), "transfer.in_flight", "whole number from 1 to 256, found 0"),
         (cut("in_flight = 2", "depth = 2"), "transfer.depth", "in_flight"),
-        (cut("[defaults]", "[defaults]\nserial = 'A1'"), "defaults.serial", "each has of its own"),
+        (cut("[defaults]", "[defaults]\nserial = 'A1'"), "defaults.serial", "a key of each camera"),
         (cut("endpoint_in = 0x82"), "camera[0].endpoint_in", "found no such key"),
         (cut("0x82", "0x02"), "camera[0].endpoint_in", "whole number from 129 to 143, found 2"),
         (cut("0x82", '0x82\nstart = ["00"]'), "camera[0].endpoint_out", "for the start and stop sequences"),
@@ -203,7 +203,7 @@ def test_files_that_are_no_profiles(tmp_path: Path) -> None:
         load_profile(tmp_path)
 
 
-def test_maps_are_checked_before_anything_is_recorded(tmp_path: Path) -> None:
+def test_maps_are_checked_before_a_recording(tmp_path: Path) -> None:
     rig = save(tmp_path, RIG + 'maps = "right.npz"')
     with pytest.raises(UserError, match=r"right\.npz: expected an .npz of the maps gain and dark, 40x24.*no such file"):
         load_profile(rig)

@@ -1,4 +1,4 @@
-"""`record`, the whole way: an emulated array through pyusb into a scene folder that every other command reads."""
+"""`record`, end to end: an emulated array through pyusb into a scene folder that every other command reads."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def record(*arguments):
 
 
 def faulty(monkeypatch, *faults, **options):
-    """Emulated arrays fail so."""
+    """Make emulated arrays fail with these faults."""
     monkeypatch.setattr(sources, "EmulatedArray", lambda p, s: EmulatedArray(p, s, faults=faults, **options))
 
 
@@ -104,14 +104,14 @@ def test_a_camera_that_loses_data_gives_exit_code_3_and_a_gap(scene, tmp_path, m
     assert not capture.stream("cam_01").packed[30:].any()
 
 
-def test_cameras_that_are_not_there_are_an_error_and_leave_nothing(scene, tmp_path, monkeypatch, capsys):
+def test_missing_cameras_are_an_error_and_leave_no_files(scene, tmp_path, monkeypatch, capsys):
     faulty(monkeypatch, Fault("cam_02", "missing"))
     assert record("--emulate", scene, "--out", tmp_path / "x") == 2
     assert "cam_02" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
 
 
-def test_ctrl_c_keeps_what_was_captured(scene, tmp_path, monkeypatch, capsys):
+def test_ctrl_c_keeps_the_captured_ticks(scene, tmp_path, monkeypatch, capsys):
     class Impatient(command.Watch):
         def rates(self, rates):
             if min(r.ticks for r in rates.values()) > 100:
@@ -124,7 +124,7 @@ def test_ctrl_c_keeps_what_was_captured(scene, tmp_path, monkeypatch, capsys):
     capture, source = open_scene(tmp_path / "x"), open_scene(scene)
     assert 80 < capture.n_ticks < 100_000
     assert "ended early" in capsys.readouterr().out
-    ticks = np.arange(capture.n_ticks) % 80  # an emulated camera begins anew after its last tick
+    ticks = np.arange(capture.n_ticks) % 80  # an emulated camera repeats its stream after the last tick
     for camera in source.cameras:
         np.testing.assert_array_equal(capture.stream(camera).packed, source.stream(camera).packed[ticks])
 
@@ -135,14 +135,14 @@ def test_only_the_third_ctrl_c_breaks_off_the_writing():
         signal.raise_signal(signal.SIGINT)
         assert stop.is_set()
         signal.raise_signal(signal.SIGINT)
-        pytest.fail("the third one went unheard")
+        pytest.fail("the third one had no effect")
 
 
 # ------------------------------------------------------------ light and darkness
 
 
 def rig_of(scene, folder: Path) -> Path:
-    """A profile of the scene's cameras, as somebody would write it who owns them."""
+    """Write a profile of the scene's cameras, as an owner of them would write it."""
     cameras = open_scene(scene).cameras
     folder.mkdir()
     (folder / "calibration.toml").write_text(calibration_toml(cameras.values()))
@@ -173,7 +173,7 @@ def test_flat_and_dark_recordings_go_into_a_clip_and_feed_calibrate(scene, tmp_p
     light = ("--flat", tmp_path / "flat", "--dark", tmp_path / "dark", "--flat-radiance", "0.7")
     assert record(rig, "--emulate", scene, "--out", tmp_path / "clip", *light) == 0
     same_streams(open_scene(tmp_path / "clip"), source)
-    assert not open_scene(tmp_path / "clip").targets  # what a rig of one's own sees has no truth
+    assert not open_scene(tmp_path / "clip").targets  # a recording of a real rig has no truth
     for name, folder in (("theirs", scene), ("ours", tmp_path / "clip")):
         assert main(["calibrate", str(folder), "--out", str(tmp_path / name)]) == 0
     for camera in source.cameras:
@@ -197,7 +197,7 @@ def test_light_that_does_not_fit_is_refused(scene, tmp_path):
 # ------------------------------------------------------------ arguments
 
 
-def test_wrong_arguments_say_what_to_do(scene, small_scene, tmp_path, capsys):
+def test_wrong_arguments_give_a_fix(scene, small_scene, tmp_path, capsys):
     out = ("--out", tmp_path / "x")
     for arguments, message in (
         ((), "--emulate SCENE"),
@@ -212,7 +212,7 @@ def test_wrong_arguments_say_what_to_do(scene, small_scene, tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
-def test_everything_that_the_machine_lacks_is_said_at_once(scene, tmp_path, monkeypatch, capsys):
+def test_all_that_the_machine_lacks_is_reported_at_once(scene, tmp_path, monkeypatch, capsys):
     lacks = [problem("disk", "room", "none", "free some"), problem("memory", "more", "less", "buy some")]
     monkeypatch.setattr(command, "check_machine", lambda *a, **k: lacks)
     assert record("--emulate", scene, "--out", tmp_path / "x") == 2

@@ -1,4 +1,4 @@
-"""`speed record`: what it says of a capture is what happened, and a disk that falls behind is not called enough."""
+"""`speed record`: its figures are true, and a disk that falls behind is not called sufficient."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def test_a_recording_to_disk_is_read_again(tmp_path: Path, monkeypatch: pytest.M
 
 
 def outcome(backlog: list[float], **changes: Any) -> Outcome:
-    """Of four seconds of one camera, whose backlog in bytes was looked at now and then."""
+    """Return the outcome of four seconds of one camera, with samples of its backlog in bytes."""
     clip: Any = SimpleNamespace(n_ticks=80_000, complete=True, cameras=[])
     at = np.linspace(0.0, 4.0, len(backlog))
     made = Outcome(clip, 4.0, 0, 0, 0.01, np.stack([at, np.array(backlog)], axis=1), 0.5, 0.2, True)
     return replace(made, **changes)
 
 
-def test_what_is_called_enough_keeps_up_to_the_end() -> None:
+def test_a_sustained_recording_keeps_up_to_the_end() -> None:
     load = Load(1, 20_000, 1 << 20, 16, 65536)
     assert load.bytes_per_s == 20_000 * FRAME_BYTES and load.buffer_s == pytest.approx(0.5 + 16 * 1.048576 / 250)
     steady = outcome([0, 80e6, *(20e6 + 3e6 * (i % 2) for i in range(20))])
     assert not_sustained(load, steady) is None
     assert growth(outcome([0, 0, 0, 0, 10e6, 20e6, 30e6, 40e6])) == pytest.approx(10e6 / (4.0 / 7))
-    filling = outcome([0, *(6e6 * i for i in range(20))])  # of which the buffers lose nothing in four seconds
+    filling = outcome([0, *(6e6 * i for i in range(20))])  # of which the buffers lose no byte in four seconds
     assert str(not_sustained(load, filling)).startswith("the backlog grows by 30 MB/s")
     lost: Any = SimpleNamespace(
         n_ticks=80_000, complete=False, cameras=[SimpleNamespace(stats=SimpleNamespace(lost_ticks=7))]
@@ -87,5 +87,5 @@ def test_the_command_writes_both_tables(tmp_path: Path, capsys: pytest.CaptureFi
     lines = list(csv.reader((tmp_path / "t-disk.csv").read_text().splitlines()))
     assert lines[0] == list(DISK_COLUMNS) and [line[0] for line in lines[1:]] == ["1"]
     shown = capsys.readouterr().out
-    assert "this machine sustains 0 cameras to disk; 1: 0.05 s are too short beside buffers of 3.86 s" in shown
+    assert "this machine sustains 0 cameras to disk; 1: 0.05 s are too short for buffers of 3.86 s" in shown
     assert sorted(p.name for p in tmp_path.iterdir()) == ["t-disk.csv", "t.csv"]

@@ -17,7 +17,7 @@ STATS = CameraStats(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, True, "ok")
 
 
 def arrivals(ppm: float, offset_us: float, late_us: NDArray[np.float64]) -> NDArray[np.int64]:
-    """A read for every 20 ticks, each late by `late_us` [m]."""
+    """Return a read for every 20 ticks, each late by `late_us` [m]."""
     ticks = 20 * (1 + np.arange(len(late_us)))
     ns = 7e15 + ticks * 50e3 * (1 + ppm * 1e-6) + (offset_us + late_us) * 1e3
     return np.stack([ticks, np.round(ns).astype(np.int64)], axis=1)
@@ -41,7 +41,7 @@ def test_clocks_are_found_exactly_where_nothing_is_late() -> None:
     assert a.residual_us < 0.01 and a.reads == 500 and not b.suspect
 
 
-def test_late_reads_hardly_move_the_fit_and_are_told() -> None:
+def test_late_reads_hardly_move_the_fit_and_are_reported() -> None:
     rng = np.random.default_rng(0)
     late = rng.exponential(40.0, 500)
     late[rng.choice(500, 100, replace=False)] += rng.exponential(20_000.0, 100)  # a fifth of them very late

@@ -1,4 +1,4 @@
-"""The recorder on libusb itself: real queued transfers, on devices that libumockdev puts in the place of the kernel's.
+"""The recorder on libusb itself: real queued transfers, on devices that libumockdev substitutes for the kernel's.
 
 /dev and /sys are mocked for a whole process, so that the cases, which `usb_cases.py` holds, run in one of their own.
 """
@@ -17,7 +17,7 @@ from usb_testbed import LIBRARIES, PRELOAD
 
 CASES = sorted(name for name in vars(usb_cases) if name.startswith("test_"))
 
-_TIME_LIMIT_S = 1800  # for a machine that has other things to do
+_TIME_LIMIT_S = 1800  # for a busy machine
 
 
 def _environment() -> dict[str, str]:
@@ -26,7 +26,7 @@ def _environment() -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
-    """Name of a case -> what went wrong in each of its runs, "" where nothing did."""
+    """Name of a case -> the failure of each of its runs, "" where it passed."""
     load = f"import ctypes\nfor name in {LIBRARIES}: ctypes.CDLL(name)"
     loaded = subprocess.run([sys.executable, "-c", load], env=_environment(), capture_output=True, text=True)
     if loaded.returncode:

@@ -1,4 +1,4 @@
-"""The store of key frames: what goes in comes out, whole or not at all, and dense in time."""
+"""The store of key frames: arrays return unchanged, files are whole or absent, views are dense in time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
-from spike4dgs.generators.rendering.render import Still
+from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.sensor.reference import tick_means
 
 SHAPE = (2, 9, 13)
@@ -17,7 +17,7 @@ PLAN = KeyPlan(n_ticks=19, rate_hz=20_000, max_px=0.5, chain=(10, 5))
 
 
 def sparse(given: np.ndarray, images: np.ndarray, kind: str = "") -> dict[str, np.ndarray]:
-    """What the renderer gives of images [2, 9, 13]."""
+    """Return the arrays that the renderer gives for images [2, 9, 13]."""
     arrays = {}
     for v, (mask, image) in enumerate(zip(given, images, strict=True)):
         arrays |= {f"{kind}given{v}": np.packbits(mask), f"{kind}values{v}": image[mask]}
@@ -25,32 +25,32 @@ def sparse(given: np.ndarray, images: np.ndarray, kind: str = "") -> dict[str, n
 
 
 def make_images(seed=0, n=5):
-    """What stands still, n random images, and which of their pixels are given at fine ticks."""
+    """Return static views, n random images, and which of their pixels are given at fine ticks."""
     rng = np.random.default_rng(seed)
-    still = Still(*rng.random((2, *SHAPE, 3), dtype=np.float32))
-    images = np.repeat(gray(still.background)[None], n, 0)
+    static = StaticViews(*rng.random((2, *SHAPE, 3), dtype=np.float32))
+    images = np.repeat(gray(static.background)[None], n, 0)
     images[1:, :, 2:5, 3:7] = rng.random((n - 1, 2, 3, 4), dtype=np.float32)
     fast = np.zeros(SHAPE, bool)
     fast[:, 3, 4:6] = True
-    return still, images, fast
+    return static, images, fast
 
 
 @pytest.fixture
 def store(tmp_path):
-    still, images, fast = make_images()
+    static, images, fast = make_images()
     store = KeyStore(tmp_path / "keys")
-    store.set_still(still)
+    store.set_static(static)
     for tick, image in zip(PLAN.ticks, images, strict=True):
-        store.put(tick, sparse(fast if PLAN.level(tick) else image != gray(still.background), image))
+        store.put(tick, sparse(fast if PLAN.level(tick) else image != gray(static.background), image))
     return store
 
 
 def test_coarse_keys_come_back_bit_for_bit(store):
-    still, images, _ = make_images()
+    static, images, _ = make_images()
     again = KeyStore(store.folder)
-    assert again.has_still and again.missing(PLAN) == []
-    assert np.array_equal(again.still().background, still.background) and np.array_equal(
-        again.still().first, still.first
+    assert again.has_static and again.missing(PLAN) == []
+    assert np.array_equal(again.static().background, static.background) and np.array_equal(
+        again.static().first, static.first
     )
     for view in range(2):
         clip = again.view(view, PLAN)
@@ -90,7 +90,7 @@ def test_means_are_those_of_the_curve_except_where_they_are_given(tmp_path):
         rng.random((4, *SHAPE), dtype=np.float32),
     )
     fast = rng.random(SHAPE) < 0.3
-    store.set_still(Still(*np.repeat(images[0][None, ..., None], 2, 0).repeat(3, -1)))
+    store.set_static(StaticViews(*np.repeat(images[0][None, ..., None], 2, 0).repeat(3, -1)))
     for tick in range(5):
         given = sparse(np.ones(SHAPE, bool), images[tick])
         store.put(tick, given | (sparse(fast, means[tick], "mean_") if tick < 4 else {}))
@@ -114,16 +114,16 @@ def test_missing_keys_are_those_without_a_file(store):
 
 
 def test_equal_keys_give_equal_bytes(store, tmp_path):
-    still, images, _ = make_images()
+    static, images, _ = make_images()
     other = KeyStore(tmp_path / "other")
-    other.set_still(still)
-    other.put(10, sparse(images[2] != gray(still.background), images[2]))
+    other.set_static(static)
+    other.put(10, sparse(images[2] != gray(static.background), images[2]))
     for name in ("000010.npz", "still.npz"):
         assert (other.folder / name).read_bytes() == (store.folder / name).read_bytes()
 
 
 def test_damage_and_bad_images_are_named(store):
-    still, images, fast = make_images()
+    static, images, fast = make_images()
     with pytest.raises(UserError, match="000099.npz: expected a key frame, found no such file"):
         store.given(99, 0)
     path = store.folder / "000010.npz"
@@ -141,4 +141,4 @@ def test_damage_and_bad_images_are_named(store):
     with pytest.raises(UserError, match="finite radiance"):
         store.put(20, sparse(fast, images[0] * np.float32(np.nan)))
     with pytest.raises(UserError, match="finite radiance"):
-        store.set_still(Still(still.background * np.float32(np.inf), still.first))
+        store.set_static(StaticViews(static.background * np.float32(np.inf), static.first))

@@ -1,4 +1,4 @@
-"""Which Mitsuba variant is used, and that the scalar one gives the same images."""
+"""The choice of the Mitsuba variant, and equal images by the scalar one."""
 
 from __future__ import annotations
 

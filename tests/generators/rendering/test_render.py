@@ -1,4 +1,4 @@
-"""Key frames: what is traced, what is reused, and how far both are from a plain full rendering."""
+"""Key frames: traced and reused pixels, and the error of both against a plain full rendering."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def world(name: str) -> WorldScene:
 
 @pytest.fixture(scope="module", params=NAMES)
 def r(request) -> Iterator[MultiViewRenderer]:
-    """One renderer at a time for all tests of a world: LLVM compiles for all scenes in memory anew."""
+    """One renderer at a time for all tests of a world: LLVM recompiles for all scenes in memory."""
     rig = cameras(world(request.param), WIDTH, HEIGHT, (1, 4))
     yield MultiViewRenderer(world(request.param), rig, seed=0, spp=SPP, background_spp=256)
     gc.collect()
@@ -50,7 +50,7 @@ def truth(r) -> np.ndarray:
 def test_keys_are_the_full_rendering_inside_and_the_background_outside(r):
     key, traced, changed, mask = r.keys(T_S), r.traced(T_S), r.changed(T_S), r.object_masks(T_S)
     assert 0.02 < traced.mean() < 0.6 and (traced <= changed).all() and not changed.all()
-    full, (background, same_numbers) = r.crn_frames(T_S), (gray_of(a) for a in r.still.arrays().values())
+    full, (background, same_numbers) = r.crn_frames(T_S), (gray_of(a) for a in r.static.arrays().values())
     assert np.array_equal(key[mask], full[mask])
     shadow = traced & ~mask  # the background and the difference that the shadow makes, from the same random numbers
     assert np.array_equal(key[shadow], np.maximum(full + (background - same_numbers), 0)[shadow])
@@ -64,22 +64,22 @@ def test_keys_are_close_to_mitsubas_own_rendering(r, truth):
     assert np.abs(error).mean() < NOISE[r.world.name]
     assert abs(error.mean()) < 0.002
     smooth, plain = (gaussian_filter(e, (0, 2, 2))[~traced] for e in (error, r.background - truth))
-    assert np.abs(smooth).mean() < 0.8 * np.abs(plain).mean()  # relighting removes what is above the noise
+    assert np.abs(smooth).mean() < 0.8 * np.abs(plain).mean()  # relighting removes the error above the noise
     assert np.abs(smooth).max() < 0.03
 
 
 def test_masks_and_depths_belong_together(r):
     mask, depth = r.object_masks(T_S), r.depths(T_S)
-    still, moving = r._still_hits[0].reshape(r.shape), r._look(T_S).hits.distance.reshape(r.shape)
+    static, moving = r._static_hits[0].reshape(r.shape), r._snapshot(T_S).hits.distance.reshape(r.shape)
     assert 0.01 < mask.mean() < 0.5
-    assert (moving[mask] < still[mask]).all()
-    assert (moving[~mask] >= still[~mask]).all()
+    assert (moving[mask] < static[mask]).all()
+    assert (moving[~mask] >= static[~mask]).all()
     near, far = r.world.depth_range
     assert (depth > near).all() and (depth < far).all()
     assert (r.traced(T_S) | ~mask).all()
 
 
-def test_what_the_camera_sees_moves_as_the_geometry_says(r):
+def test_images_move_as_the_geometry(r):
     """Warping one key by depth and pose gives another key: sides, direction of motion and textures all agree."""
     t0, t1 = 0.004, 0.012
     first, second, mask, depth = r.keys(t0)[1], r.keys(t1)[1], r.object_masks(t0)[1], r.depths(t0)[1]
@@ -99,7 +99,7 @@ def test_what_the_camera_sees_moves_as_the_geometry_says(r):
 
 def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     together = r
-    together.keys(0.002)  # neither what was rendered before nor the other views leave a trace
+    together.keys(0.002)  # earlier renderings and other views have no influence
     alone = MultiViewRenderer(r.world, together.cameras[1:], seed=0, spp=SPP, background_spp=256)
     mask = alone.object_masks(T_S)[0]
     assert alone.background[0].tobytes() == together.background[1].tobytes()
@@ -117,7 +117,7 @@ def test_colour_is_the_same_image(r):
     colour = MultiViewRenderer(r.world, gray.cameras[1:], seed=0, spp=SPP, background_spp=256, color=True)
     rgb = colour.keys(T_S)
     assert rgb.shape == (1, HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(gray_of(rgb[0]), gray.keys(T_S)[1], atol=2e-3)  # smoothing at other places
+    np.testing.assert_allclose(gray_of(rgb[0]), gray.keys(T_S)[1], atol=2e-3)  # smoothing at other pixels
     mask = gray.object_masks(T_S)[1]
     np.testing.assert_allclose(gray_of(rgb[0])[mask], gray.keys(T_S)[1][mask], rtol=1e-5, atol=1e-6)
     assert np.abs(rgb[..., 0] - rgb[..., 2]).mean() > 0.01
@@ -129,7 +129,7 @@ def test_speeds_are_those_of_warped_points_and_shadows(r):
     exact = maximum_filter(np.linalg.norm(flow, axis=-1) / 1e-4, 7)
     inner = erode(mask, np.ones((9, 9)))
     np.testing.assert_allclose(speed[inner], exact[inner], rtol=0.02, atol=20)
-    assert (ids[mask] > 0).all() and (ids[~mask] == 0).all() and ids.max() <= len(r.world.thing_names)
+    assert (ids[mask] > 0).all() and (ids[~mask] == 0).all() and ids.max() <= len(r.world.object_names)
     assert (speed[~r.traced(T_S)[1]] == 0).all()
     if r.world.name == "car":  # on the flat road the shadow keeps up with the car: no faster than its fastest point
         shadow = r.traced(T_S)[1] & (maximum_filter(mask, 9) == 0)
@@ -147,7 +147,7 @@ def test_whole_frames_are_the_exact_way(r):
 
 
 def two_flaps() -> WorldScene:
-    """The car's street with two square flaps over it that tilt in opposite senses, as one mesh of two bodies."""
+    """Return the car's street with two square flaps over it that tilt in opposite senses, as one mesh of two bodies."""
     base = world("car")
     square = np.array([(-0.8, -0.8, 0), (0.8, -0.8, 0), (0.8, 0.8, 0), (-0.8, 0.8, 0)])
     mesh = merge([quad((0, 0, 0), (1, 0, 0), (0, 1, 0))] * 2)
@@ -167,7 +167,7 @@ def test_deforming_surfaces_have_masks_numbers_and_flow():
     flaps = two_flaps()
     (camera,) = cameras(flaps, 2 * WIDTH, 2 * HEIGHT, (4,))
     r = MultiViewRenderer(flaps, [camera], seed=0, spp=16, background_spp=64)
-    assert r.world.thing_names == ("flap/0", "flap/1")
+    assert r.world.object_names == ("flap/0", "flap/1")
     depth, ids, flow = (a[0] for a in r.geometry(T_S, 1e-3))
     before, after = (flaps.moving_points(t) for t in (T_S, T_S + 1e-3))
     for body in (0, 1):
@@ -178,7 +178,7 @@ def test_deforming_surfaces_have_masks_numbers_and_flow():
         middle = np.unravel_index(
             np.argmin((x - corners[:, 0].mean()) ** 2 + (y - corners[:, 1].mean()) ** 2), ids.shape
         )
-        homography, _ = cv2.findHomography(corners, later)  # exact for a plane seen before and after
+        homography, _ = cv2.findHomography(corners, later)  # exact for a plane at both times
         there = homography @ (x[middle], y[middle], 1)
         np.testing.assert_allclose(flow[middle], there[:2] / there[2] - (x[middle], y[middle]), atol=0.01)
     points = camera.unproject(np.stack([x[ids > 0], y[ids > 0]], 1), depth[ids > 0].astype(np.float64))

@@ -1,4 +1,4 @@
-"""Keys where and when they are needed: what is left out, and what that costs."""
+"""Sparse keys: the pixels and ticks that are left out, and the error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
-from spike4dgs.generators.rendering.render import MultiViewRenderer, Still
+from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 
@@ -22,21 +22,21 @@ def r() -> MultiViewRenderer:
     return MultiViewRenderer(turntable, cameras(turntable, WIDTH, HEIGHT, (1, 4)), seed=0, spp=SPP, background_spp=256)
 
 
-def test_a_renderer_goes_on_from_the_background_of_another(r):
+def test_a_renderer_continues_from_the_background_of_another(r):
     plan = KeyPlan(400, 20_000, 0.05, (20, 4, 2))
     first = r
-    still = Still.from_arrays(first.still.arrays())
-    second = MultiViewRenderer(r.world, first.cameras, seed=0, spp=SPP, background_spp=256, still=still)
+    static = StaticViews.from_arrays(first.static.arrays())
+    second = MultiViewRenderer(r.world, first.cameras, seed=0, spp=SPP, background_spp=256, static=static)
     for tick in (200, 202, 204):
         a, b = first.key_arrays(tick, plan), second.key_arrays(tick, plan)
         assert a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
 
 
-def test_fine_keys_give_what_is_too_fast_and_the_rest_is_close(r, tmp_path):
+def test_fine_keys_give_fast_pixels_and_the_rest_is_close(r, tmp_path):
     """Dense keys from a plan against images rendered at every tick: small errors, and none where keys are given."""
     plan = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1))
     store = KeyStore(tmp_path)
-    store.set_still(r.still)
+    store.set_static(r.static)
     for tick in range(10, 31):  # the disc turns steadily: one interval and its neighbours are enough
         store.put(tick, r.key_arrays(tick, plan))
     for tick in (0, 40):
@@ -58,8 +58,8 @@ def test_fine_keys_give_what_is_too_fast_and_the_rest_is_close(r, tmp_path):
 
 def test_ticks_with_fast_motion_are_rendered_inside_the_tick():
     """A disc that turns by 4 px a tick: the rendered mean is nearer to a fine mean than the mean of two keys is."""
-    still = WORLDS["turntable"].build(0, 0, 0.02)
-    spin = replace(still, poses=lambda t: still.poses(40 * t))
+    slow = WORLDS["turntable"].build(0, 0, 0.02)
+    spin = replace(slow, poses=lambda t: slow.poses(40 * t))
     r = MultiViewRenderer(spin, cameras(spin, WIDTH, HEIGHT, (4,)), seed=0, spp=64, background_spp=64)
     plan = KeyPlan(20, 20_000, 0.2, (1,), sub_ticks=8)
     arrays = r.key_arrays(7, plan)

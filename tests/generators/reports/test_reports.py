@@ -12,12 +12,12 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
-from spike4dgs.generators.rendering.render import Still
+from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.reports import spacing, speed, tradeoff
 
 
 def drifting(n, px_per_tick, height=12, width=40):
-    """Frames [n + 1, H, W] of a smooth pattern that drifts."""
+    """Return frames [n + 1, H, W] of a smooth pattern that drifts."""
     x = np.arange(width) - px_per_tick * np.arange(n + 1)[:, None, None]
     y = np.arange(height)[:, None]
     return (0.5 + 0.3 * np.sin(x / 1.5) * np.cos(y / 4)).astype(np.float32)
@@ -79,13 +79,13 @@ def test_speed_reports_both_sides_and_the_error(tmp_path, capsys):
 @pytest.mark.parametrize("ticks", [[0], [22], [399], [111, 276], [200], [17, 18]])
 def test_tradeoff_renders_the_keys_that_its_ticks_need_and_no_others(ticks, tmp_path):
     plan, rng = KeyPlan(400, 20_000, 0.5, (20, 4, 2)), np.random.default_rng(0)
-    still = Still(np.ones((1, 3, 8, 3), np.float32), np.ones((1, 3, 8, 3), np.float32))
+    static = StaticViews(np.ones((1, 3, 8, 3), np.float32), np.ones((1, 3, 8, 3), np.float32))
     full, part = KeyStore(tmp_path / "full"), KeyStore(tmp_path / "part")
     keys = tradeoff.needed(plan, ticks)
-    assert {plan.level(t) for t in keys} == {0, 1, 2}, "the time of each spacing is wanted"
+    assert {plan.level(t) for t in keys} == {0, 1, 2}, "the time of each spacing is measured"
     for store in (full, part):
         store.folder.mkdir()
-        store.set_still(still)
+        store.set_static(static)
     for tick in plan.ticks:
         mask = rng.random((3, 8)) < (1.0 if plan.level(tick) == 0 else 0.4)
         arrays = {"given0": np.packbits(mask), "values0": rng.random(int(mask.sum())).astype(np.float32)}

@@ -1,4 +1,4 @@
-"""`speed simulate` beside a package that stands in for spikezoo: found, fed and judged as the real one would be."""
+"""`speed simulate` with a substitute for spikezoo: found, run and compared like the real package."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def table(tmp_path, monkeypatch, source):
         return list(csv.DictReader(f))
 
 
-def test_spikezoo_is_judged_by_the_charges_it_starts_from(tmp_path, monkeypatch):
+def test_spikezoo_is_compared_from_its_own_initial_charges(tmp_path, monkeypatch):
     rows = table(tmp_path, monkeypatch, SIMULATOR)
     assert rows[-1]["simulator"] == "spikezoo video2spike_simulation" and rows[-1]["x spikezoo"] == "1"
     assert int(rows[-1]["largest count error"]) <= 1 and float(rows[-1]["pixels off, %"]) < 1

@@ -14,7 +14,7 @@ from spike4dgs.generators.worlds import WORLDS
 
 
 def table(path):
-    """Markdown -> list of {column: cell}."""
+    """Read a Markdown table as a list of {column: cell}."""
     lines = [x for x in path.read_text().splitlines() if x.startswith("|")]
     cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines]
     assert cells[0] == list(COLUMNS) and set(cells[1]) == {"---"}
@@ -32,7 +32,7 @@ def test_a_row_agrees_with_the_geometry_and_the_report(tmp_path, capsys):
 
     world = WORLDS["turntable"].build(0, 0, 0.004)
     views = cameras(world, 64, 40, (0, 2, 4, 7))
-    fastest = 0.0  # of the vertices that stand on the rim, by central differences over 2 us
+    fastest = 0.0  # of the vertices on the rim, by central differences over 2 us
     for t in np.linspace(0, 0.004, 33):
         for camera in views:
             before, after = (camera.project(world.moving_points(t + d))[0] for d in (-1e-6, 1e-6))
@@ -42,7 +42,7 @@ def test_a_row_agrees_with_the_geometry_and_the_report(tmp_path, capsys):
     assert spacings == sorted(spacings, reverse=True) and all(20 % s == 0 for s in spacings)
     assert spacings[-1] * fastest / 20_000 <= 0.5
 
-    # the disc is an ellipse as wide as its diameter at its distance, and what stands on it adds a little
+    # the disc is an ellipse as wide as its diameter at its distance, and the objects on it add a little
     (camera,) = cameras(world, 64, 40, (4,))
     uv, depth = camera.project(world.moving_points(0.0))
     disc = np.pi / 4 * np.ptp(uv[:, 0]) * np.ptp(uv[:, 1]) / (64 * 40)

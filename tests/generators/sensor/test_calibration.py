@@ -1,4 +1,4 @@
-"""Calibration from flat-field and dark recordings: what comes out is what the camera was made with."""
+"""Calibration from flat-field and dark recordings: the estimates are the camera's true maps."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ def rms(found, truth):
     return float(np.sqrt(np.mean((found / truth - 1) ** 2)))
 
 
-def test_maps_are_recovered_from_what_a_scene_ships(tmp_path):
+def test_maps_are_recovered_from_a_scenes_recordings(tmp_path):
     pixels = HEIGHT, WIDTH, 0, "cam_00"
     sensor = real_sensor(pixels)
     made = recordings(tmp_path, sensor)
     flat, dark = made.flat, made.dark
     assert (flat.n_ticks, dark.n_ticks) == (calibration.FLAT_TICKS, calibration.DARK_TICKS)
     found = estimate(made)
-    assert rms(found.gain, sensor.gain) < 0.003  # asked for: 0.01
-    assert rms(found.dark, sensor.dark) < 0.05  # asked for: 0.20
+    assert rms(found.gain, sensor.gain) < 0.003  # required: 0.01
+    assert rms(found.dark, sensor.dark) < 0.05  # required: 0.20
     assert found.radiance_gain == pytest.approx(0.6, rel=1e-3)
     counted = flat.counts(0, flat.n_ticks) / flat.n_ticks - dark.counts(0, dark.n_ticks) / dark.n_ticks
     assert rms(found.gain, sensor.gain) < 0.5 * rms(counted / counted.mean(), sensor.gain)  # better than counting
@@ -86,7 +86,7 @@ def scene_with_recordings(root, facts):
         pixels = camera.height, camera.width, 0, camera.id
         sensor = real_sensor(pixels)
         calibration.write_calibration(root / "calibration", camera, sensor, [1, 2])
-        if camera.id != "cam_03":  # nobody knows the truth of this one
+        if camera.id != "cam_03":  # the truth of this one is unknown
             write_maps(root / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     return write_small_scene(root, extras={"calibration": facts})
 

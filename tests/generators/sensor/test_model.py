@@ -20,7 +20,7 @@ TICKS = 100_000
 
 
 class Lazy:
-    """Keys computed on demand: nobody may need them all at once."""
+    """Keys computed on demand: no code may need them all at once."""
 
     def __init__(self, n, image):
         self.n, self.image = n, image
@@ -42,7 +42,7 @@ def maps(height, width, on):
 
 
 def checkpoints(s):
-    """Cumulative counts [H, W] at 1000, 51000 and 100000 ticks."""
+    """Return cumulative counts [H, W] at 1000, 51000 and 100000 ticks."""
     return {1000: s.counts(0, 1000), 51_000: s.counts(0, 51_000)} | {
         TICKS: s.counts(0, 51_000).astype(int) + s.counts(51_000, TICKS)
     }
@@ -81,13 +81,13 @@ def test_linear_light_has_no_drift(spacing):
 
 
 def near_threshold(keys, ticks, n, sensor, charge, tolerance=1e-4):
-    """[n, H, W]: where the exact charge lies so near the threshold that rounding may decide."""
+    """Return [n, H, W]: where the exact charge lies so near the threshold that rounding may decide."""
     levels = (level for _, level in fire(tick_means(keys, ticks, n), sensor, charge))
     return np.stack([np.abs((level + 0.5) % 1 - 0.5) < tolerance for level in levels])
 
 
 def strays(spikes, expected):
-    """[n, H, W]: where a pixel's number of spikes so far leaves the twin's; coming back is no fault of its own."""
+    """Return [n, H, W]: where a pixel's spike count first differs from the twin's; returning to it is no new error."""
     ahead = np.cumsum(spikes.astype(int) - expected, axis=0)
     return (ahead != 0) & (np.concatenate([0 * ahead[:1], ahead[:-1]]) == 0)
 
@@ -108,8 +108,8 @@ def test_equals_the_twin(height, width, gaps, cut, contrast, on, seed):
     ticks = np.cumsum([0, *gaps])
     n = max(1, int(ticks[-1]) - cut)
     keys = (0.5 + contrast * rng.random((len(ticks), height, width))).astype(np.float32)
-    still = rng.random((height, width)) < 0.5
-    keys[:, still] = keys[0, still]
+    constant = rng.random((height, width)) < 0.5
+    keys[:, constant] = keys[0, constant]
     sensor, charge = maps(height, width, on), random_charge(height, width, [seed])
     got = stream(keys, ticks, n, sensor, charge)
     expected = simulate_reference(keys, ticks, n, sensor, charge)
@@ -266,7 +266,7 @@ def test_intervals_vary_as_photons_do():
         level -= photons * plain[tick]
 
     def spread(spikes: np.ndarray, lag: int) -> tuple[float, float]:
-        """Mean and variance of the time over `lag` intervals, over all pixels."""
+        """Return mean and variance of the time over `lag` intervals, over all pixels."""
         times = [np.flatnonzero(spikes[:, y, x]) for y in range(shape[0]) for x in range(shape[1])]
         spans = np.concatenate([t[lag:] - t[:-lag] for t in times])
         return float(spans.mean()), float(spans.var())

@@ -27,7 +27,7 @@ def real_sensor(photons: float | None = SENSOR.photons_per_spike) -> Sensor:
 
 
 def record(light: np.ndarray, sensor: Sensor, ticks: int = TICKS) -> np.ndarray:
-    """Unpacked spikes [T, H, W] of a scene that stands still."""
+    """Return unpacked spikes [T, H, W] of a static scene."""
     height, width = light.shape
     packed = np.concatenate(
         list(simulate([light, light], [0, ticks], ticks, sensor, random_charge(height, width, [0])))
@@ -40,8 +40,8 @@ def record(light: np.ndarray, sensor: Sensor, ticks: int = TICKS) -> np.ndarray:
 def roadside() -> np.ndarray:
     """Smooth light with log-normal rates around 0.1 spikes per tick (98 % of the pixels between 0.04 and 0.26).
 
-    The rates of the published recording are not known. How many pixels have one interval depends on little else: the
-    median follows from that share; the other figures are then predictions.
+    The rates of the published recording are unknown. The share of pixels with one interval depends on little else, so
+    it determines the median; the other figures are then predictions.
     """
     noise = gaussian_filter(np.random.default_rng(0).normal(size=(HEIGHT, WIDTH)), 12)
     return (0.1 / 0.6 * np.exp(0.4 * (noise - noise.mean()) / noise.std())).astype(np.float32)
@@ -55,8 +55,8 @@ def test_intervals_and_count_variance_are_the_real_cameras(roadside):
     assert found.excess_variance == pytest.approx(EXCESS, rel=WITHIN)
 
 
-def test_wrong_cameras_are_told_apart(roadside):
-    """What other simulators do: a hard reset has one interval, Poisson on the gray level far too much variance."""
+def test_wrong_cameras_are_distinguished(roadside):
+    """Other simulators: a hard reset has one interval, Poisson noise on the gray level far too much variance."""
     rate = 0.6 * roadside.astype(np.float64)
     level, hard = np.random.default_rng(0).random(rate.shape), np.empty((TICKS, *rate.shape), bool)
     for tick in range(TICKS):
@@ -88,22 +88,22 @@ def test_a_definition_of_excess_variance_against_its_closed_form():
     assert excess_variance(spikes.astype(bool), window) == pytest.approx(f * (1 - f) / (n - 1), rel=0.05)
 
 
-def test_still_pixels_of_a_real_recording_and_of_a_simulation_at_their_rates():
+def test_static_pixels_of_a_real_recording_and_of_a_simulation_at_their_rates():
     stream = open_stream(shared_file("data/real_spikes/car_100kmh_250x400_200f.dat"), WIDTH, HEIGHT, 4e4)
     real = stream.window(0, stream.n_ticks).astype(bool)
     quarters = np.stack([gaussian_filter(part.mean(0), 2) for part in np.split(real, 4)])
-    still = np.ptp(quarters, axis=0) < 0.004  # the car comes nowhere near
-    still &= (real.mean(0) > 0.05) & (real.mean(0) < 0.95)
-    assert still.sum() > 5000
+    static = np.ptp(quarters, axis=0) < 0.004  # far from the car
+    static &= (real.mean(0) > 0.05) & (real.mean(0) < 0.95)
+    assert static.sum() > 5000
     light = (rates(stream) / 0.6).astype(np.float32)
-    a = stream_statistics(real, still)
-    ours = {n: stream_statistics(record(light, Sensor(photons=n), len(real)), still) for n in (2.5e4, 5e4, 1e5)}
+    a = stream_statistics(real, static)
+    ours = {n: stream_statistics(record(light, Sensor(photons=n), len(real)), static) for n in (2.5e4, 5e4, 1e5)}
     b = ours[SENSOR.photons_per_spike]
     assert b.one_interval == pytest.approx(a.one_interval, rel=WITHIN)
     assert b.two_intervals == pytest.approx(a.two_intervals, rel=WITHIN)
     assert b.other_intervals == pytest.approx(a.other_intervals, rel=WITHIN)
     assert b.excess_variance[: len(WINDOWS) - 1] == pytest.approx(a.excess_variance[: len(WINDOWS) - 1], rel=WITHIN)
-    # twice or half as many photons to a spike would not do
+    # twice or half as many photons per spike do not fit
     assert ours[1e5].other_intervals < 0.8 * a.other_intervals < 1.25 * a.other_intervals < ours[2.5e4].other_intervals
 
 

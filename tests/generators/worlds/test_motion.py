@@ -1,4 +1,4 @@
-"""What moves in the worlds moves as such things do."""
+"""Motion in the worlds follows the physics of its objects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_a_slow_camera_would_smear_it_over_a_quarter_of_its_length(name, variant
 
 @pytest.mark.parametrize("name", STREET)
 @pytest.mark.parametrize("variant", [0, 3])
-def test_street_things_cross_from_left_to_right_at_their_speed(name, variant):
+def test_street_objects_cross_from_left_to_right_at_their_speed(name, variant):
     world = WORLDS[name].build(0, variant, 0.5)
     middle = np.array([world.moving_points(t)[:, 0].mean() for t in np.linspace(0, 0.5, 6)])
     assert np.polyfit(np.linspace(0, 0.5, 6), middle, 1)[0] == pytest.approx(world.notes["speed_m_s"], rel=0.03)
@@ -41,7 +41,7 @@ def test_nothing_sinks_into_the_ground(name):
 # ---------------------------------------------------------------- people and wheels
 
 
-def test_a_standing_foot_stands_and_legs_keep_their_length():
+def test_a_foot_on_the_ground_rests_and_legs_keep_their_length():
     run = {"speed_m_s": 5.0, "strides_per_s": 1.5, "phase": 0.0, "lane_y_m": 0.0}
     stance = [jaywalk.stride(**run, t_s=t).ankles["left"] for t in np.linspace(0, 0.24 / 1.5, 9)]
     np.testing.assert_allclose(np.diff(stance, axis=0), 0, atol=1e-9)
@@ -82,7 +82,7 @@ def test_reach_meets_a_goal_or_stretches_towards_it():
     ],
 )
 def test_wheels_roll_without_slipping(name, wheel, radius):
-    """The point of the tyre that touches the ground stands still."""
+    """The point of the tyre that touches the ground is at rest."""
     world = WORLDS[name].build(0, 0, 0.1)
     before, after = (world.poses(t)[wheel] for t in (0.03, 0.03 + 1e-6))
     contact = before[:3, 3] - [0, 0, radius]
@@ -100,13 +100,13 @@ def test_feet_stay_on_the_pedals():
     assert np.ptp(np.array(gaps)[::2], axis=0).max() < 0.01
 
 
-def test_a_rider_sits_on_a_moving_cycle_as_on_a_still_one():
+def test_a_rider_sits_on_a_moving_cycle_as_on_a_resting_one():
     feet = {"left": (-0.1, 0.1, 0.3), "right": (-0.1, -0.1, 0.3)}
-    place = ((-0.2, 0, 0.95), (0.1, 0, 1.3), (0.4, 0.2, 0.95), feet, 0.0)
-    still, moved = cycles.seated(np.eye(4), *place), np.eye(4)
+    points = ((-0.2, 0, 0.95), (0.1, 0, 1.3), (0.4, 0.2, 0.95), feet, 0.0)
+    resting, moved = cycles.seated(np.eye(4), *points), np.eye(4)
     moved[:3, 3] = 3.0, 1.0, 0.0
-    for name, pose in cycles.seated(moved, *place).items():
-        np.testing.assert_allclose(pose, moved @ still[name], atol=1e-12)
+    for name, pose in cycles.seated(moved, *points).items():
+        np.testing.assert_allclose(pose, moved @ resting[name], atol=1e-12)
 
 
 # ---------------------------------------------------------------- falling and flying
@@ -116,9 +116,9 @@ def test_free_fall_is_a_parabola_and_spin_stays():
     throw = Body("box", (0.02, 0.02, 0.02), (0, 0, 1.0), velocity=(1.0, -0.5, 2.0), spin=(0, 0, 30.0))
     path = simulate([throw], 0.0, 0.2)
     for t in (0.0, 0.0501, 0.1337, 0.2):
-        turn, place = path.at(t)
+        turn, position = path.at(t)
         expected = np.array([t, -0.5 * t, 1 + 2 * t - GRAVITY_M_S2 * t * t / 2])
-        np.testing.assert_allclose(place[0], expected, atol=GRAVITY_M_S2 * 0.2 * STEP_S)  # a step of first order
+        np.testing.assert_allclose(position[0], expected, atol=GRAVITY_M_S2 * 0.2 * STEP_S)  # a step of first order
         angle = np.arctan2(turn[0, 1, 0], turn[0, 0, 0])
         assert np.angle(np.exp(1j * (angle - 30 * t))) == pytest.approx(0, abs=1e-3)
         np.testing.assert_allclose(turn[0] @ turn[0].T, np.eye(3), atol=1e-12)

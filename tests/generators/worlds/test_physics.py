@@ -28,7 +28,7 @@ CASES = [("bricks", 0), ("bricks", 1), ("bricks", 2), ("chips", 0), ("chips", 1)
 
 @lru_cache
 def simulated(name: str, variant: int, duration_s: float = 0.1) -> tuple[WorldScene, list[Body], Trajectory]:
-    """A world with the bodies that it let move and how they moved."""
+    """Return a world, its simulated bodies, and their trajectory."""
     seen = []
 
     def watched(bodies, *arguments, **options):
@@ -42,7 +42,7 @@ def simulated(name: str, variant: int, duration_s: float = 0.1) -> tuple[WorldSc
 
 
 def mass_and_inertia(body: Body) -> tuple[float, np.ndarray]:
-    """Mass in kg and principal moments [3] in kg m^2, from textbook formulas."""
+    """Return mass in kg and principal moments [3] in kg m^2, from textbook formulas."""
     if body.shape == "box":
         a, b, c = 2 * np.array(body.size)
         mass = body.density * a * b * c
@@ -57,7 +57,7 @@ def mass_and_inertia(body: Body) -> tuple[float, np.ndarray]:
 
 
 def velocities(path: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity in m/s and spin in rad/s about the body's axes, [T - 1, B, 3] each, from differences of the poses."""
+    """Return velocity in m/s and spin in rad/s about the body's axes, [T - 1, B, 3] each, from pose differences."""
     velocity = np.diff(path.positions, axis=0) / STEP_S
     q = path.quaternions[..., [1, 2, 3, 0]]
     turn = Rotation.from_quat(q[:-1].reshape(-1, 4)).inv() * Rotation.from_quat(q[1:].reshape(-1, 4))
@@ -65,7 +65,7 @@ def velocities(path: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def energy(bodies: list[Body], path: Trajectory) -> np.ndarray:
-    """Kinetic and potential energy [T - 1] in joules."""
+    """Return kinetic and potential energy [T - 1] in joules."""
     mass, inertia = (np.array(x) for x in zip(*map(mass_and_inertia, bodies), strict=True))
     velocity, spin = velocities(path)
     moving = 0.5 * (mass * (velocity**2).sum(-1) + (inertia * spin**2).sum(-1))
@@ -76,7 +76,7 @@ def energy(bodies: list[Body], path: Trajectory) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("name", "variant"), CASES)
-def test_energy_is_lost_but_for_what_contacts_give_back(name, variant):
+def test_energy_falls_except_for_what_contacts_return(name, variant):
     _, bodies, path = simulated(name, variant)
     total = energy(bodies, path)
     assert total.max() <= total[0] * (1 + 1e-4)
@@ -105,13 +105,13 @@ def test_chips_that_collide_in_the_air_keep_momentum_and_angular_momentum():
     bodies = []
     for k in range(12):  # thrown at each other from a circle
         a = 2 * np.pi * k / 12
-        place, velocity = (
+        position, velocity = (
             (0.12 * np.cos(a), 0.12 * np.sin(a), 1.0),
             (-3 * np.cos(a), -3 * np.sin(a), rng.normal(0, 0.1)),
         )
         q, spin = rng.normal(size=4), tuple(rng.normal(0, 22, 3).tolist())
         turn = tuple((q / np.linalg.norm(q)).tolist())
-        bodies.append(Body("cylinder", (0.024, 0.00225), place, turn, velocity, spin, 1800.0))
+        bodies.append(Body("cylinder", (0.024, 0.00225), position, turn, velocity, spin, 1800.0))
     path = simulate(bodies, 0.0, 0.08)
     mass, inertia = mass_and_inertia(bodies[0])
     velocity, spin = velocities(path)
@@ -149,9 +149,9 @@ def test_spin_is_given_in_world_coordinates():
 
 
 def local_points(path: Trajectory, t_s: float, points: np.ndarray) -> np.ndarray:
-    """World points [B, P, 3], P for each body, in the coordinates of every body: [B, B, P, 3] (seen by, owned by)."""
-    turn, place = path.at(t_s)
-    return np.einsum("aji,abpj->abpi", turn, points[None] - place[:, None, None])
+    """Return world points [B, P, 3], P for each body, in every body's coordinates: [B, B, P, 3] (seen by, owned by)."""
+    turn, position = path.at(t_s)
+    return np.einsum("aji,abpj->abpi", turn, points[None] - position[:, None, None])
 
 
 @pytest.mark.parametrize(("name", "variant"), CASES)
@@ -182,8 +182,8 @@ def test_the_ball_and_the_bricks_stop_at_each_other_and_at_the_room(variant):
     walls = [Block.around(part.mesh) for name, part in world.static.items() if name.startswith(("wall", "book"))]
     for t in np.linspace(0, 0.1, 41):
         ball = world.poses(t)["ball"][:3, 3]
-        turn, place = path.at(t)
-        near = np.einsum("aji,aj->ai", turn, ball - place)[:-1]
+        turn, position = path.at(t)
+        near = np.einsum("aji,aj->ai", turn, ball - position)[:-1]
         gap = np.linalg.norm(np.maximum(np.abs(near) - np.array(bricks.BRICK_M) / 2, 0), axis=1)
         if t >= path.start_s:
             assert gap.min() > bricks.BALL_M - SOFT_M
@@ -194,7 +194,7 @@ def test_the_ball_and_the_bricks_stop_at_each_other_and_at_the_room(variant):
             assert np.minimum(corners - low, high - corners).min(1).max() < SOFT_M
 
 
-def test_things_stop_at_blocks():
+def test_bodies_stop_at_blocks():
     block = Block.around(box((0.1, 0.4, 0.3), (0.3, 0, 0.15)))
     np.testing.assert_allclose([block.low, block.high], [(0.25, -0.2, 0), (0.35, 0.2, 0.3)])
     ball = Body("sphere", (0.02,), (0, 0, 0.1), velocity=(10.0, 0, 0))
@@ -223,13 +223,13 @@ def test_poses_between_steps_are_those_of_slerp_and_ignore_the_quaternions_sign(
     q = Rotation.random(8, random_state=1)
     step = Rotation.from_rotvec(rng.normal(0, 80 * STEP_S, (8, 3)))  # 80 rad/s
     pair = np.stack([r.as_quat()[:, [3, 0, 1, 2]] for r in (q, q * step)])
-    places = rng.normal(size=(2, 8, 3))
+    positions = rng.normal(size=(2, 8, 3))
     for f in (0.0, 0.25, 0.5, 0.9, 1.0):
-        turn, place = Trajectory(0.01, places, pair).at(0.01 + f * STEP_S)
+        turn, position = Trajectory(0.01, positions, pair).at(0.01 + f * STEP_S)
         exact = [Slerp([0, 1], Rotation.concatenate([a, b]))(f) for a, b in zip(q, q * step, strict=True)]
         np.testing.assert_allclose(turn, [r.as_matrix() for r in exact], atol=1e-8)
-        np.testing.assert_allclose(place, (1 - f) * places[0] + f * places[1], atol=1e-12)
-        flipped = Trajectory(0.01, places, pair * np.array([1.0, -1.0])[:, None, None]).at(0.01 + f * STEP_S)
+        np.testing.assert_allclose(position, (1 - f) * positions[0] + f * positions[1], atol=1e-12)
+        flipped = Trajectory(0.01, positions, pair * np.array([1.0, -1.0])[:, None, None]).at(0.01 + f * STEP_S)
         np.testing.assert_allclose(flipped[0], turn, atol=1e-12)
 
 
@@ -253,7 +253,7 @@ def test_the_same_arguments_give_the_same_bits(name):
     np.testing.assert_array_equal(first.quaternions, again.quaternions)
 
 
-# ---------------------------------------------------------------- what the images show
+# ---------------------------------------------------------------- contents of the images
 
 
 def test_the_wall_bursts_in_the_same_way_in_clips_of_any_length():
@@ -285,8 +285,8 @@ def test_the_ball_flies_on_one_arc_before_and_after_the_simulation_begins():
     quaternion = tuple(Rotation.from_matrix(first[:3, :3]).as_quat()[[3, 0, 1, 2]].tolist())
     velocity = (*ball.velocity[:2], ball.velocity[2] + GRAVITY_M_S2 * 0.01)
     thrown = Body("sphere", ball.size, tuple(first[:3, 3].tolist()), quaternion, velocity, ball.spin)
-    turn, place = simulate([thrown], 0.0, 0.02).at(0.01)
-    np.testing.assert_allclose(place[0], ball.position, atol=GRAVITY_M_S2 * 0.01 * STEP_S)
+    turn, position = simulate([thrown], 0.0, 0.02).at(0.01)
+    np.testing.assert_allclose(position[0], ball.position, atol=GRAVITY_M_S2 * 0.01 * STEP_S)
     np.testing.assert_allclose(turn[0], np.eye(3), atol=1e-6)
     heights = [world.poses(t)["ball"][2, 3] for t in np.linspace(0, 0.5, 40)]
     assert min(heights) > bricks.BALL_M - SOFT_M

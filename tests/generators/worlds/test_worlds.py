@@ -31,7 +31,7 @@ def all_parts(world: WorldScene) -> list[Part]:
 
 
 def fingerprint(world: WorldScene) -> str:
-    """A hash over all meshes, materials, lights and a pose."""
+    """Return a hash over all meshes, materials, lights and a pose."""
     digest = hashlib.sha256()
     for part in all_parts(world):
         for array in (part.mesh.vertices, part.mesh.faces, part.mesh.uv, np.asarray(part.material.albedo)):
@@ -83,7 +83,7 @@ def test_the_array_is_named_row_by_row_from_the_top_left():
 
 
 def sensor_rays(camera: Camera, sent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions [N, 3] of Mitsuba's own rays through the positions `sent` [N, 2] in the image, 0..1."""
+    """Return origins and directions [N, 3] of Mitsuba's own rays through positions `sent` [N, 2] in the image, 0..1."""
     mi = load_mitsuba()
     sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, 1)
     if mi.variant().startswith("scalar"):
@@ -98,7 +98,7 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
     world = WORLDS[name].build(0, 0, 0.02)
     rig = cameras(world, WIDTH, HEIGHT)
     scene = MitsubaScene(world)
-    scene.place(0.008)
+    scene.set_time(0.008)
     tracer = make_tracer(scene, rig, 0)
     rng = np.random.default_rng(0)
     for camera in rig:
@@ -115,7 +115,7 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
 def test_moving_triangles_are_where_the_world_says(name):
     world, t_s = WORLDS[name].build(0, 0, 0.02), 0.0131
     scene = MitsubaScene(world)
-    scene.place(t_s)
+    scene.set_time(t_s)
     rig = cameras(world, WIDTH, HEIGHT, (4,))
     rng = np.random.default_rng(0)
     poses, middles, owners = world.poses(t_s), [], []
@@ -133,11 +133,11 @@ def test_moving_triangles_are_where_the_world_says(name):
     expected = np.linalg.norm(ways, axis=1)
     tracer = make_tracer(scene, rig, 0)
     hits = tracer.cast_movers(tracer.prepare(np.repeat(rig[0].center[None], len(ways), 0), ways / expected[:, None]))
-    # the triangle itself, or something before it; float32 rays may miss slivers and edges
+    # the triangle itself, or a surface in front of it; float32 rays may miss slivers and edges
     assert (hits.distance < expected * 1.0005).mean() > 0.97
     met = np.abs(hits.distance - expected) < 5e-4 * expected
-    assert met.sum() > 20 and (hits.thing[met] == owner[met]).mean() > 0.9  # things touch each other at joints
-    later = carried(world, hits, rig[0].center + ways, t_s, t_s + 1e-3)[met & (hits.thing == owner)]
+    assert met.sum() > 20 and (hits.number[met] == owner[met]).mean() > 0.9  # parts touch each other at joints
+    later = carried(world, hits, rig[0].center + ways, t_s, t_s + 1e-3)[met & (hits.number == owner)]
     parts = [world.moving_points(t) for t in (t_s, t_s + 1e-3)]
     nearest = cKDTree(parts[1]).query(later)[0]  # carried points are on the moved surface, between its vertices
     assert np.median(nearest) < 1.5 * np.median(cKDTree(parts[0]).query((rig[0].center + ways)[met])[0]) + 1e-6

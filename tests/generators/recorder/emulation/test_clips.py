@@ -1,4 +1,4 @@
-"""Recordings of emulated cameras: the scene that they show, whatever fails, and however slow the consumer is."""
+"""Recordings of emulated cameras: equal to the scene, with faults, and with a slow consumer."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_cameras_that_see_the_scene_upside_down_record_it_upright(two: Scene, tm
     check_identical(tmp_path / "clip", two)
 
 
-def test_cameras_that_send_from_the_moment_they_have_power_agree_on_a_tick(two: Scene) -> None:
+def test_cameras_that_send_from_power_on_agree_on_a_tick(two: Scene) -> None:
     profile = profile_of(two, layout="tagged-rows")
     profile = replace(profile, cameras=tuple(replace(c, start=(), stop=()) for c in profile.cameras))
     backend = emulate(two, profile)
@@ -74,7 +74,7 @@ def test_cameras_that_send_from_the_moment_they_have_power_agree_on_a_tick(two: 
 
 
 def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object) -> CameraClip:
-    """Record with a fault of cam_01; checks that cam_00 has everything, and returns cam_01's clip."""
+    """Record with a fault of cam_01, check that cam_00 is complete, and return cam_01's clip."""
     profile = profile_of(scene, **changes)
     clip = record(out, profile, emulate(scene, profile, fault), N, queued)
     check_recording(out, scene, clip)
@@ -87,17 +87,17 @@ def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object)
 
 @pytest.mark.parametrize("queued", [True, False])
 @pytest.mark.parametrize("kind", ["stall", "overflow", "unplugged"])
-def test_a_camera_that_fails_keeps_what_came_before(two: Scene, kind: str, queued: bool, tmp_path: Path) -> None:
+def test_a_camera_that_fails_keeps_earlier_ticks(two: Scene, kind: str, queued: bool, tmp_path: Path) -> None:
     tick, offset = 77, 33
     failed = fail(two, tmp_path / "clip", Fault("cam_01", kind, tick, offset), queued)
-    # Only of a queued read does libusb tell how much of it came before it failed.
+    # libusb reports the bytes before a failure for queued reads only.
     first = tick if queued else (tick * FRAME + offset) // BLOCK * BLOCK // FRAME
     assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(first, N - first, kind)]
     assert failed.stats.end == kind
 
 
 @pytest.mark.parametrize("queued", [True, False])
-def test_a_camera_that_falls_silent_keeps_all_that_came(two: Scene, queued: bool, tmp_path: Path) -> None:
+def test_a_camera_that_falls_silent_keeps_all_received_ticks(two: Scene, queued: bool, tmp_path: Path) -> None:
     failed = fail(two, tmp_path / "clip", Fault("cam_01", "time-out", 77, 33), queued, timeout_ms=1000)
     assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, "time-out")]
 
@@ -152,9 +152,9 @@ STUCK, LAST, SLOTS, FLYING = 6, 14, 8, 4  # reads counted from 0
 class Steps:
     """Lets reads end one by one, so that the consumer falls behind by a known number of them.
 
-    A read ends when the consumer has had all frames before it. But while the consumer is stuck in read STUCK of cam_01,
-    its reads up to LAST end. The ring's SLOTS then hold the reads from STUCK on; those after them have no place, up to
-    the last that was submitted meanwhile, LAST + FLYING.
+    A read ends when the consumer has received all frames before it. But while the consumer is stuck in read STUCK of
+    cam_01, its reads up to LAST end. The ring's SLOTS then hold the reads from STUCK on; those after them have no slot,
+    up to the last that was submitted meanwhile, LAST + FLYING.
     """
 
     def __init__(self, frame_bytes: int, files: StreamFiles) -> None:
@@ -166,11 +166,11 @@ class Steps:
 
     @property
     def lost(self) -> tuple[int, int]:
-        """First tick that finds no place, and the first one after it that does."""
+        """First tick without a slot, and the first one after it with a slot."""
         return self.ticks(STUCK + SLOTS), -(-(LAST + FLYING + 1) * BLOCK // self.frame_bytes)
 
     def ticks(self, reads: int) -> int:
-        """Whole ticks in this many reads."""
+        """Return the number of whole ticks in this many reads."""
         return reads * BLOCK // self.frame_bytes
 
     def allows(self, camera: str) -> bool:
@@ -181,7 +181,7 @@ class Steps:
             if n > LAST:  # the read that follows LAST's has been submitted
                 self.behind.set()
             return n <= LAST and self.stuck.is_set()
-        if camera == "cam_01" and LAST < n <= LAST + FLYING + 1:  # these have no frames
+        if camera == "cam_01" and LAST < n <= LAST + FLYING + 1:  # these bring no frames
             return self.had[camera] >= self.lost[0]
         return self.had[camera] >= self.ticks(n)
 
@@ -209,7 +209,7 @@ class SteppedReads(EmulatedReads):
 
 
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
-def test_a_consumer_slowed_on_purpose_costs_exactly_the_ticks_that_found_no_place(
+def test_a_consumer_slowed_on_purpose_loses_exactly_the_ticks_without_a_slot(
     two: Scene, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     profile = profile_of(two, layout=layout, transfers=FLYING, ring_seconds=0.002)

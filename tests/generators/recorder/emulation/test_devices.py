@@ -1,4 +1,4 @@
-"""Emulated cameras and the backend that they are behind: they send what they should, and fail as told."""
+"""Emulated cameras and their backend: the data that they send, and their faults."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation import camera as emulated_camera
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera, Fault
-from spike4dgs.generators.recorder.frames.layouts import make_layout, orient
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def camera_of(scene: Scene, *faults: Fault, layout: str = "plain", **options: ob
     return EmulatedCamera(profile.cameras[0], profile, source, faults=faults, **options)  # type: ignore[arg-type]
 
 
-# What a camera sends.
+# The data of a camera.
 
 
 @settings(max_examples=40, deadline=None)
@@ -48,7 +49,7 @@ def camera_of(scene: Scene, *faults: Fault, layout: str = "plain", **options: ob
         max_size=4,
     ),
 )
-def test_reads_of_any_size_bring_the_stream_less_what_is_lost(
+def test_reads_of_any_size_bring_the_stream_less_the_lost_bytes(
     two: Scene, layout: str, sizes: list[int], losses: list[tuple[str, int, int, int]]
 ) -> None:
     faults = [Fault("cam_00", kind, tick, offset, lost, start=0) for kind, tick, offset, lost in losses]
@@ -60,7 +61,7 @@ def test_reads_of_any_size_bring_the_stream_less_what_is_lost(
     at = 0
     ahead = sorted(faults, key=lambda f: f.tick * frames.frame_bytes + f.offset)
     for size in sizes:
-        expected, status = bytearray(), "ok"  # byte by byte, as slow as it gets
+        expected, status = bytearray(), "ok"  # byte by byte: the slow twin
         while len(expected) < size:
             if ahead and ahead[0].tick * frames.frame_bytes + ahead[0].offset <= at:
                 fault = ahead.pop(0)
@@ -93,7 +94,7 @@ def test_a_camera_sends_its_image_as_its_profile_says(two: Scene, layout: str, r
 
 
 class Clock:
-    """A clock that is set by hand."""
+    """A clock that tests set."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
@@ -144,7 +145,7 @@ def test_a_camera_without_reads_in_flight_loses_whole_frames(two: Scene, monkeyp
     steps=st.lists(st.tuples(st.integers(0, 400), st.integers(1, 700)), min_size=1, max_size=12),
     memory=st.integers(0, 700),
 )
-def test_whatever_is_lost_the_rest_are_whole_frames_in_order(
+def test_after_any_loss_the_rest_are_whole_frames_in_order(
     two: Scene, steps: list[tuple[int, int]], memory: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -168,7 +169,7 @@ def test_whatever_is_lost_the_rest_are_whole_frames_in_order(
         assert not len(counts) or (counts[-1] + 1 - len(counts)) * 168 <= camera.lost_bytes
 
 
-def test_what_was_held_at_a_stop_comes_before_the_next_start(two: Scene) -> None:
+def test_bytes_held_at_a_stop_come_before_the_next_start(two: Scene) -> None:
     camera, into = camera_of(two), np.zeros(3 * FRAME, np.uint8)
     stream = np.resize(two.stream("cam_00").packed, (400, FRAME)).reshape(-1)
     camera.begin(0.0)
@@ -223,7 +224,7 @@ def test_blocking_reads_fail_with_the_errors_of_libusb(two: Scene, kind: str, nu
         assert device.read(0x82, buffer, 1000) == 2 * FRAME
 
 
-def test_a_blocking_read_that_is_cut_off_returns_what_has_come(two: Scene) -> None:
+def test_a_blocking_read_that_is_cut_off_returns_the_bytes_so_far(two: Scene) -> None:
     backend = emulate(two, profile_of(two), Fault("cam_00", "time-out", 3, 7, start=0))
     device = next(iter(usb.core.find(find_all=True, backend=backend)))
     device.write(0x01, b"start")

@@ -1,4 +1,4 @@
-"""A recording on disk: bits at their true ticks, gaps that every reader sees, and nothing half done."""
+"""A recording on disk: bits at their true ticks, gaps that every reader reports, no unfinished files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present, read_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.generators.recorder.files.clip_files import ClipRecord, StreamFiles, write_clip
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles, write_clip
+from spike4dgs.generators.recorder.files.clip_record import ClipRecord
 from spike4dgs.generators.recorder.frames.gaps import REASONS, Gap, merged, missing
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.profile.profile import CameraProfile, RigProfile
@@ -42,7 +43,7 @@ def rig(layout: str = "plain", calibrated: bool = True, **more: object) -> RigPr
 
 
 def spikes(seed: int, ticks: int = TICKS) -> np.ndarray:
-    """Upright spikes [T, H, W]."""
+    """Return upright spikes [T, H, W]."""
     return np.random.default_rng(seed).random((ticks, HEIGHT, WIDTH)) < 0.4
 
 
@@ -77,7 +78,7 @@ def test_a_recording_is_a_scene_of_the_same_bits(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize(("rows", "mirrored"), [("bottom-up", False), ("top-down", False), ("bottom-up", True)])
-def test_frames_become_upright_ticks_in_their_place(layout: str, rows: str, mirrored: bool, tmp_path: Path) -> None:
+def test_frames_become_upright_ticks_at_their_numbers(layout: str, rows: str, mirrored: bool, tmp_path: Path) -> None:
     pose = array_cameras(1, WIDTH, HEIGHT)[0]
     profile = RigProfile("test", WIDTH, HEIGHT, layout, (camera("cam_00", rows, mirrored, calibration=pose),))
     upright = spikes(0, 700)  # more frames than are unpacked at a time
@@ -86,7 +87,7 @@ def test_frames_become_upright_ticks_in_their_place(layout: str, rows: str, mirr
     gap = Gap("cam_00", 600, 50, "overflow")
     with StreamFiles(tmp_path / "clip", profile, 700) as files:
         files.write_ticks("cam_00", np.r_[:600, 650:699], np.concatenate([frames[:600], frames[650:699]]))
-        files.write("cam_00", 699, frames[699:].repeat(3, axis=0))  # what is beyond the end is left out
+        files.write("cam_00", 699, frames[699:].repeat(3, axis=0))  # frames after the end are left out
         root = files.finish(ClipRecord(690, (gap,), SYNC))
     stream = open_scene(root, allow_gaps=True).stream("cam_00")
     expected = upright[:690] & present([gap], 690)[:, None, None]
@@ -149,7 +150,7 @@ def test_maps_and_files_become_part_of_the_scene(tmp_path: Path) -> None:
     assert "calibration/maps" in (root / "README.md").read_text()
 
 
-# ---------------------------------------------------------------- what goes wrong
+# ---------------------------------------------------------------- errors
 
 
 def test_until_the_end_there_are_only_part_files_and_after_a_failure_none(tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_until_the_end_there_are_only_part_files_and_after_a_failure_none(tmp_pa
     assert not out.exists()
 
 
-def test_places_that_a_recording_cannot_have(tmp_path: Path) -> None:
+def test_folders_that_a_recording_cannot_use(tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "scene.json").write_text("{}")
     with pytest.raises(UserError, match="a new or empty folder"):
@@ -212,7 +213,7 @@ def test_damaged_lists_of_gaps(records: list[dict[str, object]], message: str) -
 
 @settings(deadline=None)
 @given(st.lists(st.integers(-5, 25), max_size=20), st.integers(1, 20))
-def test_missing_ticks_are_those_that_are_not_there(ticks: list[int], n_ticks: int) -> None:
+def test_missing_ticks_are_the_complement(ticks: list[int], n_ticks: int) -> None:
     gaps = missing("c", np.array(sorted(set(ticks)), np.int64), n_ticks, "stall")
     kept = present(gaps, n_ticks)
     assert [t for t in range(n_ticks) if kept[t]] == sorted({t for t in ticks if 0 <= t < n_ticks})
@@ -246,7 +247,7 @@ def test_rates_and_intervals_leave_gaps_out() -> None:
     assert examine("c", SpikeStream(pack(fired), 16, 8, 2e4)).two_intervals == 0  # the gap taken for an interval
 
 
-def test_inspect_draws_each_gap_where_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_plots_each_gap_at_its_ticks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from matplotlib.figure import Figure
 
     profile = rig()

@@ -1,4 +1,4 @@
-"""Files past the page cache: any pieces at any places become the same bytes, and what a disk refuses is known."""
+"""Files past the page cache: any pieces at any offsets become the same bytes, and failed writes are reported."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def noise(n: int) -> np.ndarray:
 
 
 def no_direct(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file system without O_DIRECT."""
+    """Imitate a file system without O_DIRECT."""
     system = os.open
 
     def refuse(path: Path, flags: int, mode: int = 0o777) -> int:
@@ -101,13 +101,13 @@ def test_a_write_that_is_not_aligned_enough_goes_through_the_cache(
     assert (tmp_path / "file").read_bytes() == noise(50000).tobytes()
 
 
-def fail_at(monkeypatch: pytest.MonkeyPatch, place: int, name: str = "", error: int = errno.ENOSPC) -> None:
-    """A disk that takes no byte from `place` on, of the files whose path has `name`."""
+def fail_at(monkeypatch: pytest.MonkeyPatch, offset: int, name: str = "", error: int = errno.ENOSPC) -> None:
+    """Imitate a disk that stores no byte from `offset` on in files whose path contains `name`."""
     write = os.pwrite
 
     def take(fd: int, data: memoryview, at: int) -> int:
         if name in os.readlink(f"/proc/self/fd/{fd}"):
-            data = data[: max(place - at, 0)]
+            data = data[: max(offset - at, 0)]
             if not len(data):
                 raise OSError(error, os.strerror(error))
         return write(fd, data, at)
@@ -115,12 +115,12 @@ def fail_at(monkeypatch: pytest.MonkeyPatch, place: int, name: str = "", error: 
     monkeypatch.setattr(disk.os, "pwrite", take)
 
 
-def test_an_error_is_kept_and_what_came_before_it_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_kept_and_earlier_bytes_are_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(disk, "BUFFER_BYTES", 2 * BLOCK)
     fail_at(monkeypatch, 5 * BLOCK)
     buffers = Buffers(1, 50000)
     file = DiskFile(tmp_path / "file", 50000, buffers)
-    for at in range(0, 50000, 1000):  # goes on without waiting for a buffer that nobody gives back
+    for at in range(0, 50000, 1000):  # continues without waiting for a buffer that is never returned
         file.write(at, noise(1000))
     file.flush()
     assert file.error is not None and file.error.errno == errno.ENOSPC and file.written == 5 * BLOCK
@@ -132,7 +132,7 @@ def test_an_error_is_kept_and_what_came_before_it_is_there(tmp_path: Path, monke
     assert (tmp_path / "file").read_bytes() == expected.tobytes()
 
 
-def test_nothing_stays_of_a_file_that_has_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_without_room_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(fd: int, at: int, n: int) -> None:
         raise OSError(errno.ENOSPC, "no space left on device")
 
@@ -157,7 +157,7 @@ def packed(scene: Path, camera: str) -> np.ndarray:
 
 
 def check_end(out: Path, source: Path, camera: str, stop: int) -> None:
-    """The recording has the camera's ticks up to `stop`, and after these a gap and zeros."""
+    """Check that the recording has the camera's ticks up to `stop`, and after them a gap and zeros."""
     recorded = open_scene(out, allow_gaps=True)
     n = recorded.n_ticks
     gaps = [(g.first_tick, g.stop_tick, g.reason) for g in recorded.gaps if g.camera == camera]
@@ -186,7 +186,7 @@ def test_a_camera_whose_file_fails_ends_alone(
     assert cameras["cam_01"]["lost_ticks"] == TICKS - 100_000 // FRAME
 
 
-def test_a_recording_ends_when_no_file_takes_anything(
+def test_a_recording_ends_when_no_file_accepts_data(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(disk, "BUFFER_BYTES", 8 * BLOCK)
@@ -200,7 +200,7 @@ def test_a_recording_ends_when_no_file_takes_anything(
     assert "ended early" in capsys.readouterr().out
 
 
-def test_a_disk_that_takes_nothing_is_an_error_and_leaves_nothing(
+def test_a_disk_without_room_is_an_error_and_leaves_no_files(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fail_at(monkeypatch, 0)
@@ -209,7 +209,7 @@ def test_a_disk_that_takes_nothing_is_an_error_and_leaves_nothing(
     assert not (tmp_path / "clip").exists()
 
 
-def test_what_cannot_be_synchronised_is_not_claimed(
+def test_data_that_cannot_be_synchronised_are_not_claimed(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sync = os.fsync
@@ -260,5 +260,5 @@ def test_the_streams_of_a_killed_recording_are_named(
     (out / "spikes" / ".cam_01.dat.part").write_bytes(b"half")
     assert main(["record", "--emulate", str(source), "--out", str(out)]) == 2
     shown = capsys.readouterr().err.strip()
-    assert ".cam_01.dat.part: expected a folder without a recording, found the streams of one that" in shown
+    assert ".cam_01.dat.part: expected a folder without a recording, found the streams of a recording that" in shown
     assert shown.endswith(f"choose another --out, or remove {out}")

@@ -7,7 +7,8 @@ import pytest
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.frames.gaps import Gap
-from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_layout, orient
+from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
 SIZES = {"plain": (400, 250), "tagged-rows": (400, 250), "line-tagged": (1000, 1000)}
@@ -24,7 +25,7 @@ def bit(data: np.ndarray, i: int) -> int:
 
 
 def tagged_frame(payload: np.ndarray, width: int, height: int, count: int) -> list[int]:
-    """A frame of tagged rows, in Python's integers."""
+    """Return a frame of tagged rows, from Python's integers."""
     low, high = count % 2**16, count // 2**16
     frame: list[int] = []
     for r in range(height):
@@ -35,7 +36,7 @@ def tagged_frame(payload: np.ndarray, width: int, height: int, count: int) -> li
 
 
 def line_frame(payload: np.ndarray, width: int, height: int) -> list[int]:
-    """A frame of tagged blocks, bit by bit, in the order that the format's description lists."""
+    """Return a frame of tagged blocks, bit by bit, in the order of the format's description."""
     half = height // 2
     order = [(line, c) for line in range(half, 0, -1) for c in (0, 1)]
     order += [(line, c) for line in range(1, half + 1) for c in (2, 3)]
@@ -129,7 +130,7 @@ def tagged() -> tuple[Layout, np.ndarray]:
 
 
 def ticks_of(runs: list[Run], frames: np.ndarray) -> list[int]:
-    """Ticks of runs, whose contents must be those of the frames with these numbers."""
+    """Return the ticks of runs, and check that their contents are the frames with these numbers."""
     found = []
     for run in runs:
         for i, frame in enumerate(run.frames):
@@ -209,7 +210,7 @@ def test_torn_frames_repeats_and_leaps_never_yield_a_wrong_tick() -> None:
     )
 
 
-def test_a_common_origin_drops_what_was_before_the_trigger_and_shows_what_came_late() -> None:
+def test_a_common_origin_drops_frames_before_the_trigger_and_shows_late_ones() -> None:
     layout, frames = tagged()  # counters from 2**32 - 10
     early = TickCounter(layout, "cam_00", origin=2**32 - 4)
     assert ticks_of(early.feed(frames[:20].ravel()), frames[6:]) == list(range(14))

@@ -1,4 +1,4 @@
-"""Where the bundle adjustment of an array starts: every camera alone, then chained together by views they share."""
+"""The initial estimate for the bundle adjustment: every camera alone, then chained by the views that cameras share."""
 
 from __future__ import annotations
 
@@ -9,40 +9,44 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.recorder.rig_calibration.board import Float64
-from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Rig, Sightings
+from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Detections, Rig
 
 FEWEST_VIEWS = 4  # of the board for each camera: three tilts determine a focal length, one is to spare
 
 
-def first_rig(sightings: Sightings, points: Float64, names: Sequence[str], size: tuple[int, int]) -> tuple[Rig, int]:
-    """A rig near the solution, and its reference camera (the one that saw most views). `size`: width, height.
-    Every view has a sighting.
+def estimate_rig(
+    detections: Detections, points: Float64, names: Sequence[str], size: tuple[int, int]
+) -> tuple[Rig, int]:
+    """Return a rig near the solution, and its reference camera (the one with most views). `size`: width, height.
 
-    Zhang's method gives each camera its focal length and the board as it sees it; the principal point is the middle.
-    Cameras are then joined to the reference by the views that both have: of the relative poses that single views
-    suggest, the one is taken that fits all of them best (a flat board seen from afar has a false twin now and then).
+    Every view has a detection. Zhang's method gives each camera its focal length and the board in its frame; the
+    principal point is the middle of the image. Cameras are then joined to the reference by shared views: of the
+    relative poses that single views suggest, the one that fits all of them best is used (a flat board far away
+    sometimes has a false twin).
     Raises UserError where a camera has too few views, or shares none with the others.
     """
-    by_camera = [sightings.of(sightings.camera == c) for c in range(len(names))]
+    by_camera = [detections.of(detections.camera == c) for c in range(len(names))]
     for name, mine in zip(names, by_camera, strict=True):
         if len(mine.view) < FEWEST_VIEWS:
             fix = "show it the whole board, longer or in better light, check --columns and --rows, or raise --views"
             raise problem(f"camera {name}", f"the board in {FEWEST_VIEWS} views", f"{len(mine.view)}", fix)
     alone = [_alone(mine, points, size) for mine in by_camera]
-    n, n_views = len(names), int(sightings.view.max()) + 1
-    middle = np.tile(np.array(size) / 2, (n, 1))
+    n, n_views = len(names), int(detections.view.max()) + 1
+    principal = np.tile(np.array(size) / 2, (n, 1))
     reference = int(np.argmax([len(mine.view) for mine in by_camera]))
-    still = np.tile(np.eye(4), (n_views, 1, 1))
-    rig = Rig(np.array([f for f, _ in alone]), middle, *_parts(np.tile(np.eye(4), (n, 1, 1))), *_parts(still))
+    identity = np.tile(np.eye(4), (n_views, 1, 1))
+    rig = Rig(np.array([f for f, _ in alone]), principal, *_parts(np.tile(np.eye(4), (n, 1, 1))), *_parts(identity))
     boards = [poses for _, poses in alone]
     cameras = _chained(rig, boards, by_camera, points, names, reference)
     rig = replace(rig, **dict(zip(("R", "t"), _parts(np.stack(cameras)), strict=True)))
-    placed = [_board_pose(rig, v, boards, cameras, sightings.of(sightings.view == v), points) for v in range(n_views)]
-    return replace(rig, **dict(zip(("board_R", "board_t"), _parts(np.stack(placed)), strict=True))), reference
+    board_poses = [
+        _board_pose(rig, v, boards, cameras, detections.of(detections.view == v), points) for v in range(n_views)
+    ]
+    return replace(rig, **dict(zip(("board_R", "board_t"), _parts(np.stack(board_poses)), strict=True))), reference
 
 
-def _alone(mine: Sightings, points: Float64, size: tuple[int, int]) -> tuple[float, dict[int, Float64]]:
-    """Focal length of a camera, and the board in its frame [4, 4] by view."""
+def _alone(mine: Detections, points: Float64, size: tuple[int, int]) -> tuple[float, dict[int, Float64]]:
+    """Return the focal length of a camera, and the board in its frame [4, 4] by view."""
     import cv2
 
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_ZERO_TANGENT_DIST
@@ -61,16 +65,16 @@ def _alone(mine: Sightings, points: Float64, size: tuple[int, int]) -> tuple[flo
 def _chained(
     rig: Rig,
     boards: list[dict[int, Float64]],
-    by_camera: list[Sightings],
+    by_camera: list[Detections],
     points: Float64,
     names: Sequence[str],
     reference: int,
 ) -> list[Float64]:
-    """World to camera [4, 4] of every camera; the world is the reference camera's frame."""
-    known = {reference: np.eye(4)}
-    while len(known) < len(boards):
-        left = [b for b in range(len(boards)) if b not in known]
-        shared, a, b = max((len(boards[a].keys() & boards[b].keys()), a, b) for a in known for b in left)
+    """Return world to camera [4, 4] of every camera; the world is the reference camera's frame."""
+    poses = {reference: np.eye(4)}
+    while len(poses) < len(boards):
+        left = [b for b in range(len(boards)) if b not in poses]
+        shared, a, b = max((len(boards[a].keys() & boards[b].keys()), a, b) for a in poses for b in left)
         if not shared:
             found = f"{', '.join(names[c] for c in left)} without"
             fix = "show the board to two cameras at once"
@@ -82,14 +86,14 @@ def _chained(
             np.median(_errors(rig, both, points, np.stack([pose @ boards[a][int(v)] for v in both.view])))
             for pose in suggested
         ]
-        known[b] = suggested[int(np.argmin(misfits))] @ known[a]
-    return [known[c] for c in range(len(boards))]
+        poses[b] = suggested[int(np.argmin(misfits))] @ poses[a]
+    return [poses[c] for c in range(len(boards))]
 
 
 def _board_pose(
-    rig: Rig, view: int, boards: list[dict[int, Float64]], cameras: list[Float64], mine: Sightings, points: Float64
+    rig: Rig, view: int, boards: list[dict[int, Float64]], cameras: list[Float64], mine: Detections, points: Float64
 ) -> Float64:
-    """Board to world [4, 4]: of what the cameras that see it say, the pose that all of them agree with best."""
+    """Return board to world [4, 4]: of the poses from each camera that sees it, the one that fits all of them best."""
     suggested = [np.linalg.inv(cameras[c]) @ boards[c][view] for c in mine.camera]
     misfits = [
         np.sum(np.median(_errors(rig, mine, points, np.stack([cameras[c] @ pose for c in mine.camera])), axis=1))
@@ -98,13 +102,13 @@ def _board_pose(
     return suggested[int(np.argmin(misfits))]
 
 
-def _errors(rig: Rig, s: Sightings, points: Float64, board_to_camera: Float64) -> Float64:
-    """Distances in px [S, N] between the corners and where these poses [S, 4, 4] put them."""
+def _errors(rig: Rig, s: Detections, points: Float64, board_to_camera: Float64) -> Float64:
+    """Return the distances in px [S, N] between the corners and their projections by these poses [S, 4, 4]."""
     x = points @ board_to_camera[:, :3, :3].transpose(0, 2, 1) + board_to_camera[:, None, :3, 3]
-    uv = rig.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + rig.middle[s.camera][:, None]
+    uv = rig.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + rig.principal[s.camera][:, None]
     return np.asarray(np.linalg.norm(uv - s.uv, axis=-1))
 
 
 def _parts(poses: Float64) -> tuple[Float64, Float64]:
-    """Rotations [n, 3, 3] and translations [n, 3] of poses [n, 4, 4]."""
+    """Return rotations [n, 3, 3] and translations [n, 3] of poses [n, 4, 4]."""
     return poses[:, :3, :3], poses[:, :3, 3]

@@ -1,0 +1,150 @@
+"""Bundle adjustment of an array against scipy, and its errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from board_array import BOARD, CAMERAS, HEIGHT, WIDTH, projected
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.generators.recorder.rig_calibration import calibrate_rig as rig_command
+from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
+    Detections,
+    Freedom,
+    Rig,
+    adjust,
+    exp_so3,
+    rms_px,
+    trimmed,
+)
+from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_rig
+
+
+def detections_of(cameras, shares, noise_px, seed=0):
+    rng = np.random.default_rng(seed)
+    seen = [(c, v, *projected(camera, s)) for v, s in enumerate(shares) for c, camera in enumerate(cameras)]
+    camera, view, uv = (np.array([row[k] for row in seen if row[3]]) for k in range(3))
+    view = np.unique(view, return_inverse=True)[1]
+    return Detections(camera, view, uv + noise_px * rng.normal(size=uv.shape), np.ones(uv.shape[:2], bool))
+
+
+def initial(cameras, detections):
+    return estimate_rig(detections, BOARD.corners, [c.id for c in cameras], (WIDTH, HEIGHT))
+
+
+@pytest.fixture(scope="module")
+def adjusted():
+    cameras, shares = CAMERAS[::3], np.linspace(0, 1, 12)
+    detections = detections_of(cameras, shares, 0.05)
+    rig, reference = initial(cameras, detections)
+    return cameras, detections, rig, reference, adjust(rig, detections, BOARD.corners, reference)
+
+
+def test_rotations_are_those_of_their_vectors():
+    w = np.random.default_rng(0).normal(size=(50, 3)) * np.geomspace(1e-9, 3, 50)[:, None]
+    np.testing.assert_allclose(exp_so3(w), Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
+
+
+def moved(rig, x, reference):
+    """Return the rig after changes of all free parameters, in another order and with scipy's rotations."""
+    n, views = len(rig.focal), len(rig.board_t)
+    poses, rest = x[: 6 * (n - 1)].reshape(-1, 6), x[6 * (n - 1) :]
+    focal, rest = rest[:n], rest[n:]
+    principal, boards = rest[: 2 * n].reshape(n, 2), rest[2 * n :].reshape(views, 6)
+    poses = np.insert(poses, reference, 0.0, axis=0)
+    turn, board_turn = (Rotation.from_rotvec(p[:, :3]).as_matrix() for p in (poses, boards))
+    R, t = turn @ rig.R, np.einsum("nij,nj->ni", turn, rig.t) + poses[:, 3:]
+    board_R = board_turn @ rig.board_R
+    board_t = np.einsum("nij,nj->ni", board_turn, rig.board_t) + boards[:, 3:]
+    return Rig(rig.focal + focal, rig.principal + principal, R, t, board_R, board_t)
+
+
+def test_the_adjustment_is_the_least_squares_solution_and_its_deviations_are_those_of_the_jacobian(adjusted):
+    _, detections, rig, reference, found = adjusted
+    n, views = len(rig.focal), len(rig.board_t)
+
+    def residuals(x):
+        return moved(found.rig, x, reference).residuals(detections, BOARD.corners).ravel()
+
+    def cost(r):
+        return float(np.sum(r.residuals(detections, BOARD.corners) ** 2))
+
+    size = 6 * (n - 1) + 3 * n + 6 * views
+    scale = np.r_[np.full(6 * (n - 1), 1e-2), np.full(3 * n, 10.0), np.full(6 * views, 1e-2)]
+    solution = least_squares(residuals, np.zeros(size), x_scale=scale, ftol=1e-12, xtol=1e-12, gtol=1e-12)
+    assert cost(found.rig) < 0.8 * cost(rig)
+    assert cost(found.rig) <= 2 * solution.cost * (1 + 1e-6)
+    variance = 2 * solution.cost / (detections.uv.size - size)
+    assert found.sigma_px == pytest.approx(math.sqrt(variance), rel=1e-5)
+    assert 0.04 < found.sigma_px < 0.06  # the noise that was added
+    deviation = np.sqrt(np.diag(variance * np.linalg.inv(solution.jac.T @ solution.jac)))
+    poses = np.insert(deviation[: 6 * (n - 1)].reshape(-1, 6), reference, 0.0, axis=0)
+    np.testing.assert_allclose(found.center_m, np.linalg.norm(poses[:, 3:], axis=1), rtol=1e-3)
+    np.testing.assert_allclose(found.turn_deg, np.degrees(np.linalg.norm(poses[:, :3], axis=1)), rtol=1e-3)
+    np.testing.assert_allclose(found.focal_px, deviation[6 * (n - 1) :][:n], rtol=1e-3)
+
+
+def test_poses_come_out_within_their_deviations(adjusted):
+    cameras, _, rig, reference, found = adjusted
+    size = (WIDTH, HEIGHT)
+    cameras_found = rig_command.levelled(found.rig, [c.id for c in cameras], size)
+    errors = pose_errors(cameras_found, cameras)
+    assert errors.translation_m.max() < 4 * found.center_m.max() < 0.01
+    assert errors.rotation_deg.max() < 4 * found.turn_deg.max() < 1.0
+    assert np.abs(found.rig.focal - [c.fx for c in cameras]).max() < 4 * found.focal_px.max()
+    mean_up = -np.mean([c.R[1] for c in cameras_found], axis=0)
+    assert np.abs(mean_up / np.linalg.norm(mean_up) - [0, 0, 1]).max() < 0.05
+    assert np.mean([c.center[1] for c in cameras_found]) < -0.8  # behind the origin, at which they look
+
+
+def test_fixed_parameters_stay(adjusted):
+    cameras, detections, rig, reference, free = adjusted
+    fixed = adjust(rig, detections, BOARD.corners, reference, Freedom(shared_focal=True, centered=True))
+    np.testing.assert_array_equal(fixed.rig.principal, np.tile([WIDTH / 2, HEIGHT / 2], (len(cameras), 1)))
+    steps = fixed.rig.focal - rig.focal
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
+    assert np.ptp(fixed.focal_px) == 0 and (fixed.focal_px > 0).all()
+    assert fixed.rig.t[reference] == pytest.approx(rig.t[reference])
+    assert fixed.sigma_px > free.sigma_px
+
+
+def test_corners_that_do_not_fit_are_left_out(adjusted):
+    _, detections, _, reference, found = adjusted
+    uv = detections.uv.copy()
+    uv[3, 7] += [5.0, -4.0]
+    spoiled = replace(detections, uv=uv)
+    rough = adjust(found.rig, spoiled, BOARD.corners, reference)
+    kept = trimmed(rough.rig, spoiled, BOARD.corners)
+    assert not kept.used[3, 7] and kept.used.mean() > 0.99
+    again = adjust(rough.rig, kept, BOARD.corners, reference)
+    assert rms_px(again.rig, kept, BOARD.corners) == pytest.approx(
+        rms_px(found.rig, detections, BOARD.corners), rel=0.05
+    )
+
+
+def test_cameras_with_too_few_or_no_common_views_are_named():
+    cameras, shares = CAMERAS[:2], np.linspace(0, 1, 12)
+    detections = detections_of(cameras, shares, 0.0)
+    few = detections.of((detections.camera == 0) | (detections.view < 3))
+    with pytest.raises(UserError, match=r"camera cam_01: expected the board in 4 views, found \d"):
+        initial(cameras, few)
+    apart = detections.of((detections.view % 2 == 0) == (detections.camera == 0))
+    with pytest.raises(UserError, match="found cam_0. without"):
+        initial(cameras, apart)
+
+
+def test_an_array_that_no_pinholes_explain_is_refused():
+    cameras, shares = CAMERAS[:3], np.linspace(0, 1, 12)
+    detections = detections_of(cameras, shares, 0.0)
+    late = detections.uv.copy()
+    late[detections.camera == 1] += 8 * np.sin(detections.view[detections.camera == 1])[:, None, None]  # another clock
+    with pytest.raises(UserError, match="reprojection error below 1 px"):
+        rig_command.calibrate_array(
+            replace(detections, uv=late), BOARD, [c.id for c in cameras], (WIDTH, HEIGHT), Freedom()
+        )

@@ -1,0 +1,102 @@
+"""make-dataset with Mitsuba: the audit, geometry and images that agree, and equal bytes after any interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_renderer import files
+from scipy.ndimage import binary_erosion, map_coordinates
+
+from spike4dgs.benchmark.scene.images import read_geometry
+from spike4dgs.benchmark.scene.scene import Target, open_scene
+
+
+def start(out, *more):
+    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), *more]
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def kill_when(process, pattern: str, folder: Path, count: int):
+    """Send SIGKILL as soon as `count` files match; return at once if the process has ended."""
+    until = time.monotonic() + 100
+    while process.poll() is None and len(list(folder.glob(pattern))) < count and time.monotonic() < until:
+        time.sleep(0.002)
+    assert process.poll() is None, process.stdout.read().decode()
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_data) -> dict[str, bytes]:
+    return files(tiny_data / "car-0-tiny")
+
+
+@pytest.mark.slow
+def test_the_audit_finds_noise_and_no_more(tiny_data):
+    report = json.loads((tiny_data / "car-0-tiny.report.json").read_text())
+    ticks, truth = (report["audit"][k] for k in ("ticks", "ground_truth"))
+    assert not all(row["is_key"] for row in ticks["each"]) and len(ticks["each"]) == 4 * 3
+    assert ticks["total"]["psnr_db"] > 36 and truth["total"]["psnr_db"] > 40  # 16 and 64 samples a pixel
+    assert ticks["total"]["mean_percent"] < 5 and truth["total"]["mean_percent"] < 4
+    assert ticks["total"]["mean_percent_moving"] > truth["total"]["mean_percent_moving"] > 0
+    assert report["plan"]["keys"] == 5
+
+
+@pytest.mark.slow
+def test_flow_and_depth_of_a_scene_carry_its_images_over(tiny_data):
+    """Ground truth warped by its flow is the next frame, and depth warps one camera's image into another's."""
+    scene = open_scene(tiny_data / "car-0-tiny")
+    tick, (camera, other) = 40, ("cam_04", "cam_00")
+    here, later, there = (
+        scene.ground_truth(Target(c, t)) for c, t in ((camera, tick), (camera, tick + 20), (other, tick))
+    )
+    geometry = read_geometry(scene.manifest.path(f"geometry/{camera}/{tick:06d}.exr"))
+    v, u = np.mgrid[: here.shape[0], : here.shape[1]] + 0.5
+    moving = binary_erosion(geometry.ids > 0, iterations=2)
+
+    def sampled(image, uv):
+        return map_coordinates(image, [uv[..., 1] - 0.5, uv[..., 0] - 0.5], order=1, mode="nearest")
+
+    flowed = sampled(later, np.stack([u, v], -1) + geometry.flow)
+    against = sampled(later, np.stack([u, v], -1) - geometry.flow)
+    assert np.abs(flowed - here)[moving].mean() < 0.7 * np.abs(against - here)[moving].mean()
+    assert (geometry.flow[geometry.ids == 0] == 0).all()
+    a, b = scene.cameras[camera], scene.cameras[other]
+    uv, _ = b.project(a.unproject(np.stack([u.ravel(), v.ravel()], 1), geometry.depth.ravel().astype(np.float64)))
+    warped = sampled(there, uv.reshape(*here.shape, 2))
+    seen = ((uv > 1) & (uv < [b.width - 1, b.height - 1])).all(1).reshape(here.shape)
+    assert np.median(np.abs(warped - here)[seen]) < 0.6 * np.median(np.abs(there - here)[seen])
+
+
+@pytest.mark.slow
+def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
+    """Killed among the key frames and among the ground truth, then finished by two workers: the same bytes."""
+    work = tmp_path / ".work/car-0-tiny"
+    kill_when(start(tmp_path), "keys/0*.npz", work, 2)
+    assert not (tmp_path / "car-0-tiny").exists()
+    kill_when(start(tmp_path, "--workers", "2"), "scene/images/*/*.exr", work, 1)
+    output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
+    assert process.returncode == 0, output.decode()
+    found = files(tmp_path / "car-0-tiny")
+    assert found["manifest.json"] == whole["manifest.json"] and found == whole
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_scene(whole, tmp_path):
+    from distributed import LocalCluster
+
+    quiet = {"processes": True, "n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**quiet, silence_logs=50) as cluster:
+        output, _ = (process := start(tmp_path, "--scheduler", cluster.scheduler_address)).communicate(timeout=300)
+    assert process.returncode == 0, output.decode()
+    assert files(tmp_path / "car-0-tiny") == whole

@@ -1,0 +1,54 @@
+"""A renderer without Mitsuba, and the files of a folder, for the tests of `make-dataset`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spike4dgs.benchmark.scene.images import gray
+from spike4dgs.generators.rendering.render import StaticViews
+
+
+class FakeRenderer:
+    """Images without Mitsuba: a bright square over noise, to the right with time."""
+
+    def __init__(self, world, cameras, *, seed, spp, background_spp, color=False, static=None, whole_frames=False):
+        self.cameras, self.color = tuple(cameras), color
+        self.shape = (len(cameras), cameras[0].height, cameras[0].width)
+        noise = [
+            np.random.default_rng([0, *c.id.encode()]).uniform(0.2, 0.4, self.shape[1:]).astype(np.float32)
+            for c in cameras
+        ]
+        self.static = static or StaticViews(*np.repeat(np.stack(noise)[None, ..., None], 2, 0).repeat(3, -1))
+
+    def static_on(self, background):
+        return StaticViews(background, background)
+
+    def object_masks(self, t_s):
+        x = np.arange(self.shape[2]) - 10 - 5000 * t_s
+        return np.broadcast_to((np.abs(x) < 5) & (np.abs(np.arange(self.shape[1]) - 20) < 6)[:, None], self.shape)
+
+    traced = object_masks
+
+    def keys(self, t_s):
+        rgb = np.where(self.object_masks(t_s)[..., None], np.float32(0.9), self.static.background)
+        return rgb if self.color else gray(rgb)
+
+    reference_frames = None
+
+    def key_arrays(self, tick, plan):
+        mask = self.object_masks(tick / 20_000)
+        given = {f"given{v}": np.packbits(m) for v, m in enumerate(mask)}
+        values = gray(np.full(3, 0.9, np.float32))
+        return given | {f"values{v}": np.full(m.sum(), values, np.float32) for v, m in enumerate(mask)}
+
+    def depths(self, t_s):
+        return np.full(self.shape, 5.0, np.float32)
+
+    def geometry(self, t_s, dt_s):
+        flow = np.zeros((*self.shape, 2), np.float32)
+        return self.depths(t_s), self.object_masks(t_s).astype(np.uint32), flow
+
+
+def files(folder):
+    """Return relative path -> bytes of every file, hidden ones included."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
