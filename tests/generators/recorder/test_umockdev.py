@@ -33,7 +33,15 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         reason = loaded.stderr.strip().splitlines()[-1]
         pytest.skip(f"the Debian packages umockdev and libusb-1.0-0 are not here ({reason})")
     folder = tmp_path_factory.mktemp("umockdev")
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", f"--junitxml={folder / 'cases.xml'}"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "--numprocesses=0",
+        "-p",
+        "no:cacheprovider",
+        f"--junitxml={folder / 'cases.xml'}",
+    ]
     command += [f"--basetemp={folder / 'work'}", str(Path(usb_cases.__file__))]
     done = subprocess.run(command, env=_environment(), capture_output=True, text=True, timeout=_TIME_LIMIT_S)
     if not (folder / "cases.xml").is_file():
