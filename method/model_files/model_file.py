@@ -1,7 +1,7 @@
-"""Fitted models on disk: one safetensors file with tensors, what they are, and where they come from.
+"""Fitted models on disk: one safetensors file with tensors, their meaning and their provenance.
 
-Nothing in it is code. `kind` says which class reads the tensors (`saved_model.KINDS`), `config` is what it needs
-besides.
+Nothing in it is code. `kind` names the class that reads the tensors (`saved_model.KINDS`), `config` holds its other
+arguments.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class ModelFile:
     provenance: Provenance
 
     def part(self, group: str) -> dict[str, Tensor]:
-        """The tensors of a group by name."""
+        """Return the tensors of a group by name."""
         return part(self.tensors, group)
 
 
 def group(**groups: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of several groups, as `ModelFile.part` finds them again; copies, as some may share their memory."""
+    """Return copies of the tensors of several groups, named for `ModelFile.part`; the originals may share memory."""
     return {f"{name}.{k}": v.detach().clone() for name, tensors in groups.items() for k, v in tensors.items()}
 
 

@@ -1,4 +1,4 @@
-"""Named tensors in one safetensors file, with a schema, text entries, and a hash over everything that matters."""
+"""Named tensors in one safetensors file, with a schema, text entries, and a hash of tensors and entries."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], schema: str, entrie
 
 
 def read_tensors(path: Path, schema: str, key: str, what: str, fix: str) -> tuple[Tensors, dict[str, str]]:
-    """Tensors and entries of a file that `write_tensors` wrote.
+    """Return the tensors and entries of a file that `write_tensors` wrote.
 
-    Raises UserError for a damaged file and for one of another schema; `what` names the kind of file for it, `fix` says
-    what to do.
+    Raises UserError for a damaged file and for one of another schema; `what` names the kind of file in
+    the message, `fix` the remedy.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as f:
@@ -45,12 +45,12 @@ def read_tensors(path: Path, schema: str, key: str, what: str, fix: str) -> tupl
 
 
 def part(tensors: Mapping[str, Tensor], prefix: str) -> Tensors:
-    """The tensors whose name starts with `prefix.`, without it."""
+    """Return the tensors whose name starts with `prefix.`, without the prefix."""
     return {k.removeprefix(f"{prefix}."): v for k, v in tensors.items() if k.startswith(f"{prefix}.")}
 
 
 def _digest(entry: str, tensors: Tensors) -> str:
-    """The format checks its header only; a flipped bit in a tensor would go unnoticed."""
+    """Return the hash of an entry and the tensors; the format itself checks no tensor for flipped bits."""
     digest = hashlib.sha256(entry.encode())
     for name in sorted(tensors):
         digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())

@@ -128,5 +128,5 @@ def require_finite(splats: Splats) -> None:
 
 def not_finite(name: str, index: int) -> UserError:
     """Return the error for a parameter that is NaN or infinite."""
-    fix = "look for a diverging learning rate or a division by 0"
+    fix = "check for a diverging learning rate or a division by 0"
     return problem(f"Splats.{name}", "finite numbers", f"NaN or infinity at Gaussian {index}", fix)

@@ -1,4 +1,4 @@
-"""A browser without a window, driven by its devtools protocol: enough to load a page, press keys, take screenshots."""
+"""A browser without a window, driven by its devtools protocol: it loads a page, presses keys, takes screenshots."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIDTH, HEIGHT = 900, 540
 
 
 def wait_for(what: str, check: Callable[[], Any], seconds: float = 180.0) -> Any:
-    """The first true value of `check`."""
+    """Return the first true value of `check`."""
     end = time.monotonic() + seconds
     while not (found := check()):
         assert time.monotonic() < end, f"no {what} within {seconds:.0f} s"
@@ -47,7 +47,7 @@ class Page:
                 return dict(answer["result"])
 
     def value(self, expression: str) -> Any:
-        """The value of a JavaScript expression."""
+        """Return the value of a JavaScript expression."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
     def press(self, key: str) -> None:
@@ -56,7 +56,7 @@ class Page:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=KEYS[key])
 
     def screenshot(self) -> np.ndarray:
-        """What the page shows, gray [H, W] uint8."""
+        """Return the image of the page, gray [H, W] uint8."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
 
@@ -66,7 +66,7 @@ KEYS = {"End": 35, "Home": 36, "ArrowRight": 39}
 
 @contextmanager
 def browser(profile: Path) -> Iterator[Page]:
-    """A page of a new browser; the test is skipped where there is none."""
+    """Yield a page of a new browser. The test is skipped if there is no browser."""
     binary = next(filter(None, map(shutil.which, NAMES)), None)
     if binary is None:
         pytest.skip("no Chromium here")
@@ -75,8 +75,8 @@ def browser(profile: Path) -> Iterator[Page]:
     flags = ("--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--mute-audio")
     quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
     software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
-    place = (f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0")
-    command = [binary, *flags, *quiet, *software, *place, "about:blank"]
+    options = (f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0")
+    command = [binary, *flags, *quiet, *software, *options, "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port_file = profile / "DevToolsActivePort"

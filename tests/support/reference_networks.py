@@ -1,7 +1,7 @@
-"""The published packages `lpips` and torchvision on random weights, run in a process of their own.
+"""The published packages `lpips` and torchvision with random weights, run in a process of their own.
 
-torchvision's wheel needs compiled operators that a torch for CPUs alone has not; two of them are looked up at import.
-They are declared here, without being used, so that its networks (plain torch) can be imported.
+torchvision's wheel needs compiled operators that a CPU build of torch lacks; its import refers to two of them. They are
+declared here, without being used, so that its networks (plain torch) can be imported.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ Arrays = dict[str, NDArray[Any]]
 
 @cache
 def published_networks() -> Arrays:
-    """Two images `a`, `b` and an input `x`, and for each network its state dict and what it makes of them.
+    """Return two images `a`, `b` and an input `x`, and each network's state dict and output.
 
     `alex/features.0.weight`, ..., `alex/head.0`, ..., `alex/value`; `resnet/conv1.weight`, ..., `resnet/value`. The
-    test is skipped where a package is absent: `pip install --no-deps lpips torchvision` installs both.
+    test is skipped if a package is absent: `pip install --no-deps lpips torchvision` installs both.
     """
     for package in ("lpips", "torchvision"):
         if importlib.util.find_spec(package) is None:

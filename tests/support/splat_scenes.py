@@ -14,7 +14,7 @@ WIDTH, HEIGHT, FOCAL = 100, 70, 100.0
 
 
 def random_splats(n: int, channels: int = 1, seed: int = 0) -> Splats:
-    """Gaussians of all sizes in front of the cameras and a little outside of their image, float64."""
+    """Return Gaussians of all sizes in front of the cameras and a little outside of their image, float64."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -28,7 +28,7 @@ def random_splats(n: int, channels: int = 1, seed: int = 0) -> Splats:
 
 
 def views(count: int = 2) -> Views:
-    """Cameras side by side, turned by a few degrees, that see the Gaussians of `random_splats`."""
+    """Return cameras side by side, turned by a few degrees, that see the Gaussians of `random_splats`."""
     w2c = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     for c in range(count):
         a = 0.08 * (c - (count - 1) / 2)
@@ -39,13 +39,13 @@ def views(count: int = 2) -> Views:
 
 
 def changed(splats: Splats, **tensors: Tensor) -> Splats:
-    """The same Gaussians with some tensors replaced."""
+    """Return the same Gaussians with some tensors replaced."""
     names = ("means", "quats", "scales", "opacities", "colors")
     return Splats(**{name: tensors.get(name, getattr(splats, name)) for name in names})
 
 
 def near_plane() -> tuple[Splats, Views]:
-    """Centres from behind the camera to just before it, some closer than the near plane."""
+    """Return centres from behind the camera to just in front of it, some closer than the near plane."""
     s = random_splats(60, seed=1)
     z = torch.linspace(-1.0, 0.6, 60, dtype=torch.float64)
     z[::7] = 0.0101  # just visible: projected hundreds of pixels wide
@@ -53,13 +53,13 @@ def near_plane() -> tuple[Splats, Views]:
 
 
 def needles() -> tuple[Splats, Views]:
-    """One axis ten thousand times the others."""
+    """Return Gaussians with one axis ten thousand times the others."""
     s = random_splats(80, seed=2)
     return changed(s, scales=torch.tensor([3.0, 3e-4, 3e-4], dtype=torch.float64).expand(80, 3)), views()
 
 
 def pancakes() -> tuple[Splats, Views]:
-    """Flat discs in all orientations, a third of them seen exactly edge-on."""
+    """Return flat discs in all orientations, a third of them seen exactly edge-on."""
     s = random_splats(60, seed=3)
     quats = s.quats.clone()
     quats[::3] = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)  # the thin axis up: a line across the image
@@ -67,7 +67,7 @@ def pancakes() -> tuple[Splats, Views]:
 
 
 def tiny_and_huge() -> tuple[Splats, Views]:
-    """Standard deviations of 1e-6 and of 1e3, alone and within one Gaussian."""
+    """Return standard deviations of 1e-6 and of 1e3, alone and within one Gaussian."""
     s = random_splats(60, seed=4)
     scales = torch.full((60, 3), 1e-6, dtype=torch.float64)
     scales[20:40] = 1e3
@@ -77,14 +77,14 @@ def tiny_and_huge() -> tuple[Splats, Views]:
 
 
 def opacities() -> tuple[Splats, Views]:
-    """Opacity 0, at the visibility limit, just above it, almost 1, and 1."""
+    """Return opacities 0, at the visibility limit, just above it, almost 1, and 1."""
     s = random_splats(100, seed=5)
     values = torch.tensor([0.0, 1 / 255, 0.00393, 0.9989, 0.9991, 0.999999, 1.0], dtype=torch.float64)
     return changed(s, opacities=values[torch.arange(100) % 7], scales=s.scales * 2), views()
 
 
 def equal_depths() -> tuple[Splats, Views]:
-    """All centres at one depth, and pairs at one point: the order is the index."""
+    """Return centres at one depth, and pairs at one point: the order is the index."""
     s = random_splats(90, seed=6)
     means = s.means.clone()
     means[:, 2] = 4.1
@@ -93,7 +93,7 @@ def equal_depths() -> tuple[Splats, Views]:
 
 
 def off_screen() -> tuple[Splats, Views]:
-    """Nothing in view: beside, above, behind."""
+    """Return Gaussians out of view: beside, above, behind."""
     s = random_splats(30, seed=7)
     means = s.means.clone()
     means[:10, 0] += 50
@@ -103,12 +103,12 @@ def off_screen() -> tuple[Splats, Views]:
 
 
 def nothing() -> tuple[Splats, Views]:
-    """No Gaussian at all."""
+    """Return no Gaussian at all."""
     return random_splats(0), views()
 
 
 def far_origin() -> tuple[Splats, Views]:
-    """The random scene, moved with its cameras to 1e4 m from the world's origin."""
+    """Return the random scene, moved with its cameras to 1e4 m from the world's origin."""
     s, v = random_splats(150, seed=8), views()
     away = torch.tensor([7e3, -5e3, 6e3], dtype=torch.float64)
     w2c = v.w2c.clone()
@@ -117,13 +117,13 @@ def far_origin() -> tuple[Splats, Views]:
 
 
 def opaque_stack() -> tuple[Splats, Views]:
-    """Hundreds of opaque Gaussians behind each other: every pixel is finished early."""
+    """Return hundreds of opaque Gaussians behind each other: every pixel is finished early."""
     s = random_splats(400, seed=9)
     return changed(s, opacities=0.5 + 0.5 * s.opacities, scales=s.scales * 3), views()
 
 
 def zero_quaternions() -> tuple[Splats, Views]:
-    """A rotation that does not exist: not drawn."""
+    """Return Gaussians of which a third have no rotation: those are not rendered."""
     s = random_splats(30, seed=10)
     quats = s.quats.clone()
     quats[::3] = 0

@@ -1,4 +1,4 @@
-"""Files of training bursts without a renderer: the toy world, seen by nine cameras, as `make-msdi-data` writes it."""
+"""Files of training bursts without a renderer: the toy world in nine cameras, in the format of `make-msdi-data`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from spike4dgs.benchmark.scene.bursts import Burst, BurstFacts, burst_path, stac
 
 
 def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
-    """`count` images around `t` in [0, 1]; everything within reach of the board counts as moving."""
+    """Return `count` images around `t` in [0, 1]; the pixels of the board at any of these times count as moving."""
     times = t + np.linspace(-0.05, 0.05, count)
-    looks = [[world.look(camera, when) for camera in world.cameras] for when in times]
-    keys = np.array([[image for image, _, _ in row] for row in looks], np.float32)
+    traced = [[world.look(camera, when) for camera in world.cameras] for when in times]
+    keys = np.array([[image for image, _, _ in row] for row in traced], np.float32)
     shape = keys.shape[1:]
     rng = np.random.default_rng(world.seed)
     return Burst(
         keys=keys,
-        depth=np.array([depth for _, depth, _ in looks[count // 2]], np.float32),
-        moving=np.any([[board for _, _, board in row] for row in looks], axis=0),
+        depth=np.array([depth for _, depth, _ in traced[count // 2]], np.float32),
+        moving=np.any([[board for _, _, board in row] for row in traced], axis=0),
         w2c=np.stack([c.w2c for c in world.cameras]),
         K=np.stack([c.K for c in world.cameras]),
         gain=rng.uniform(0.95, 1.05, shape).astype(np.float32),
@@ -29,12 +29,12 @@ def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
 
 
 def write_toy_shard(folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2) -> Path:
-    """The shard `toy-VARIANT` of one rig; returns its path."""
+    """Write the shard `toy-VARIANT` of one rig and return its path."""
     world = ToyWorld(width=width, height=height, seed=variant)
     bursts = [toy_burst(world, t) for t in np.linspace(0.3, 0.7, instants)]
-    looks = [world.look(camera, 1e3) for camera in world.cameras]  # the board is far out of sight
-    stills = [tuple(np.array([look[k] for look in looks], np.float32) for k in range(2))]
+    traced = [world.look(camera, 1e3) for camera in world.cameras]  # the board is far outside all images
+    static = [tuple(np.array([maps[k] for maps in traced], np.float32) for k in range(2))]
     facts = BurstFacts("toy", variant, 0, width, height, len(world.cameras), 1, instants, 1, GAIN, 5e4)
     path = burst_path(folder, "toy", variant)
-    write_bursts(path, facts, stack_bursts([bursts], stills))
+    write_bursts(path, facts, stack_bursts([bursts], static))
     return path

@@ -1,3 +1,5 @@
+"""Published weights of Fast3R and DUSt3R, and MSDI's own weight files."""
+
 from __future__ import annotations
 
 import json
@@ -23,7 +25,7 @@ DUST3R = Dust3rShape(2, 16, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
 
 
 def layer(width: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a published transformer layer."""
+    """Return names and shapes of a published transformer layer."""
     return {
         "norm1.weight": (width,),
         "norm1.bias": (width,),
@@ -46,7 +48,7 @@ def conv(name: str, *shape: int, bias: bool = True) -> dict[str, tuple[int, ...]
 
 
 def head(prefix: str, c: MsdiConfig) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a published DPT head."""
+    """Return names and shapes of a published DPT head."""
     w, f, t = c.head_widths, c.head_features, (c.encoder_width, *[c.fusion_width] * 3)
     names: dict[str, tuple[int, ...]] = {}
     for k in range(4):
@@ -64,7 +66,7 @@ def head(prefix: str, c: MsdiConfig) -> dict[str, tuple[int, ...]]:
 
 
 def fast3r_shapes(c: MsdiConfig) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the published file of Fast3R at the sizes of a configuration."""
+    """Return names and shapes of the published file of Fast3R at the sizes of a configuration."""
     names = conv("encoder.patch_embed.proj", c.encoder_width, 3, c.patch, c.patch)
     for k in range(c.encoder_layers):
         names |= {f"encoder.enc_blocks.{k}.{n}": s for n, s in layer(c.encoder_width).items()}
@@ -112,7 +114,7 @@ def test_the_papers_configuration_takes_dust3rs_encoder() -> None:
     assert {n.split(".")[0] for n in result.fresh} == {"encoder", "extractor", "fusion", "generator", "head"}
 
 
-def test_values_land_where_they_belong(tmp_path: Path) -> None:
+def test_values_have_the_right_names(tmp_path: Path) -> None:
     state = random_state(fast3r_shapes(EMBED), 1)
     save_file(state, tmp_path / "model.safetensors")
     network, before = fresh(EMBED), fresh(EMBED).state_dict()

@@ -1,4 +1,4 @@
-"""What MSDI's networks see: rates against a plain loop, and ideal sensors against the light that they saw."""
+"""Inputs of MSDI's networks: rates against a plain loop, and corrected spikes against the light."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spike4dgs.method.msdi.inputs import Sensors, corrected, network_inputs, own
 
 
 def rates_plainly(spikes: np.ndarray, half_windows: tuple[int, ...]) -> list[float]:
-    """`own_rates` of one pixel [T]."""
+    """Return `own_rates` of one pixel [T]."""
     middle, found = len(spikes) // 2, []
     for half in half_windows:
         times = [t for t in range(middle - half, middle + half) if spikes[t]]
@@ -43,7 +43,7 @@ def test_a_steady_rate_is_measured_by_its_intervals() -> None:
     assert torch.allclose(own_rates(spikes, (7, 20))[0, [0, 2, 4], 0, 0], torch.tensor(1 / 3))
 
 
-def test_ideal_sensors_gather_what_the_light_brought() -> None:
+def test_corrected_rates_are_those_of_the_light() -> None:
     sensors = Sensors(torch.tensor([[1.25, 0.0]]), torch.tensor([[0.1, 0.2]]))
     light = torch.tensor([[0.4, 0.4]])
     seen = (light * sensors.sensitivity + sensors.dark).expand(1, 3, 1, 2)

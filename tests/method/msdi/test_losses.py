@@ -1,3 +1,5 @@
+"""The losses of MSDI's training against loops and closed forms."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -12,8 +14,8 @@ from spike4dgs.method.msdi.training.losses import ALPHA, image_loss, point_loss
 SHAPE = (2, 3, 4, 5)
 
 
-def draw(seed: int, share: float = 0.7) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points, confidence, truth and valid pixels, float64."""
+def random_case(seed: int, share: float = 0.7) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return points, confidence, truth and valid pixels, float64."""
     g = torch.Generator().manual_seed(seed)
     points, truth = (torch.randn(*SHAPE, 3, generator=g, dtype=torch.float64) + 2 for _ in range(2))
     confidence = 1 + torch.rand(*SHAPE, generator=g, dtype=torch.float64) * 4
@@ -21,16 +23,16 @@ def draw(seed: int, share: float = 0.7) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def twin(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor) -> float:
-    """The loss by loops."""
+    """Return the loss by loops."""
     p, c, x, counted = (t.detach().numpy() for t in (points, confidence, truth, valid))
     terms = []
     for sample in range(p.shape[0]):
-        places = [k for k in np.ndindex(*p.shape[1:4]) if counted[sample][k] and np.isfinite(x[sample][k]).all()]
-        if not places:
+        counting = [k for k in np.ndindex(*p.shape[1:4]) if counted[sample][k] and np.isfinite(x[sample][k]).all()]
+        if not counting:
             continue
-        z = sum(float(np.sqrt((p[sample][k] ** 2).sum())) for k in places) / len(places)
-        zgt = sum(float(np.sqrt((x[sample][k] ** 2).sum())) for k in places) / len(places)
-        for k in places:
+        z = sum(float(np.sqrt((p[sample][k] ** 2).sum())) for k in counting) / len(counting)
+        zgt = sum(float(np.sqrt((x[sample][k] ** 2).sum())) for k in counting) / len(counting)
+        for k in counting:
             off = float(np.sqrt(((p[sample][k] / z - x[sample][k] / zgt) ** 2).sum()))
             terms.append(c[sample][k] * off - 0.2 * np.log(c[sample][k]))
     return float(np.mean(terms)) if terms else 0.0
@@ -39,14 +41,14 @@ def twin(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor) -> fl
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 0.05, 0.7, 1.0]))
 def test_point_loss_equals_loops(seed: int, share: float) -> None:
-    parts = draw(seed, share)
+    parts = random_case(seed, share)
     assert float(point_loss(*parts)) == pytest.approx(twin(*parts), abs=1e-12)
     single = [t.float() if t.is_floating_point() else t for t in parts]
     assert float(point_loss(*single)) == pytest.approx(twin(*parts), abs=1e-5)
 
 
 def test_scale_of_a_sample_is_free_and_that_of_a_view_is_not() -> None:
-    points, confidence, truth, valid = draw(0)
+    points, confidence, truth, valid = random_case(0)
     loss = point_loss(points, confidence, truth, valid)
     scales = torch.tensor([0.01, 30.0], dtype=torch.float64)[:, None, None, None, None]
     assert torch.allclose(point_loss(scales * points, confidence, truth, valid), loss)
@@ -60,7 +62,7 @@ def test_scale_of_a_sample_is_free_and_that_of_a_view_is_not() -> None:
 
 
 def test_pixels_that_do_not_count_change_nothing_and_have_no_gradient() -> None:
-    points, confidence, truth, valid = draw(1)
+    points, confidence, truth, valid = random_case(1)
     loss = point_loss(points, confidence, truth, valid)
     points, confidence = points.requires_grad_(), confidence.requires_grad_()
     spoilt = truth.clone()
@@ -74,7 +76,7 @@ def test_pixels_that_do_not_count_change_nothing_and_have_no_gradient() -> None:
 
 
 def test_truth_that_is_not_finite_counts_as_absent() -> None:
-    points, confidence, truth, valid = draw(2)
+    points, confidence, truth, valid = random_case(2)
     truth[0, 1] = torch.nan
     truth[1, 0, 0, 0, 2] = torch.inf
     out = point_loss(points.requires_grad_(), confidence, truth, valid)
@@ -84,7 +86,7 @@ def test_truth_that_is_not_finite_counts_as_absent() -> None:
 
 
 def test_no_valid_pixel_gives_zero_and_zero_gradient() -> None:
-    points, confidence, truth, valid = draw(3, 0.0)
+    points, confidence, truth, valid = random_case(3, 0.0)
     out = point_loss(points.requires_grad_(), confidence.requires_grad_(), truth, valid)
     out.backward()
     assert float(out.detach()) == 0 and points.grad is not None and confidence.grad is not None
@@ -92,7 +94,7 @@ def test_no_valid_pixel_gives_zero_and_zero_gradient() -> None:
 
 
 @pytest.mark.parametrize("points", [torch.zeros(*SHAPE, 3), torch.ones(*SHAPE, 3)])
-def test_points_at_the_origin_or_in_one_place_are_finite(points: Tensor) -> None:
+def test_points_at_the_origin_or_all_equal_are_finite(points: Tensor) -> None:
     points = points.requires_grad_()
     out = point_loss(points, 1 + torch.ones(SHAPE), torch.zeros(*SHAPE, 3), torch.ones(SHAPE, dtype=torch.bool))
     out.backward()
@@ -100,14 +102,14 @@ def test_points_at_the_origin_or_in_one_place_are_finite(points: Tensor) -> None
 
 
 def test_gradients_agree_with_differences() -> None:
-    points, confidence, truth, valid = draw(4)
+    points, confidence, truth, valid = random_case(4)
     small = slice(0, 1), slice(0, 2), slice(0, 2), slice(0, 2)
     a, b = points[small].clone().requires_grad_(), confidence[small].clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda p, c: point_loss(p, c, truth[small], valid[small]), (a, b))
 
 
 def test_best_confidence_is_alpha_over_the_error() -> None:
-    points, _, truth, valid = draw(5, 1.0)
+    points, _, truth, valid = random_case(5, 1.0)
     confidence = torch.full(SHAPE, 1.0, dtype=torch.float64, requires_grad=True)
     out = point_loss(points, confidence, truth, valid)
     (slope,) = torch.autograd.grad(out, confidence)

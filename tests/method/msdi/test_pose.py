@@ -1,3 +1,5 @@
+"""Poses from points: exact, noisy, with unknown focal length, and without any solution."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -18,7 +20,7 @@ TRUE = [c.w2c @ _BACK for c in WORLD.cameras]  # from view 0's frame
 
 
 def seen(scale: float = 1.0) -> Float64:
-    """What each pixel of each view sees, [9, H, W, 3] in view 0's frame."""
+    """Return the points that pixels of all views see, [9, H, W, 3] in view 0's frame."""
     maps = []
     for camera in WORLD.cameras:
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
@@ -30,7 +32,7 @@ def seen(scale: float = 1.0) -> Float64:
 
 
 def errors(w2c: Float64 | None, true: Float64, scale: float = 1.0) -> tuple[float, float]:
-    """Degrees, and distance of the centres in true metres."""
+    """Return degrees, and the distance of the centres in true metres."""
     assert w2c is not None
     turn = float(angle_deg(w2c[:3, :3] @ true[:3, :3].T))
     centres = [-m[:3, :3].T @ m[:3, 3] / s for m, s in ((w2c, scale), (true, 1.0))]
@@ -90,7 +92,7 @@ def test_bad_views_have_no_pose_and_say_why_and_leave_the_others() -> None:
     points = seen()
     points[2] = rng.normal(size=points[2].shape) * 5  # nonsense
     points[3] = np.nan
-    points[4] = 1.0  # all in one place
+    points[4] = 1.0  # all equal
     points[5, ..., 1:] = [0.5, 3.0]  # on a line
     points[6] = -points[6]  # mirrored through the camera
     points[7, :30] = np.nan  # a part is enough

@@ -70,7 +70,7 @@ def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training,
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(data: Bursts, tmp_path: Path) -> None:
     whole, first, second = (Training(data, TINY, FAST, "cpu", seed=2) for _ in range(3))
     losses = [whole.train_step() for _ in range(6)]
-    torch.rand(3)  # what else draws does not matter
+    torch.rand(3)  # other random numbers do not matter
     for _ in range(3):
         first.train_step()
     first.save(tmp_path / "c.safetensors", "key")
@@ -112,7 +112,7 @@ def test_a_step_without_a_finite_gradient_changes_nothing(data: Bursts, monkeypa
 
 
 class Oracle(torch.nn.Module):
-    """Knows the truth, at another scale; `off` is added to one coordinate of all points of odd rows."""
+    """A network that returns the truth at another scale, plus `off` in one coordinate of all points of odd rows."""
 
     def __init__(self, batch: Batch, off: float = 0.0) -> None:
         super().__init__()
@@ -138,7 +138,7 @@ def test_the_truth_has_no_error(data: Bursts) -> None:
     assert found["rra_5"] == found["rta_5"] == found["posed"] == 1
 
 
-def test_errors_that_the_confidence_tells_are_ranked(data: Bursts) -> None:
+def test_errors_that_the_confidence_predicts_are_ranked(data: Bursts) -> None:
     batch = data.fixed(1, 3, TINY.ticks)[0]
     scores = evaluate(Oracle(batch, off=1.0), [batch], "cpu")  # type: ignore[arg-type]
     found = scores.measured
@@ -169,7 +169,7 @@ def test_tfp_is_the_mean_of_the_ticks_around_the_instant() -> None:
     np.testing.assert_array_equal(found[1], 0.25)
 
 
-def test_curves_drop_what_will_be_made_again(tmp_path: Path) -> None:
+def test_curves_drop_rows_that_a_resumed_training_repeats(tmp_path: Path) -> None:
     curve = Curve(tmp_path / "c.csv", 0)
     for step in (50, 100, 150):
         curve.add(step, {"total": step / 7})

@@ -1,4 +1,4 @@
-"""Gaussians before a background against the same Gaussians rendered all at once: equal bits, equal gradients."""
+"""Gaussians in front of a background against the same Gaussians rendered all at once: equal bits, equal gradients."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rows(splats: Splats, index: Tensor) -> Splats:
 
 
 def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int]) -> None:
-    """Compare images and gradients of splats[moving] before the others."""
+    """Compare images and gradients of splats[moving] in front of the others."""
     few = Views(v.w2c[chosen], v.K[chosen], v.width, v.height)
     order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
     everything = [t.requires_grad_() for t in (*rows(splats, order).geometry, rows(splats, order).colors)]
@@ -52,20 +52,20 @@ def test_hard_scenes(scene) -> None:  # type: ignore[no-untyped-def]
     both_ways(splats, v, moving, [0])
 
 
-def test_it_can_be_drawn_with_again() -> None:
+def test_a_background_serves_many_renders() -> None:
     splats, v = random_splats(100, seed=5), views(2)
-    still = torch.arange(100) < 60
-    backdrop = Background(rows(splats, still), v)
-    first = [backdrop.render(rows(random_splats(30, seed=s), torch.arange(30)), [0, 1]).image for s in (1, 2, 1)]
+    static = torch.arange(100) < 60
+    background = Background(rows(splats, static), v)
+    first = [background.render(rows(random_splats(30, seed=s), torch.arange(30)), [0, 1]).image for s in (1, 2, 1)]
     assert torch.equal(first[0], first[2]) and not torch.equal(first[0], first[1])
-    assert len(backdrop) == 60
+    assert len(background) == 60
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
     splats, v = rows(random_splats(20, seed=3), torch.arange(20)), views(1)
-    backdrop = Background(splats, v)
+    background = Background(splats, v)
     for name in ("means", "colors"):
         bad = {n: getattr(splats, n).clone() for n in ("means", "quats", "scales", "opacities", "colors")}
         bad[name][3, 0] = float("nan")
         with pytest.raises(UserError, match="finite"):
-            backdrop.render(Splats(**bad), [0])
+            background.render(Splats(**bad), [0])

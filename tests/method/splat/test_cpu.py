@@ -31,10 +31,10 @@ def differentiate(
     out = render(Splats(*leaves[:5]), Views(leaves[5], v.K, v.width, v.height), backend=backend, depth=depth, **options)
     g = torch.Generator().manual_seed(0)
     loss = torch.zeros((), dtype=torch.float64)
-    for picture, weight in ((out.image, 1.0), (out.alpha[..., None], 1.0), (out.depth, 0.2)):
-        if picture is not None:
-            picture = picture.reshape(*keep.shape, -1)
-            loss = loss + weight * (picture * keep[..., None] * torch.randn(picture.shape, generator=g)).sum()
+    for layer, weight in ((out.image, 1.0), (out.alpha[..., None], 1.0), (out.depth, 0.2)):
+        if layer is not None:
+            layer = layer.reshape(*keep.shape, -1)
+            loss = loss + weight * (layer * keep[..., None] * torch.randn(layer.shape, generator=g)).sum()
     loss.backward()
     return out, dict(zip(NAMES, [t.grad for t in (*leaves, out.means2d)], strict=True))
 
@@ -42,7 +42,7 @@ def differentiate(
 def compare(splats: Splats, v: Views, *, depth: bool = False, antialiased: bool = False) -> None:
     margin = cutoff_margin(splats, v, antialiased=antialiased)
     keep = margin > ON_CUTOFF
-    assert (~keep).sum() <= 0.005 * keep.numel(), "too many pixels on a cut-off to say anything"
+    assert (~keep).sum() <= 0.005 * keep.numel(), "too many pixels are on a cut-off"
     expected, wanted = differentiate(splats, v, "reference", keep, depth, antialiased=antialiased)
     found, got = differentiate(splats, v, "cpu", keep, depth, antialiased=antialiased)
     assert torch.equal(expected.visible, found.visible)
@@ -125,16 +125,16 @@ def test_background_shows_through() -> None:
     torch.testing.assert_close(background.grad, (1 - plain.alpha).sum().expand(3))
 
 
-def test_no_gradient_is_kept_where_none_is_wanted() -> None:
+def test_nothing_is_differentiated_without_need() -> None:
     out = render(random_splats(20), views())
     assert not out.image.requires_grad and not out.means2d.requires_grad
 
 
 def test_only_poses_differentiated() -> None:
     v = views()
-    moving = Views(v.w2c.clone().requires_grad_(), v.K, v.width, v.height)
-    render(random_splats(20), moving).image.sum().backward()
-    assert moving.w2c.grad is not None and moving.w2c.grad[:, :3].abs().sum() > 0
+    trained = Views(v.w2c.clone().requires_grad_(), v.K, v.width, v.height)
+    render(random_splats(20), trained).image.sum().backward()
+    assert trained.w2c.grad is not None and trained.w2c.grad[:, :3].abs().sum() > 0
 
 
 def test_one_line_errors() -> None:

@@ -71,7 +71,7 @@ def test_inner_region_equals_scikit_image() -> None:
 
 
 def ssim_map(a: torch.Tensor, b: torch.Tensor) -> np.ndarray:
-    """The twin's map: its mean's derivative with respect to a per-pixel weight is the map itself."""
+    """Return the twin's map, per pixel, in float64."""
     window = torch.as_tensor(np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2))
     window = (window / window.sum()).view(1, 1, 1, -1)
 
