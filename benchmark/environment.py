@@ -1,4 +1,4 @@
-"""What ran: versions, machine, commit. Recorded beside every number, so that a number can be made again."""
+"""Versions, machine and commit of a run, recorded beside every number so that it can be reproduced."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PACKAGES = (
 
 
 def environment(device: str) -> dict[str, Any]:
-    """Python, platform, package versions, CPU, and the GPU if `device` is one (null otherwise)."""
+    """Return Python, platform, package versions, CPU, and the GPU if `device` is one (null otherwise)."""
     gpu, cuda = _gpu(device) if device_type(device) == "cuda" else (None, None)
     return {
         "python": platform.python_version(),
@@ -38,7 +38,7 @@ def environment(device: str) -> dict[str, Any]:
 
 @cache
 def harness() -> dict[str, Any]:
-    """Version of this package; commit and dirty flag where it runs from a git checkout, null where it is installed."""
+    """Return the version of this package, with commit and dirty flag of a git checkout (null where it is installed)."""
     here = Path(__file__).resolve()
     commit, dirty = None, None
     # An environment inside a checkout is not the checkout: only a tracked file tells the commit it came from.
@@ -50,17 +50,17 @@ def harness() -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """The command as typed, with the program's name without its folder."""
+    """Return the command as typed, with the program's name without its folder."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def utc_now() -> str:
-    """The time as ISO 8601 in UTC, such as 2026-01-31T12:00:00Z."""
+    """Return the time as ISO 8601 in UTC, such as 2026-01-31T12:00:00Z."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def device_type(device: str) -> str:
-    """`cuda` for `cuda:1`, `cpu` for `cpu`."""
+    """Return the kind of a device: `cuda` for `cuda:1`, `cpu` for `cpu`."""
     return device.partition(":")[0]
 
 
@@ -97,7 +97,7 @@ def reset_peak_memory(device: str) -> None:
 
 
 def peak_memory_mb(device: str) -> float | None:
-    """Peak memory since the reset in MB: of the GPU for a CUDA device, of the whole process otherwise.
+    """Return the peak memory since the reset in MB: of the GPU for a CUDA device, of the whole process otherwise.
 
     None where the system does not tell (only Linux does for a process).
     """

@@ -1,4 +1,4 @@
-"""The one error type that users see, and the one sentence form it takes."""
+"""The one error type that users see, and the one form of its sentence."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class UserError(Exception):
-    """Bad input. The message is one line that says where, what was expected, what was found and what to do."""
+    """Bad input. The message is one line: where, what was expected, what was found and what to do."""
 
 
 def problem(where: str | Path, expected: str, found: str, fix: str) -> UserError:

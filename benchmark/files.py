@@ -18,7 +18,7 @@ from spike4dgs.benchmark.errors import problem
 
 _ROOM = ("room for the file", "free some disk space, or choose another folder")
 _ACCESS = ("a folder that may be written to", "change its permissions, or choose another folder")
-_FOLDERS = ("folders on the way to the file", "remove what stands in their place, or choose another folder")
+_FOLDERS = ("folders on the way to the file", "remove what is there instead, or choose another folder")
 _FAILURES = {  # what writing expected, and what to do; other errors are the program's
     errno.ENOSPC: _ROOM,
     errno.EDQUOT: _ROOM,
@@ -109,13 +109,13 @@ def _refuse_constant(name: str) -> None:
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes as hex digits, read in blocks."""
+    """Return the SHA-256 of a file's bytes as hex digits, read in blocks."""
     with open(path, "rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def sha256_json(value: Any) -> str:
-    """SHA-256 of a JSON value in canonical form (sorted keys, no spaces): the content keys of the runner."""
+    """Return the SHA-256 of a JSON value in canonical form (sorted keys, no spaces), for the runner's content keys."""
     return hashlib.sha256(
         json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     ).hexdigest()

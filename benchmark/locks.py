@@ -18,7 +18,7 @@ def locked(file: Path, where: Path | str, expected: str) -> Iterator[None]:
     The system releases the lock when the process ends, however it ends. Raises UserError where another process holds
     it; `where` and `expected` name for the error what is locked, such as "a folder that no other run uses".
     """
-    with writing(file):
+    with writing(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
         opened = open(file, "w")
     with opened:

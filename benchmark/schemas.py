@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @cache
 def load_schema(package: str, name: str) -> dict[str, Any]:
-    """The JSON Schema `name` of a package of ours, such as ("spike4dgs.benchmark", "result.schema.json")."""
+    """Return the JSON Schema `name` of one of our packages, such as ("spike4dgs.benchmark", "result.schema.json")."""
     schema: dict[str, Any] = json.loads((package_files(package) / name).read_text(encoding="utf-8"))
     return schema
 
 
 @cache
 def _registry() -> SchemaRegistry:
-    """The schemas of this package by file name, so that one may refer to parts of another."""
+    """Return the schemas of this package by file name, so that one may refer to parts of another."""
     from referencing import Registry, Resource
 
     resources: SchemaRegistry = Registry()
@@ -35,11 +35,11 @@ def _registry() -> SchemaRegistry:
 
 
 def check_schema(value: Any, schema: dict[str, Any], where: str | Path, fix: str) -> None:
-    """Raise UserError that names the first place where `value` differs from `schema` and its title."""
+    """Raise UserError that names the first difference of `value` from `schema`, and the schema's title."""
     from jsonschema import Draft202012Validator
 
     validator = Draft202012Validator(schema, registry=_registry())
     errors = sorted(validator.iter_errors(value), key=lambda e: (list(map(str, e.absolute_path)), e.message))
     for error in errors:
-        place = "/".join(str(p) for p in error.absolute_path) or "the top level"
-        raise problem(where, f"a valid {schema['title']}", f"at {place}: {error.message[:200]}", fix)
+        path = "/".join(str(p) for p in error.absolute_path) or "the top level"
+        raise problem(where, f"a valid {schema['title']}", f"at {path}: {error.message[:200]}", fix)

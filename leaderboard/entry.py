@@ -47,7 +47,7 @@ def read_entry(path: Path) -> Entry:
 
 
 def write_entry(leaderboard: Path, record: Record, label: str, unverified: list[str], replace: bool) -> Entry:
-    """Write a record's entry, or keep the one that makes the same claim; return the entry that stands now.
+    """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
     An entry that makes the same claim takes over a better label and a shorter list of unverified scores. Raises
     UserError where the method has another record there, unless `replace`.

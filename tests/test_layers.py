@@ -118,7 +118,7 @@ def test_the_command_line_itself_imports_only_its_own_room() -> None:
         ("'''spike4dgs.method'''", "spike4dgs.benchmark", False),
     ],
 )
-def test_the_check_itself_sees_what_it_should(source: str, package: str, caught: bool) -> None:
+def test_the_check_itself_catches_what_it_should(source: str, package: str, caught: bool) -> None:
     assert bool(violations(source, package)) == caught
 
 
@@ -180,7 +180,7 @@ def test_inside_a_room_arrows_go_down(room: str) -> None:
     assert not upward(arrows(room, EVERY_IMPORT), order)
 
 
-def test_the_arrows_themselves_are_seen() -> None:
+def test_the_arrows_themselves_are_found() -> None:
     imports = {"r.a": ["r.b.x"], "r.b.x": ["r.b.y"], "r.b.y": ["r.c"], "r.c": []}
     assert set(arrows("r", imports)) == {("a", "b"), ("b", "c")}
     assert set(arrows("r.b", imports)) == {("x", "y")}

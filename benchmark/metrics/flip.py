@@ -1,8 +1,8 @@
 """FLIP of gray images (Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", 2020, LDR version).
 
-The mean over pixels of the error that a viewer sees when two images alternate on a screen, in 0..1. Both images are
+The mean over pixels of the error that is visible when two images alternate on a screen, in 0..1. Both images are
 filtered by the eye's contrast sensitivity; the difference of their lightness is compressed (exponent 0.7); where edges
-or points appear or vanish it counts more. The screen is assumed 0.7 m wide with 3840 pixels and seen from 0.7 m: 67.02
+or points appear or vanish it counts more. The screen is assumed 0.7 m wide with 3840 pixels, viewed from 0.7 m: 67.02
 pixels per degree, the authors' default.
 
 Gray images have no chroma, so of the three opponent channels only the achromatic one is computed, with separable
@@ -32,7 +32,7 @@ _LARGEST = 203.301655  # HyAB distance of green and blue with Hunt's adjustment:
 
 
 def flip(truth: UInt8, prediction: UInt8) -> float:
-    """FLIP of two sRGB-encoded 8-bit gray images [H, W]: 0 for equal ones, at most 1.
+    """Return FLIP of two sRGB-encoded 8-bit gray images [H, W]: 0 for equal ones, at most 1.
 
     Raises UserError unless both are such images of one size.
 
@@ -44,15 +44,15 @@ def flip(truth: UInt8, prediction: UInt8) -> float:
             found = f"{truth.dtype} {truth.shape}, {prediction.dtype} {prediction.shape}"
             raise problem("FLIP", "two 8-bit gray images of one size", found, "encode both as sRGB first")
     a, b = (_LINEAR[image] for image in (truth, prediction))
-    colour = _compressed(np.abs(_lightness(_seen(a)) - _lightness(_seen(b))))
-    # The detectors see the opponent channel, 116 Y - 16, scaled back to 0..1: linear light itself.
+    colour = _compressed(np.abs(_lightness(_filtered_by_eye(a)) - _lightness(_filtered_by_eye(b))))
+    # The detectors take the opponent channel, 116 Y - 16, scaled back to 0..1: linear light itself.
     feature = np.maximum(*(np.abs(_strength(a, order) - _strength(b, order)) for order in (1, 2)))
     exponent = 1 - (feature / math.sqrt(2)) ** _FEATURE_POWER
     return float(np.mean(colour**exponent))
 
 
 def _linear_light() -> Float64:
-    """Linear light of the 256 levels of sRGB."""
+    """Return the linear light of the 256 levels of sRGB."""
     x = np.arange(256) / 255
     return np.asarray(np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
 
@@ -61,7 +61,7 @@ _LINEAR = _linear_light()
 
 
 def _filtered(image: Float64, rows: Float64, columns: Float64) -> Float64:
-    """Correlation with the outer product of two kernels; the border's pixels are repeated beyond it."""
+    """Return the correlation with the outer product of two kernels; the border's pixels are repeated beyond it."""
     import cv2
 
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, columns, rows, borderType=cv2.BORDER_REPLICATE))
@@ -69,7 +69,7 @@ def _filtered(image: Float64, rows: Float64, columns: Float64) -> Float64:
 
 @cache
 def _kernel(order: int) -> Float64:
-    """Gaussian of the feature detectors (order 0), or its first or second derivative.
+    """Return the Gaussian of the feature detectors (order 0), or its first or second derivative.
 
     The derivatives' positive weights sum to 1 and their negative ones to -1.
     """
@@ -89,20 +89,20 @@ def _sensitivity() -> Float64:
     return np.asarray(weights / weights.sum())
 
 
-def _seen(image: Float64) -> Float64:
-    """Linear light after the eye's contrast sensitivity."""
+def _filtered_by_eye(image: Float64) -> Float64:
+    """Return linear light filtered by the eye's contrast sensitivity."""
     return np.clip(_filtered(image, _sensitivity(), _sensitivity()), 0, 1)
 
 
 def _lightness(light: Float64) -> Float64:
-    """CIE L* in 0..100 of linear light."""
+    """Return CIE L* in 0..100 of linear light."""
     cube = (6 / 29) ** 3
     root = np.where(light > cube, np.cbrt(light), light / (3 * (6 / 29) ** 2) + 4 / 29)
     return np.asarray(116 * root - 16)
 
 
 def _compressed(difference: Float64) -> Float64:
-    """Lightness differences as errors in 0..1: a power, then two straight pieces."""
+    """Return lightness differences as errors in 0..1: a power, then two straight pieces."""
     powered = difference**_COLOUR_POWER
     largest = _LARGEST**_COLOUR_POWER
     knee = _KNEE * largest
@@ -111,7 +111,7 @@ def _compressed(difference: Float64) -> Float64:
 
 
 def _strength(image: Float64, order: int) -> Float64:
-    """How strong the edges (order 1) or points (order 2) of an image are."""
+    """Return the strength of the edges (order 1) or points (order 2) of an image."""
     gauss, derivative = _kernel(0), _kernel(order)
     across, down = _filtered(image, gauss, derivative), _filtered(image, derivative, gauss)
     return np.asarray(np.sqrt(across * across + down * down))

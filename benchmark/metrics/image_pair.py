@@ -1,4 +1,4 @@
-"""What a metric sees of one target: truth, prediction and moving region, checked, in the form that it takes."""
+"""The input of a metric for one target: truth, prediction and moving region, in the forms that metrics take."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ class ImagePair:
 
     @cached_property
     def truth8(self) -> UInt8:
-        """Truth as people see it: sRGB-encoded, 8 bit (computed in float64: the same on every machine)."""
+        """Truth as shown to people: sRGB-encoded, 8 bit (computed in float64: the same on every machine)."""
         return encode_srgb(self.truth)
 
     @cached_property
     def prediction8(self) -> UInt8:
-        """Prediction as people see it: sRGB-encoded, 8 bit."""
+        """Prediction as shown to people: sRGB-encoded, 8 bit."""
         return encode_srgb(self.prediction)
 
     @cached_property
     def ssim(self) -> tuple[float, Float64]:
-        """Mean SSIM and the map [H, W] it comes from (the mean leaves out a border of half a window)."""
+        """Mean SSIM, and the map [H, W] that it is the mean of, without a border of half a window."""
         from skimage.metrics import structural_similarity
 
         value, ssim_map = structural_similarity(  # type: ignore[no-untyped-call]
@@ -71,7 +71,7 @@ class ImagePair:
         return float(value), np.asarray(ssim_map)
 
     def check_image(self) -> None:
-        """Raise UserError for a prediction that shows nothing: one level everywhere, such as a black image."""
+        """Raise UserError for a prediction that has one level everywhere, such as a black image."""
         if self.prediction8.min() == self.prediction8.max():
             found = f"the level {self.prediction8.flat[0]} of 255 everywhere"
             raise problem(self.where, "an image of something", found, "correct the method's fit or render")

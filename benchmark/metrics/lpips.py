@@ -42,7 +42,7 @@ class LpipsNetwork:
     weights: tuple[Tensor, ...]
 
     def distance(self, a: UInt8, b: UInt8) -> float:
-        """LPIPS of two 8-bit gray images [H, W]. Raises UserError unless they are such images of one size."""
+        """Return LPIPS of two 8-bit gray images [H, W]. Raises UserError unless they are such images of one size."""
         import torch
 
         for image in (a, b):
@@ -75,7 +75,7 @@ def make_network(net: str, features: nn.Sequential) -> LpipsNetwork:
 
 
 def empty_trunk(net: str) -> nn.Sequential:
-    """The trunk of `net` with random weights."""
+    """Return the trunk of `net` with random weights."""
     from spike4dgs.benchmark.metrics import neural_trunks
 
     makers = {
@@ -88,7 +88,7 @@ def empty_trunk(net: str) -> nn.Sequential:
 
 @cache
 def _load(net: str, path: Path, sha256: str) -> LpipsNetwork:
-    """The network with the weights of a file; read again when the file's hash changes."""
+    """Return the network with the weights of a file; read again when the file's hash changes."""
     trunk, prefix = empty_trunk(net), "features."
     # The classifier behind the features is in the file too, and not used.
     state = {k.removeprefix(prefix): v for k, v in read_state(path).items() if k.startswith(prefix)}
@@ -97,7 +97,7 @@ def _load(net: str, path: Path, sha256: str) -> LpipsNetwork:
 
 
 def lpips(net: str, a: UInt8, b: UInt8) -> float:
-    """LPIPS of two sRGB-encoded 8-bit gray images [H, W]; 0 for equal ones.
+    """Return LPIPS of two sRGB-encoded 8-bit gray images [H, W]; 0 for equal ones.
 
     Raises UserError for other images, WeightsError where the trunk's file is absent or another one.
     """

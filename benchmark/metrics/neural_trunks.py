@@ -16,7 +16,7 @@ def _conv(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 
 
 
 def alexnet_features() -> nn.Sequential:
-    """Convolutions of AlexNet ("One weird trick for parallelizing convolutional neural networks", 2014)."""
+    """Return the convolutions of AlexNet ("One weird trick for parallelizing convolutional neural networks", 2014)."""
     return nn.Sequential(
         *_conv(3, 64, 11, stride=4, padding=2),
         nn.MaxPool2d(3, 2),
@@ -29,7 +29,7 @@ def alexnet_features() -> nn.Sequential:
 
 
 def vgg16_features() -> nn.Sequential:
-    """Convolutions of VGG-16, configuration D of Simonyan and Zisserman (2015)."""
+    """Return the convolutions of VGG-16, configuration D of Simonyan and Zisserman (2015)."""
     layers: list[nn.Module] = []
     inputs = 3
     for block, (outputs, convolutions) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
@@ -50,13 +50,13 @@ class _Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, H, W] -> [N, 2 * expanded, H, W]."""
+        """Map [N, inputs, H, W] to [N, 2 * expanded, H, W]."""
         x = torch.relu(self.squeeze(x))
         return torch.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], 1))
 
 
 def squeezenet_features() -> nn.Sequential:
-    """Convolutions of SqueezeNet 1.1 (Iandola et al., 2016)."""
+    """Return the convolutions of SqueezeNet 1.1 (Iandola et al., 2016)."""
     return nn.Sequential(
         *_conv(3, 64, 3, stride=2),
         nn.MaxPool2d(3, 2, ceil_mode=True),
@@ -87,7 +87,7 @@ class _Block(nn.Module):
             self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, H, W] -> [N, outputs, H / stride, W / stride]."""
+        """Map [N, inputs, H, W] to [N, outputs, H / stride, W / stride]."""
         y = torch.relu(self.bn1(self.conv1(x)))
         return torch.relu(self.bn2(self.conv2(y)) + self.downsample(x))
 
@@ -107,7 +107,7 @@ class ResNet18(nn.Module):
         self.fc = nn.Linear(512, 1000)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Class scores [N, 1000] of normalised RGB images [N, 3, H, W]."""
+        """Return class scores [N, 1000] of normalised RGB images [N, 3, H, W]."""
         x = self.maxpool(torch.relu(self.bn1(self.conv1(x))))
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         scores: Tensor = self.fc(x.mean(dim=(2, 3)))

@@ -1,8 +1,8 @@
 """Estimated poses against calibrated ones: alignment by a similarity (Sim3), and errors with and without it.
 
-Poses from images alone live in a frame of their own: turned, moved and scaled. The similarity that takes it to the
-scene's frame is found from the cameras' centres and one point along each of their axes (the idea of DUSt3R's alignment
-of posed views): centres alone leave a rig in a line free to roll, and a rig in a plane open to reflection.
+Poses estimated from images alone are in a frame of their own: rotated, translated and scaled. The similarity from it
+to the scene's frame is found from the cameras' centres and one point along each of their axes (the idea of DUSt3R's
+alignment of posed views): centres alone leave a rig in a line free to roll, and a rig in a plane open to reflection.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from spike4dgs.benchmark.scene.cameras import Camera
 
 Float64 = NDArray[np.float64]
 
-# Length of the axes, in median distances between cameras. A narrow array knows its rotations better than its places:
-# on structure from motion of two scenes, longer axes left 0.2 and 0.1 px between the scene as the aligned and as the
-# calibrated views see it, axes of 1 left 0.4 and 0.8.
+# Length of the axes, in median distances between cameras. A narrow array determines its rotations better than its
+# positions: on structure from motion of two scenes, longer axes left 0.2 and 0.1 px between the projections of the
+# scene into the aligned and into the calibrated views, axes of 1 left 0.4 and 0.8.
 REACH = 10.0
 THRESHOLDS_DEG = (5, 15)  # of RRA and RTA
 MAA_DEG = 30  # of the mean average accuracy
@@ -36,11 +36,11 @@ class Sim3:
     t: Float64
 
     def __call__(self, points: Float64) -> Float64:
-        """Points [N, 3] moved."""
+        """Return points [N, 3] transformed."""
         return np.asarray(self.scale * points @ self.R.T + self.t)
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera that sees the moved world as `camera` sees the world: the same pixels, scaled depths."""
+        """Return the camera that projects transformed points to the pixels to which `camera` projects the points."""
         R = camera.R @ self.R.T
         return replace(camera, R=R, t=-R @ self(camera.center[None])[0])
 
@@ -61,7 +61,7 @@ class PoseErrors:
     pair_direction_deg: Float64  # [P]
 
     def summary(self) -> dict[str, float]:
-        """Means over cameras (largest too), and shares of pairs below thresholds; units in the names."""
+        """Return means over cameras (largest too), and shares of pairs below thresholds; units in the names."""
         worst = np.maximum(self.pair_rotation_deg, self.pair_direction_deg)
         accuracy: dict[str, float] = {}
         for name, errors in (("rra", self.pair_rotation_deg), ("rta", self.pair_direction_deg)):
@@ -78,7 +78,7 @@ class PoseErrors:
 
 
 def umeyama(source: Float64, target: Float64) -> Sim3:
-    """The similarity that takes points [N, 3] to their partners with the least sum of squares (Umeyama 1991).
+    """Return the similarity that takes points [N, 3] to their partners with the least sum of squares (Umeyama 1991).
 
     A reflection is never returned: the sign goes to the direction of the smallest singular value.
     Raises UserError for points that do not determine it: fewer than 3, coincident, or on one line.
@@ -99,9 +99,9 @@ def umeyama(source: Float64, target: Float64) -> Sim3:
 
 
 def align_cameras(estimated: Sequence[Camera], true: Sequence[Camera]) -> Sim3:
-    """The similarity from the frame of the estimated cameras to that of the true ones, camera by camera.
+    """Return the similarity from the frame of the estimated cameras to that of the true ones, camera by camera.
 
-    Raises UserError for fewer than 2 cameras, different counts, or cameras that all stand in one place.
+    Raises UserError for fewer than 2 cameras, different counts, or cameras that are all at one position.
     """
     if len(estimated) != len(true) or len(true) < 2:
         found = f"{len(estimated)} estimated and {len(true)} true ones"
@@ -110,18 +110,20 @@ def align_cameras(estimated: Sequence[Camera], true: Sequence[Camera]) -> Sim3:
 
 
 def _skeleton(cameras: Sequence[Camera]) -> Float64:
-    """Centres, and points along the axes at `REACH` median distances [4 N, 3]: it scales as the cameras do."""
+    """Return centres, and points along the axes at `REACH` median distances [4 N, 3]: they scale as the cameras do."""
     centers = np.stack([c.center for c in cameras])
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=-1)[np.triu_indices(len(cameras), 1)]
     reach = REACH * float(np.median(distances))
     if not reach > 1e-12 * max(1.0, float(np.abs(centers).max())):
-        raise problem("alignment", "cameras in different places", "all in one place", "use cameras with a baseline")
+        raise problem(
+            "alignment", "cameras at different positions", "all at one position", "use cameras with a baseline"
+        )
     axes = np.stack([c.R for c in cameras])  # [N, 3, 3], rows are the axes in world coordinates
     return np.concatenate([centers, (centers[:, None] + reach * axes).reshape(-1, 3)])
 
 
 def angle_deg(R: Float64) -> Float64:
-    """Angles [...] of rotations [..., 3, 3] in degrees; exact near 0 and near 180, where arccos of the trace is not."""
+    """Return angles [...] of rotations [..., 3, 3] in degrees; unlike arccos of the trace, exact near 0 and 180."""
     sine = 0.5 * np.linalg.norm(
         np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1), axis=-1
     )
@@ -129,7 +131,7 @@ def angle_deg(R: Float64) -> Float64:
 
 
 def pose_errors(estimated: Sequence[Camera], true: Sequence[Camera]) -> PoseErrors:
-    """Errors of estimated cameras in any frame; they are aligned to the true ones first. Raises as `align_cameras`.
+    """Return the errors of estimated cameras in any frame, aligned to the true ones first. Raises as `align_cameras`.
 
     Pairs are compared as Fast3R and others do, relative rotation and direction of relative translation, but a
     direction that points the opposite way counts as 180 degrees off and is not folded to 0.
@@ -152,6 +154,6 @@ def pose_errors(estimated: Sequence[Camera], true: Sequence[Camera]) -> PoseErro
 
 
 def _relative(cameras: Sequence[Camera], i: NDArray[Any], j: NDArray[Any]) -> tuple[Float64, Float64]:
-    """Rotations [P, 3, 3] from cameras i to cameras j, and centres of j as cameras i see them [P, 3]."""
+    """Return rotations [P, 3, 3] from cameras i to cameras j, and the centres of j in the frames of i [P, 3]."""
     R, centers = np.stack([c.R for c in cameras]), np.stack([c.center for c in cameras])
     return R[j] @ R[i].transpose(0, 2, 1), np.einsum("pij,pj->pi", R[i], centers[j] - centers[i])

@@ -1,4 +1,4 @@
-"""Which metrics a run computes: what `--metrics` means, and why the others have no value."""
+"""The metrics that a run computes, as `--metrics` names them, and the reasons why the others have no value."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Selection:
         return tuple(METRICS[i] for i in self.weights)
 
     def among(self, ids: Collection[str]) -> Selection:
-        """The same without metrics that are not in `ids`."""
+        """Return the selection without metrics that are not in `ids`."""
         kept = {i: sha256 for i, sha256 in self.weights.items() if i in ids}
         dropped = {i: _NOT_ASKED for i in self.weights if i not in ids}
         return Selection(kept, {**self.absent, **dropped})
@@ -35,7 +35,7 @@ _NOT_ASKED = "not asked for"
 
 
 def select_metrics(names: Sequence[str] = (AUTO,)) -> Selection:
-    """The metrics that a command line names: `auto` for all that this machine can compute, and metric ids.
+    """Return the metrics that a command line names: `auto` for all that this machine can compute, and metric ids.
 
     The metrics of linear images are always computed: they need nothing and the ranks rest on them. Raises UserError for
     unknown names, and WeightsError where a metric that is named lacks its weights.

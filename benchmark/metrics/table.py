@@ -3,7 +3,7 @@
 A metric takes one of two kinds of input:
 
 - `linear`: gray linear radiance in the dataset's known unit (1.0 = white), clipped to [0, 1]: no gamma, no scaling.
-- `srgb8`: the same image sRGB-encoded with 8 bits, as people see it: for perceptual and no-reference metrics.
+- `srgb8`: the same image sRGB-encoded with 8 bits, as shown to people: for perceptual and no-reference metrics.
 
 The `*_aligned` metrics multiply the prediction by one least-squares gain per scene, which forgives a method that does
 not know the exposure. The `*_dynamic` metrics use only the moving region that the dataset marks. Metrics of linear

@@ -1,1 +1,1 @@
-"""What people look at after a run: tables, sheets and plots."""
+"""Reports of a run: tables, sheets and plots."""

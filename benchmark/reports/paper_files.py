@@ -12,7 +12,7 @@ from spike4dgs.benchmark.reports.table_files import write_table
 from spike4dgs.benchmark.results.record import Record, dataset_means
 from spike4dgs.benchmark.scene.scene import Scene
 
-Run = tuple[Sequence[Scene], Sequence[Record]]  # scenes seen through one split, and the records of all methods on them
+Run = tuple[Sequence[Scene], Sequence[Record]]  # scenes with one split, and the records of all methods on them
 
 
 def write_paper_table(
@@ -20,7 +20,7 @@ def write_paper_table(
 ) -> None:
     """Write table.* to `folder`: a column for each world, or for each split where the table compares numbers of views.
 
-    runs: one for each split; worlds: scene id -> world. A table of several splits is also drawn, as views.png.
+    runs: one for each split; worlds: scene id -> world. A table of several splits is also plotted, as views.png.
     """
     if not table.splits:
         ((scenes, records),) = runs
@@ -37,7 +37,7 @@ def write_paper_table(
 
 
 def join_splits(runs: Sequence[Sequence[Record]]) -> list[Record]:
-    """Records of the same methods on several splits as one for each method, whose scenes are `column_of` both."""
+    """Join the records of several splits into one record per method, whose scenes are named by `column_of`."""
     joined = []
     for records in zip(*runs, strict=True):
         cells = {column_of(s, r["dataset"]["split"]): cell for r in records for s, cell in r["scenes"].items()}
@@ -47,5 +47,5 @@ def join_splits(runs: Sequence[Sequence[Record]]) -> list[Record]:
 
 
 def column_of(scene: str, split: str) -> str:
-    """Name of a scene as seen through a split."""
+    """Return the name of a scene with a split."""
     return f"{scene}, {split}"

@@ -1,7 +1,7 @@
 """The tables of the Spike4DGS paper: which methods on which worlds, the published numbers, and ranks beside ranks.
 
-The published scenes are not available, so the published values never mix with measured ones: they stand in columns of
-their own, and what is compared is the order of the methods.
+The published scenes are not available, so the published values never mix with measured ones: they have columns of
+their own, and the order of the methods is compared.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ class PublishedTable:
     splits: tuple[str, ...] = ()
 
     def value(self, method: str, column: str, metric: str) -> float | None:
-        """A published value; None where there is none."""
+        """Return a published value; None where there is none."""
         values = self.rows.get(method, {}).get(column)
         return values[self.metrics.index(metric)] if values and metric in self.metrics else None
 
     def mean(self, method: str, metric: str) -> float | None:
-        """The mean over the table's columns, or what is published as such."""
+        """Return the mean over the table's columns, or the published mean."""
         if (published_mean := self.value(method, MEAN, metric)) is not None:
             return published_mean
         values = [self.value(method, column, metric) for column in self.splits or self.worlds]
@@ -66,7 +66,7 @@ class PublishedTable:
 
 @cache
 def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
-    """A table as published; in the track `uncalibrated` its rows are methods that estimate poses themselves.
+    """Return a table as published; in the track `uncalibrated` its rows are methods that estimate poses themselves.
 
     Raises UserError for a number that is none of those in `published_tables.json`, and for a table without that track.
     """
@@ -90,17 +90,17 @@ def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
 def _without_poses(
     number: int, track: str, rows: Mapping[str, Any], partners: Mapping[str, str | None]
 ) -> dict[str, Any]:
-    """The rows of the track `uncalibrated`, each with the published values of its partner."""
+    """Return the rows of the track `uncalibrated`, each with the published values of its partner."""
     if track not in TRACKS:
         raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
     if not set(partners.values()) - {None} <= set(rows):
-        fix = "its rows say where each has its poses from; use --table 1 or 2"
+        fix = "each of its rows states its own poses; use --table 1 or 2"
         raise problem("--track", f"calibrated for table {number}", track, fix)
     return {name: rows[partner] if partner else {} for name, partner in partners.items()}
 
 
 def table_scenes(table: PublishedTable, data: Path, profile: str) -> tuple[Path, ...]:
-    """The scene folders of a table: variant 0 of its worlds. Raises UserError where one is missing."""
+    """Return the scene folders of a table: variant 0 of its worlds. Raises UserError where one is missing."""
     paths = tuple(data / f"{world}-0-{profile}" for world in table.worlds)
     if missing := [p.name for p in paths if not p.is_dir()]:
         fix = f"spike4dgs make-dataset {' '.join(table.worlds)} --profile {profile} --out {data}"
@@ -109,12 +109,12 @@ def table_scenes(table: PublishedTable, data: Path, profile: str) -> tuple[Path,
 
 
 def table_columns(table: PublishedTable) -> tuple[str, ...]:
-    """Metric ids of a table's columns: the published ones, then those that are measured besides."""
+    """Return the metric ids of a table's columns: the published ones, then those that are measured besides."""
     return (*table.metrics, *(m for m in ALSO if m not in table.metrics))
 
 
 def truth_scores(scene: Scene, metrics: Sequence[Metric]) -> dict[str, float | None]:
-    """What those of `metrics` that look at one image only say of the ground truth: means over a scene's targets.
+    """Return the ground truth's own scores by the no-reference metrics among `metrics`: means over a scene's targets.
 
     The measure of such a metric on a scene: methods that score better than the truth did not come nearer to it.
     """
@@ -138,9 +138,9 @@ def build_table(
     worlds: Mapping[str, str],
     truths: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> dict[str, Any]:
-    """A table's content: every cell a number or a reason, published values beside.
+    """Return a table's content: every cell a number or a reason, published values beside.
 
-    worlds: scene id -> column; truths: scene id -> what `truth_scores` says of it.
+    worlds: scene id -> column; truths: scene id -> its `truth_scores`.
     """
     rows = [_row(table, record, worlds) for record in records]
     for metric in table_columns(table):
@@ -196,7 +196,7 @@ def _mean_cost(record: Record, cost: str) -> float | None:
 
 
 def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:
-    """1 for the best; equal values share the better rank; None has none.
+    """Return ranks: 1 for the best; equal values share the better rank; None has none.
 
     >>> ranks([20.0, None, 30.0, 20.0], METRICS["psnr"])
     [2, None, 1, 2]
@@ -207,7 +207,7 @@ def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:
 
 
 def kendall_tau(rows: Sequence[Mapping[str, Any]], metric: str) -> float | None:
-    """Kendall's tau-b between the measured and the published order of the methods; None for fewer than two."""
+    """Return Kendall's tau-b between the measured and the published order of the methods; None for fewer than two."""
     from scipy.stats import kendalltau
 
     pairs = [(r["mean"][metric]["value"], r["mean"][metric]["published"]) for r in rows]

@@ -12,8 +12,8 @@ from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.record import COSTS
 
-Table = Mapping[str, Any]  # what `tables.build_table` gives
-Mark = Callable[[str, int], str]  # text of a value, its place (0 best, 1 second) -> marked text
+Table = Mapping[str, Any]  # from `paper_tables.build_table`
+Mark = Callable[[str, int], str]  # text of a value, its rank (0 best, 1 second) -> marked text
 
 
 def write_table(folder: Path, table: Table) -> None:
@@ -25,7 +25,7 @@ def write_table(folder: Path, table: Table) -> None:
 
 
 def to_csv(table: Table) -> str:
-    """One line for every method, scene and metric."""
+    """Return CSV with one line for every method, scene and metric."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["method", "scene", "metric", "value", "published", "reason", *COSTS])
@@ -39,8 +39,8 @@ def to_csv(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """The means with costs and ranks, then one block for each metric with all scenes, then what is missing and why."""
-    marks: Mark = lambda text, place: (f"**{text}**", f"<u>{text}</u>")[place]  # noqa: E731
+    """Return Markdown: means with costs and ranks, a block for each metric with all scenes, then missing values."""
+    marks: Mark = lambda text, rank: (f"**{text}**", f"<u>{text}</u>")[rank]  # noqa: E731
     lines = [f"# Table {table['table']}: {table['title']}", "", f"Published columns: {table['published_note']}", ""]
     for title, header, body in (_summary(table, marks), *_metric_blocks(table, marks)):
         lines += [f"## {title}", "", _pipes(header), _pipes(["---"] * len(header)), *map(_pipes, body), ""]
@@ -50,8 +50,8 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """The same blocks as `tabular`s for the package booktabs."""
-    marks: Mark = lambda text, place: (rf"\textbf{{{text}}}", rf"\underline{{{text}}}")[place]  # noqa: E731
+    """Return LaTeX: the same blocks as `tabular`s for the package booktabs."""
+    marks: Mark = lambda text, rank: (rf"\textbf{{{text}}}", rf"\underline{{{text}}}")[rank]  # noqa: E731
     lines = []
     for title, header, body in (_summary(table, marks), *_metric_blocks(table, marks)):
         lines += [f"% {title}", rf"\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}", r"\toprule"]
@@ -60,7 +60,7 @@ def to_latex(table: Table) -> str:
 
 
 def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]:
-    """Means over scenes: each metric, its published mean and both ranks, then the costs."""
+    """Return the block of means over scenes: each metric, its published mean and both ranks, then the costs."""
     header, columns = ["method"], [[r["method"] for r in table["rows"]]]
     for m in table["metrics"]:
         cells = [r["mean"][m["id"]] for r in table["rows"]]
@@ -79,15 +79,15 @@ def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]
 
 
 def _metric_blocks(table: Table, mark: Mark) -> list[tuple[str, list[str], list[list[str]]]]:
-    """One block for each metric: all scenes, and what the metric says of the ground truth where it can be asked."""
+    """Return one block for each metric: all scenes, and the ground truth's own score where the metric has one."""
     blocks = []
     for m in table["metrics"]:
-        asked = any(m["id"] in values for values in table["truth"].values())
-        last = ["ground truth"] if asked else []
+        scored = any(m["id"] in values for values in table["truth"].values())
+        last = ["ground truth"] if scored else []
         header, columns = ["method"], [[r["method"] for r in table["rows"]] + last]
         for scene, world in table["scenes"].items():
             cells = [r["scenes"][scene]["values"][m["id"]] for r in table["rows"]]
-            truth = [METRICS[m["id"]].format(table["truth"][scene][m["id"]])] if asked else []
+            truth = [METRICS[m["id"]].format(table["truth"][scene][m["id"]])] if scored else []
             header.append(world)
             columns.append(_marked([c["value"] for c in cells], m["id"], mark) + truth)
             if any(c["published"] is not None for c in cells):
@@ -104,7 +104,7 @@ def _marked(values: Sequence[float | None], metric: str, mark: Mark) -> list[str
 
 
 def _reasons(table: Table) -> list[str]:
-    """Why values are missing: one line for each metric and reason, with the cells it concerns."""
+    """Return the reasons of missing values: one line for each metric and reason, with its cells."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in table["rows"]:
         for scene, cell in row["scenes"].items():

@@ -1,1 +1,1 @@
-"""What methods hand in and what the judge makes of it: predictions folders, result records, scores."""
+"""Predictions folders, which methods hand in, and the result records that the judge makes of them."""

@@ -1,4 +1,4 @@
-"""The predictions folder: what a method hands to the judge.
+"""The predictions folder, which a method hands to the judge.
 
     cam_04/000120.exr   gray linear radiance (half float, channel Y), named by camera and tick as in targets.json
     SHA256SUMS          the images' hashes in the format of coreutils: `sha256sum -c SHA256SUMS` checks the folder
@@ -35,7 +35,7 @@ _LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """Which method, exactly. `trained_on` lists the data sets that learned parts have seen (contamination)."""
+    """The identity of a method. `trained_on` lists the data sets that learned parts were trained on (contamination)."""
 
     name: str
     version: str | None = None
@@ -44,7 +44,7 @@ class MethodInfo:
     trained_on: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return {**asdict(self), "trained_on": list(self.trained_on)}
 
 
@@ -78,7 +78,7 @@ class Predictions:
     sha256: str  # of the text of SHA256SUMS
 
     def read(self, target: Target) -> NDArray[np.float32]:
-        """The predicted radiance of a target [H, W]. Raises UserError where the file differs from SHA256SUMS."""
+        """Read the predicted radiance of a target [H, W]. Raises UserError where the file differs from SHA256SUMS."""
         self._check(f"{target.name}.exr")
         return read_exr(self.root / f"{target.name}.exr")
 

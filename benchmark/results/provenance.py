@@ -1,5 +1,7 @@
-"""Where a saved model comes from: method, scene, cameras, clock, commit. The runner writes it, programs that show
-models read it."""
+"""The provenance of a saved model: method, scene, cameras, clock, commit.
+
+The runner writes it, and programs that show models read it.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio, to_nerfst
 
 @dataclass(frozen=True, eq=False)
 class Provenance:
-    """What a model was fitted to, and by what."""
+    """The method, the scene and the run that a fitted model comes from."""
 
     method: dict[str, Any]  # name, version, params (recipe and settings), seed, trained_on
     scene: str
@@ -41,13 +43,13 @@ class Provenance:
         return self.n_ticks * 1e6 / self.rate_hz
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; cameras in nerfstudio's keys, as in a scene folder."""
+        """Return plain values for JSON; cameras in nerfstudio's keys, as in a scene folder."""
         cameras = [{"camera": c.id, **to_nerfstudio(c)} for c in self.cameras]
         return {k: v for k, v in asdict(self).items() if k != "cameras"} | {"cameras": cameras}
 
 
 def read_provenance(value: Mapping[str, Any], where: str, fix: str) -> Provenance:
-    """What `as_dict` gave. Raises UserError where something is missing or of another type."""
+    """Read the values of `as_dict`. Raises UserError where one is missing or of another type."""
     try:
         cameras = tuple(from_nerfstudio(str(c["camera"]), c, where) for c in value["cameras"])
         found = Provenance(**{**value, "cameras": cameras})
@@ -64,5 +66,5 @@ class Savable(Protocol):
     """A model that can be written to a file and rendered later."""
 
     def save(self, path: Path, provenance: Provenance) -> None:
-        """Write the model atomically to one file, with where it comes from."""
+        """Write the model and its provenance atomically to one file."""
         ...

@@ -1,7 +1,7 @@
 """The result record, format `spike4dgs-result/1`: one method on all scenes of a dataset.
 
-The JSON Schema says what a record looks like; `check_record` also holds its numbers together: means are the means of
-what they summarise, and a scene without a value makes the mean null, never smaller.
+The JSON Schema states the form of a record; `check_record` also checks its numbers: means are the means of their parts,
+and a scene without a value makes the mean null, never smaller.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _AGAIN = "score the predictions again"
 
 
 def missing_cell(status: str, error: str) -> Cell:
-    """A cell without values: `status` is failed or skipped, `error` is the reason in one line."""
+    """Return a cell without values: `status` is failed or skipped, `error` is the reason in one line."""
     nothing = ("gain_aligned", "predictions_sha256", *COSTS, "budget", "device")
     return {
         "status": status,
@@ -75,7 +75,7 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
 
 
 def dataset_means(cells: Mapping[str, Cell]) -> Values:
-    """Mean over scenes of each metric; None where any scene has no value."""
+    """Return the mean over scenes of each metric; None where any scene has no value."""
     means: Values = {}
     for metric in METRICS:
         values = [cell["metrics"].get(metric) for cell in cells.values()]
@@ -84,7 +84,7 @@ def dataset_means(cells: Mapping[str, Cell]) -> Values:
 
 
 def is_complete(record: Record) -> bool:
-    """Whether every scene was scored. Only complete records are ranked."""
+    """Return whether every scene was scored. Only complete records are ranked."""
     return all(cell["status"] == "ok" for cell in record["scenes"].values())
 
 
@@ -109,7 +109,7 @@ def check_record(record: Record, where: str | Path) -> None:
 
 
 def check_method_name(name: str) -> None:
-    """Raise UserError unless a method's name can stand in file names."""
+    """Raise UserError unless a method's name can be part of file names."""
     schema = load_schema("spike4dgs.benchmark", "result.schema.json")["$defs"]["method"]["properties"]["name"]
     if not re.fullmatch(schema["pattern"], name):
         raise problem("method", "a name of letters, digits and + . _ -", repr(name), "rename the method")
@@ -122,7 +122,7 @@ def _check_metric_names(values: Values, where: str) -> None:
 
 
 def _check_computed(cell: Cell, where: str) -> None:
-    """Values only of metrics that were computed, and a note for every metric without one."""
+    """Raise UserError for values of metrics that were not computed, and for metrics without value or note."""
     if unknown := sorted(cell["computed"].keys() - METRICS.keys()):
         raise problem(where, "computed metrics of the table", ", ".join(unknown), _AGAIN)
     for metric, sha256 in cell["computed"].items():
@@ -146,7 +146,7 @@ def _check_means(found: Values, expected: Values, where: str) -> None:
 
 
 def same_value(a: float | None, b: float | None, tolerance: float) -> bool:
-    """Whether two values are both None, or numbers within `tolerance` of each other."""
+    """Return whether two values are both None, or numbers within `tolerance` of each other."""
     return a == b if a is None or b is None else abs(a - b) <= tolerance
 
 

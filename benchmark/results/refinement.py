@@ -1,8 +1,8 @@
-"""Refined scores: held-out cameras moved to where a model sees them, by pixels that are not scored.
+"""Refined scores: held-out cameras at the poses that a model estimates for them, from pixels that are not scored.
 
-A model that estimates poses may have `refine(camera, image, still, t_us) -> Camera`. It gets one image of each
-held-out camera, taken from its spikes over a time without targets, and the pixels at which nothing moves in any target.
-Everything else is rendered from the camera that it returns. Such scores use test pixels, so they stand in a record of
+A model that estimates poses may have `refine(camera, image, background, t_us) -> Camera`. It gets one image of each
+held-out camera, made from its spikes over a time without targets, and the pixels at which nothing moves in any target.
+The targets are then rendered from the camera that it returns. Such scores use test pixels, so they have a record of
 their own, METHOD.refined, beside the scores at the calibrated pose.
 """
 
@@ -23,31 +23,34 @@ MAX_TICKS = 200  # of the image: at 20 kHz 10 ms
 
 
 class Refinable(Protocol):
-    """A model that can say from where it sees an image."""
+    """A model that can estimate the pose of an image."""
 
-    def refine(self, camera: Camera, image: NDArray[np.float32], still: NDArray[np.bool_], t_us: float) -> Camera:
-        """The camera near `camera` from which `image` [H, W] is seen at `t_us`, by the pixels of `still` [H, W]."""
+    def refine(self, camera: Camera, image: NDArray[np.float32], background: NDArray[np.bool_], t_us: float) -> Camera:
+        """Return a camera near `camera` that renders `image` [H, W] at `t_us`, by the pixels in `background` [H, W]."""
         ...
 
 
 def refined_cameras(model: Refinable, scene: Scene) -> dict[str, Camera]:
-    """Each held-out camera where the model sees it. Raises UserError for a view in which every pixel moves."""
+    """Return the held-out cameras at the model's estimates of their poses.
+
+    Raises UserError for a view in which every pixel moves.
+    """
     cameras = {}
     for name in scene.test:
         targets = [t for t in scene.targets if t.camera == name]
         start, stop = free_ticks([t.tick for t in targets], scene.n_ticks)
         image = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
-        still = ~np.any([scene.moving(t) for t in targets], axis=0)
-        if not still.any():
+        background = ~np.any([scene.moving(t) for t in targets], axis=0)
+        if not background.any():
             fix = "publish the scores at the calibrated pose only"
             raise problem(f"{scene.id}, {name}", "pixels at which nothing moves", "none", fix)
         t_us = 0.5 * (scene.t_us(start) + scene.t_us(stop))
-        cameras[name] = model.refine(scene.cameras[name], image.astype(np.float32), still, t_us)
+        cameras[name] = model.refine(scene.cameras[name], image.astype(np.float32), background, t_us)
     return cameras
 
 
 def free_ticks(ticks: Sequence[int], n_ticks: int) -> tuple[int, int]:
-    """The longest stretch [start, stop) of the clip without any of `ticks`, its middle part if it is very long.
+    """Return the longest stretch [start, stop) of the clip without any of `ticks`, its middle part if it is very long.
 
     Raises UserError where every tick is taken.
     """

@@ -61,7 +61,7 @@ def open_for(root: Path, scene: Scene) -> Predictions:
 
 
 def _pairs(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, ImagePair]]:
-    """Targets with their images, checked, each camera's in the order of time.
+    """Yield targets with their images, checked, each camera's in the order of time.
 
     Read anew each time, so that no clip is held in memory: a pair knows the one before it, and no more.
     """
@@ -80,7 +80,7 @@ def _pairs(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, Ima
 
 
 def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
-    """Where each scene's predictions are: `root` itself for a single scene, or subfolders named by scene id."""
+    """Return each scene's predictions folder: `root` itself for a single scene, or a subfolder named by scene id."""
     if (root / SUMS).is_file() or len(scenes) == 1 and not (root / scenes[0].id).is_dir():
         if len(scenes) > 1:
             fix = "give the folder that holds one predictions folder per scene id"

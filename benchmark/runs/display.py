@@ -1,4 +1,4 @@
-"""How far a run is: bars with an estimate on a terminal, lines with one elsewhere."""
+"""Progress of a run: bars with an estimate on a terminal, lines with one elsewhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 @dataclass(frozen=True)
 class ShownCell:
-    """What a cell in progress reports to."""
+    """The callables to which a cell in progress reports."""
 
     progress: Callable[..., None]  # (done, total, note="")
     note: Callable[[str], None]
@@ -38,7 +38,7 @@ class RunDisplay:
 
     @contextmanager
     def cell(self, title: str) -> Iterator[ShownCell]:
-        """Show one cell; yields what it reports to."""
+        """Show one cell, and yield the callables to which it reports."""
         task = self._bars.add_task(title, total=None)
         label = f"[{self._done + 1}/{self._cells}] {title}"
         self._console.print(label, highlight=False, markup=False)

@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, in several, or on a cluster. All give the same results in the same order.
+"""Executors run tasks in this process, in several, or on a cluster, with the same results in the same order.
 
 An executor is a function `run(task, chunks)` that yields `task(chunk)` for every chunk, in order. The task travels to
 each worker once.
@@ -27,7 +27,7 @@ _task: Callable[[Any], Any] | None = None  # of a worker process
 
 @contextmanager
 def executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Run]:
-    """The executor for `workers` processes, or for a dask.distributed scheduler such as tcp://host:8786.
+    """Yield the executor for `workers` processes, or for a dask.distributed scheduler such as tcp://host:8786.
 
     Raises UserError for fewer than one worker, for both at once, where distributed is not installed, where the
     scheduler does not answer within 10 s or has no workers, and, while running, where a worker process dies.
@@ -49,7 +49,7 @@ def here(task: Callable[[C], R], chunks: Iterable[C]) -> Iterator[R]:
 
 
 def chunked(items: Sequence[int], most: int = 16) -> list[list[int]]:
-    """Runs of neighbouring items: neighbours share work, and many chunks keep all workers busy to the end."""
+    """Return runs of neighbouring items: neighbours share work, and many chunks keep all workers busy to the end."""
     return [list(items[k : k + most]) for k in range(0, len(items), most)]
 
 
@@ -69,7 +69,7 @@ def _in_processes(task: Callable[[C], R], chunks: Sequence[C], workers: int) -> 
 
 
 def _ordered(futures: list[Future[R]]) -> Iterator[R]:
-    """Results in order; each is forgotten when it was yielded."""
+    """Yield results in order; each is dropped once it is yielded."""
     futures.reverse()
     while futures:
         yield futures.pop().result()
@@ -85,7 +85,7 @@ def _start_worker(task: Callable[[Any], Any], threads: int, parent: int) -> None
 
 
 def _die_with(parent: int) -> None:
-    """A worker whose parent was killed would wait for work for ever."""
+    """End this worker with its parent: after the parent was killed it would wait for work for ever."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

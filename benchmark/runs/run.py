@@ -33,7 +33,7 @@ from spike4dgs.benchmark.weights import WeightsError
 
 @dataclass(frozen=True)
 class Settings:
-    """What all cells of a run share."""
+    """The settings that all cells of a run share."""
 
     out: Path
     seed: int = 0
@@ -43,14 +43,14 @@ class Settings:
 
 
 def predictions_folder(out: Path, method: str, scene: str) -> Path:
-    """Where a run keeps the predictions of a cell."""
+    """Return the folder in which a run keeps the predictions of a cell."""
     return out / "predictions" / method / scene
 
 
 def run_matrix(
     scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings, console: Console
 ) -> list[Record]:
-    """Run, or resume, every method on every scene, and score everything from the files. One record per method.
+    """Run, or resume, every method on every scene, and score everything from the files. Return a record per method.
 
     A cell that fails does not stop the others: its reason is in the record and its traceback in a log file.
     Raises UserError for scenes that are damaged or given twice, before any work begins.
@@ -79,7 +79,7 @@ def run_matrix(
 
 
 def _run_cell(job: Job, selection: Selection, out: Path, display: RunDisplay) -> list[Cell]:
-    """The cells of the job's variants."""
+    """Run or resume a job, and return the cells of its variants."""
     folders = [predictions_folder(out, variant.name, job.scene.id) for variant in job.variants]
     log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
     with display.cell(f"{job.method.name} on {job.scene.id}") as shown:

@@ -141,7 +141,7 @@ class RunBenchmark:
         leaderboard: Path | None,
         replace: bool,
     ) -> bool:
-        """Submit every record. Return True where the leaderboard refused one: the run's results stand all the same."""
+        """Submit every record. Return whether the leaderboard refused one; the run's results remain."""
         refused = False
         for name in (r["method"]["name"] for r in records):
             predictions = settings.out / "predictions" / name

@@ -1,14 +1,14 @@
-"""Training bursts: what an array of cameras sees around some instants, for networks that learn from many views at once.
+"""Training bursts: radiance at the cameras of an array around some instants, for networks that learn from many views.
 
 `make-msdi-data` writes them and `train-msdi` reads them: one safetensors file for each variant of a world. In a file R
-rigs of V cameras look at the scene, each at I instants. A burst is the radiance from REACH ticks before an instant to
+rigs of V cameras view the scene, each at I instants. A burst is the radiance from REACH ticks before an instant to
 REACH after it; spikes are made of it anew at every use. Only pixels in which something moves, or its shadow, are stored
 for each instant:
 
 | tensor | type and shape | what it is |
 |---|---|---|
-| `still` | half [R, V, H, W] | radiance without what moves |
-| `still_depth` | half [R, V, H, W] | metres along the optical axis to what stands still, inf: nothing |
+| `still` | half [R, V, H, W] | radiance of the background |
+| `still_depth` | half [R, V, H, W] | metres along the optical axis to the background, inf: nothing |
 | `w2c`, `K` | double [R, V, 4, 4], [R, V, 3, 3] | cameras, OpenCV, pixel centres at +0.5 |
 | `gain`, `dark` | half [V, H, W] | maps of V sensors: relative sensitivity, spikes per tick in the dark |
 | `given.r.i` | uint8 [V H W / 8, rounded up] | a bit for each pixel: whether rig r stores it for its instant i |
@@ -52,7 +52,7 @@ _FIX = "delete it and run `spike4dgs make-msdi-data` again"
 
 @dataclass(frozen=True)
 class BurstFacts:
-    """What a file says of itself."""
+    """The facts that a file states of itself."""
 
     world: str
     variant: int
@@ -63,7 +63,7 @@ class BurstFacts:
     rigs: int
     instants: int  # of each rig
     spp: int  # samples per pixel
-    radiance_gain: float  # spikes per tick of a pixel that sees white
+    radiance_gain: float  # spikes per tick of a pixel at radiance 1 (white)
     photons_per_spike: float  # of its shot noise
 
     @property
@@ -73,17 +73,17 @@ class BurstFacts:
 
     @property
     def hidden(self) -> bool:
-        """Whether the variant is kept for scores."""
+        """True for a variant that is kept for scores."""
         return self.variant in HIDDEN_VARIANTS
 
 
 @dataclass(frozen=True, eq=False)
 class Burst:
-    """What V cameras of a rig see around an instant."""
+    """Radiance, depth and cameras of the V views of a rig around an instant."""
 
     keys: Float32  # [k, V, H, W] radiance at k ticks, evenly from -REACH to REACH around the instant
     depth: Float32  # [V, H, W] metres along the optical axis at the instant, inf: nothing
-    moving: NDArray[np.bool_]  # [V, H, W] stored for this instant: sees something that moves, its shadow, or is near
+    moving: NDArray[np.bool_]  # [V, H, W] stored for this instant: shows something that moves, its shadow, or is near
     w2c: Float64  # [V, 4, 4]
     K: Float64  # [V, 3, 3]
     gain: Float32  # [V, H, W] relative sensitivity
@@ -99,21 +99,21 @@ class BurstFile:
     sha256: str  # of its tensors
 
     def __len__(self) -> int:
-        """Number of bursts."""
+        """Return the number of bursts."""
         return self.facts.rigs * self.facts.instants
 
     def read(self, number: int) -> Burst:
-        """The burst `number`, of all views. Raises UserError where the file is damaged."""
+        """Read the burst `number`, of all views. Raises UserError where the file is damaged."""
         f = self.facts
         rig, instant = divmod(number, f.instants)
         shape = (f.views, f.height, f.width)
         try:
             with safetensors.safe_open(self.path, framework="np") as file:
-                still, depth, w2c, K = (file.get_slice(n)[rig] for n in ("still", "still_depth", "w2c", "K"))
+                background, depth, w2c, K = (file.get_slice(n)[rig] for n in ("still", "still_depth", "w2c", "K"))
                 given, values, there = (file.get_tensor(f"{n}.{rig}.{instant}") for n in ("given", "values", "depth"))
                 gain, dark = file.get_tensor("gain"), file.get_tensor("dark")
             moving = np.unpackbits(given, count=int(np.prod(shape))).astype(bool).reshape(shape)
-            keys = np.repeat(still.astype(np.float32)[None], len(values), axis=0)
+            keys = np.repeat(background.astype(np.float32)[None], len(values), axis=0)
             keys[:, moving] = values
             depth = depth.astype(np.float32)
             depth[moving] = there
@@ -123,7 +123,7 @@ class BurstFile:
 
 
 def burst_path(folder: Path, world: str, variant: int) -> Path:
-    """The file of a variant."""
+    """Return the path of a variant's file."""
     return folder / f"{world}-{variant}.safetensors"
 
 
@@ -142,7 +142,7 @@ def open_bursts(path: Path) -> BurstFile:
 
 
 def open_folder(folder: Path) -> list[BurstFile]:
-    """All files of bursts in a folder, by world and variant. Raises UserError as `open_bursts`, and for none at all."""
+    """Open all burst files of a folder, by world and variant. Raises UserError as `open_bursts`, and for no file."""
     files = [open_bursts(path) for path in sorted(folder.glob("*.safetensors"))]
     if not files:
         fix = "make some with `spike4dgs make-msdi-data`, or correct the path"
@@ -169,16 +169,16 @@ def write_bursts(path: Path, facts: BurstFacts, arrays: Mapping[str, NDArray[Any
         safetensors.numpy.save_file(plain, part, metadata={_SCHEMA: meta})
 
 
-def stack_bursts(rigs: Sequence[Sequence[Burst]], stills: Sequence[tuple[Float32, Float32]]) -> Arrays:
-    """The arrays of a file from the bursts of each rig, and each rig's `still` and `still_depth` [V, H, W].
+def stack_bursts(rigs: Sequence[Sequence[Burst]], backgrounds: Sequence[tuple[Float32, Float32]]) -> Arrays:
+    """Return the arrays of a file from the bursts of each rig, and each rig's `still` and `still_depth` [V, H, W].
 
-    Where a burst is not `moving`, its keys and depth are not looked at. Gain and dark maps are the first burst's.
+    Where a burst is not `moving`, its keys and depth are not used. Gain and dark maps are the first burst's.
     """
     most = 100.0  # radiance far beyond what saturates a sensor, within half floats
     first = rigs[0][0]
     arrays: Arrays = {
-        "still": np.stack([np.minimum(still, most) for still, _ in stills]).astype(np.float16),
-        "still_depth": np.stack([_half(depth) for _, depth in stills]),
+        "still": np.stack([np.minimum(radiance, most) for radiance, _ in backgrounds]).astype(np.float16),
+        "still_depth": np.stack([_half(depth) for _, depth in backgrounds]),
         "w2c": np.stack([bursts[0].w2c for bursts in rigs]),
         "K": np.stack([bursts[0].K for bursts in rigs]),
         "gain": first.gain.astype(np.float16),

@@ -1,9 +1,9 @@
-"""What a camera does to light, estimated from recordings that any owner can make: before uniform light, in the dark.
+"""A camera's response to light, estimated from recordings that any owner can make: under uniform light, in the dark.
 
-A pixel's rate is (spikes - 1) / (ticks between the first and the last), which knows nothing of the charge before the
+A pixel's rate is (spikes - 1) / (ticks between the first and the last), which does not depend on the charge before the
 first spike and after the last: over T ticks it is wrong by about 1 / T, where a count is by 1 / (rate T). Then
 
-    gain = (rate before uniform light - dark rate) / its mean,      dark = rate in the dark
+    gain = (rate under uniform light - dark rate) / its mean,      dark = rate in the dark
 
 The gain map is the n(x, y) of Spike4DGS (eq. 15): a method that wants it takes the estimate, never a simulator's truth.
 """
@@ -25,7 +25,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Two recordings of one camera: before uniform light of a known radiance, and in the dark."""
+    """Two recordings of one camera: under uniform light of a known radiance, and in the dark."""
 
     flat: SpikeStream
     dark: SpikeStream
@@ -34,12 +34,12 @@ class Recordings:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a camera does to light, as far as its recordings tell.
+    """A camera's response to light, as estimated from its recordings.
 
     Attributes:
         gain: [H, W], relative sensitivity, mean 1.
         dark: [H, W], spikes per tick in the dark.
-        radiance_gain: spikes per tick of a pixel of gain 1 that sees radiance 1, without the dark rate.
+        radiance_gain: spikes per tick of a pixel of gain 1 at radiance 1, without the dark rate.
     """
 
     gain: Float32
@@ -47,15 +47,15 @@ class Calibration:
     radiance_gain: float
 
     def radiance(self, rate: Float32) -> Float32:
-        """Linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""
+        """Return the linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""
         light = np.maximum(rate - self.dark, 0)
         return np.asarray(light / np.where(self.gain > 0, self.gain, np.inf) / self.radiance_gain, np.float32)
 
 
 def estimate(recordings: Recordings) -> Calibration:
-    """Gain and dark maps of a camera.
+    """Return the gain and dark maps of a camera.
 
-    Raises UserError where the recordings do not fit together, or where no pixel sees the light.
+    Raises UserError where the recordings do not fit together, or where no pixel responds to the light.
     """
     flat, dark = recordings.flat, recordings.dark
     if (flat.width, flat.height) != (dark.width, dark.height) or recordings.flat_radiance <= 0:
@@ -69,7 +69,7 @@ def estimate(recordings: Recordings) -> Calibration:
 
 
 def rates(stream: SpikeStream) -> NDArray[np.float64]:
-    """Spikes per tick [H, W] of steady light; a pixel without spikes counts as having half of one."""
+    """Return spikes per tick [H, W] under steady light; a pixel without spikes counts as having half of one."""
     n = stream.width * stream.height
     first, last, count = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
     first_and_last(rows(stream.packed), first, last, count)
@@ -81,7 +81,7 @@ def rates(stream: SpikeStream) -> NDArray[np.float64]:
 
 @kernel
 def first_and_last(packed: Any, first: Any, last: Any, count: Any) -> None:
-    """Tick of the first and last spike and number of spikes of every pixel [P], from packed rows [T, bytes]."""
+    """Fill the ticks of the first and last spike and spike count of every pixel [P], from packed rows [T, bytes]."""
     for tick in range(len(packed)):
         for byte in range(packed.shape[1]):
             bits = packed[tick, byte]

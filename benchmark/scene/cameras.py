@@ -66,19 +66,19 @@ class Camera:
         return -self.R.T @ self.t
 
     def project(self, points: Float64) -> tuple[Float64, Float64]:
-        """World points [N, 3] -> pixel coordinates [N, 2] and depths z [N] (z <= 0 is behind the camera)."""
+        """Return pixel coordinates [N, 2] and depths z [N] of world points [N, 3] (z <= 0 is behind the camera)."""
         p = np.asarray(points, dtype=np.float64) @ self.R.T + self.t
         z = p[:, 2]
         return np.stack([self.fx * p[:, 0] / z + self.cx, self.fy * p[:, 1] / z + self.cy], axis=-1), z
 
     def unproject(self, uv: Float64, z: Float64) -> Float64:
-        """Pixel coordinates [N, 2] and depths z [N] -> world points [N, 3]."""
+        """Return the world points [N, 3] of pixel coordinates [N, 2] and depths z [N]."""
         p = np.stack([(uv[:, 0] - self.cx) / self.fx * z, (uv[:, 1] - self.cy) / self.fy * z, z], axis=-1)
         return (p - self.t) @ self.R
 
 
 def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: float, width: int, height: int) -> Camera:
-    """A camera at `origin` that looks at `target`, square pixels, principal point in the middle."""
+    """Return a camera at `origin` that looks at `target`, square pixels, principal point in the middle."""
     forward = np.asarray(target, dtype=np.float64) - origin
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -88,7 +88,7 @@ def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: fl
 
 
 def to_nerfstudio(camera: Camera) -> dict[str, Any]:
-    """Per-frame nerfstudio keys (fl_x ... transform_matrix), OpenGL camera-to-world."""
+    """Return per-frame nerfstudio keys (fl_x ... transform_matrix), OpenGL camera-to-world."""
     return {
         "fl_x": camera.fx,
         "fl_y": camera.fy,
@@ -101,7 +101,7 @@ def to_nerfstudio(camera: Camera) -> dict[str, Any]:
 
 
 def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -> Camera:
-    """Camera from per-frame nerfstudio keys. Raises UserError where a key is missing or the pose is no rigid motion."""
+    """Return the camera of per-frame nerfstudio keys. Raises UserError for missing keys and non-rigid poses."""
     try:
         m = np.array(frame["transform_matrix"], dtype=np.float64) @ _OPENGL
         fx, fy, cx, cy = (float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
@@ -123,12 +123,12 @@ def check_rotation(R: Float64, where: str) -> None:
 
 
 def mitsuba_to_world(camera: Camera) -> Float64:
-    """The `to_world` matrix [4, 4] of Mitsuba's `perspective` sensor for this pose."""
+    """Return the `to_world` matrix [4, 4] of Mitsuba's `perspective` sensor for this pose."""
     return np.asarray(camera.c2w @ _MITSUBA)
 
 
 def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
-    """Intrinsics of Mitsuba's `perspective` sensor (fov along x in degrees, principal point offsets).
+    """Return the intrinsics of Mitsuba's `perspective` sensor (fov along x in degrees, principal point offsets).
 
     Mitsuba's offsets are relative to the film size and count opposite to ours: cx = W (0.5 - offset_x).
     Raises UserError for non-square pixels, which the sensor cannot model.
@@ -148,7 +148,7 @@ def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
 def from_mitsuba(
     id: str, to_world: Float64, x_fov: float, offset: tuple[float, float], size: tuple[int, int]
 ) -> Camera:
-    """Camera from Mitsuba's `to_world` [4, 4], `x_fov` (degrees), principal point offsets and (width, height)."""
+    """Return the camera of Mitsuba's `to_world` [4, 4], `x_fov` (degrees), principal point offsets, (width, height)."""
     width, height = size
     f = 0.5 * width / np.tan(np.radians(x_fov) / 2)
     m = np.asarray(to_world, dtype=np.float64) @ _MITSUBA

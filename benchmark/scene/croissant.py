@@ -78,7 +78,7 @@ def write_croissant(root: Path, meta: dict[str, Any], description: str) -> None:
 
 
 def _licence(name: str) -> str:
-    """The address of an SPDX licence such as CC0-1.0; any other text as it is."""
+    """Return the address of an SPDX licence such as CC0-1.0; any other text as it is."""
     is_spdx = re.fullmatch(r"[A-Z][A-Za-z0-9.]*(-[A-Za-z0-9.]+)*-\d[A-Za-z0-9.]*", name)
     return f"https://spdx.org/licenses/{name}.html" if is_spdx else name
 
@@ -108,7 +108,7 @@ def _file_set(name: str, description: str, pattern: str, kind: str) -> dict[str,
 
 
 def _records(root: Path) -> list[dict[str, Any]]:
-    """What a loader can iterate over; a list that is empty is left out, because loaders cannot read one.
+    """Return the lists that a loader can iterate over, without empty ones, which loaders cannot read.
 
     Both come from JSON: mlcroissant reads no EXR, not even a file's name.
     """
@@ -132,7 +132,7 @@ def _records(root: Path) -> list[dict[str, Any]]:
 def _record_set(
     name: str, description: str, file: str, items: str, fields: dict[str, tuple[str, str]]
 ) -> dict[str, Any]:
-    """A record for each of the objects in the list `items` of a JSON file; `fields` has their description and type."""
+    """Return a record for each object in the list `items` of a JSON file; `fields` has their description and type."""
 
     def field(key: str, about: str, kind: str) -> dict[str, Any]:
         named = {"@type": "cr:Field", "@id": f"{name}/{key}", "name": key, "description": about, "dataType": kind}

@@ -64,7 +64,7 @@ class EventStream:
         return Events(*(column[first:stop] for column in self.events))  # type: ignore[arg-type]
 
     def __len__(self) -> int:
-        """Number of events."""
+        """Return the number of events."""
         return len(self.events.t)
 
     def _check(self, found: Events, path: Path) -> None:

@@ -47,7 +47,7 @@ class Frames(Sequence[Frame]):
     files: Manifest  # of the scene, with this camera's frames alone
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.ticks)
 
     @overload

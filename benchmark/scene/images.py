@@ -21,15 +21,15 @@ _AGAIN = "render or restore it"
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What a camera sees at an instant, besides light."""
+    """Depth, object ids and flow of a view at an instant."""
 
     depth: Float32  # [H, W] metres along the optical axis; inf where there is nothing
-    ids: NDArray[np.uint32]  # [H, W] 0 where nothing moves, otherwise the moving thing (scene.json: "instances")
-    flow: Float32  # [H, W, 2] where the surface point of this pixel goes, in pixels (x right, y down)
+    ids: NDArray[np.uint32]  # [H, W] 0 where nothing moves, otherwise the moving object (scene.json: "instances")
+    flow: Float32  # [H, W, 2] motion of the surface point in pixels (x right, y down)
 
 
 def gray(image: Float32) -> Float32:
-    """Gray of linear RGB: [..., 3] to [...], float32."""
+    """Return the gray values [...] of linear RGB [..., 3], float32."""
     r, g, b = (np.float32(weight) * image[..., i].astype(np.float32) for i, weight in enumerate(GRAY))
     return np.asarray(r + g + b)  # not a matrix product: its last bit would depend on the machine
 
@@ -83,7 +83,7 @@ def write_geometry(path: Path, depth: Float32, ids: NDArray[np.uint32], flow: Fl
 
 
 def read_geometry(path: Path) -> Geometry:
-    """Read what `write_geometry` wrote. Raises UserError where it is missing, damaged or lacks a channel."""
+    """Read the file that `write_geometry` wrote. Raises UserError where it is missing, damaged or lacks a channel."""
     names = ("Z", "id", "flow.x", "flow.y")
     found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again")
     flow = np.stack([found["flow.x"], found["flow.y"]], axis=-1)
@@ -113,7 +113,7 @@ def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: floa
 
 
 def _read_channels(path: Path, names: tuple[str, ...], what: str, fix: str) -> dict[str, NDArray[Any]]:
-    """Channels by name [H, W], in the type that the file has."""
+    """Return channels by name [H, W], in the type that the file has."""
     import OpenEXR
 
     if not path.is_file():

@@ -23,7 +23,7 @@ class Manifest:
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def path(self, name: str) -> Path:
-        """Path of a recorded file after its size and hash were checked (once per process).
+        """Return the path of a recorded file after its size and hash were checked (once per process).
 
         Raises UserError where the file is not recorded, is missing, or differs from its record.
         """

@@ -57,7 +57,7 @@ class TrainingScene:
     streams: tuple[SpikeStream, ...]
     rate_hz: float
     n_ticks: int
-    radiance_gain: float  # spikes per tick of a pixel that sees radiance 1 (white)
+    radiance_gain: float  # spikes per tick of a pixel at radiance 1 (white)
     recordings: tuple[Recordings | None, ...] = ()  # calibration recordings of each camera, if there are any
     found_frames: Mapping[str, Frames] = field(default_factory=dict)  # by camera; see `frames`
     found_events: Mapping[str, EventStream] = field(default_factory=dict)  # by camera; see `events`
@@ -122,7 +122,7 @@ class Scene:
 
     @property
     def radiance_gain(self) -> float:
-        """Spikes per tick of a pixel that sees radiance 1 (white)."""
+        """Spikes per tick of a pixel at radiance 1 (white)."""
         return float(self.meta["radiance_gain"])
 
     @property
@@ -137,7 +137,7 @@ class Scene:
 
     @property
     def is_default_split(self) -> bool:
-        """Whether this is the split that is meant where none is named."""
+        """True for the split that is used where none is named."""
         return bool(self.split == self.meta["default_split"])
 
     def t_us(self, tick: int) -> float:
@@ -244,7 +244,7 @@ def check_meta(meta: dict[str, Any], path: Path) -> None:
 
 
 def _read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
-    """The targets of every split: a split that holds out what the default one does has the same."""
+    """Read the targets of every split: splits that hold out the same cameras as the default one have its targets."""
     data = read_json(path, "the scored images")
     splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
     held_out = splits[meta["default_split"]].test

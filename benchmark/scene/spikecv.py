@@ -62,7 +62,7 @@ def import_spikecv(
         out: New folder to write.
         rate_hz: Ticks per second, which SpikeCV does not record.
         transforms: nerfstudio file (JSON) with intrinsics and a pose for each camera, named by the key "camera".
-        radiance_gain: Spikes per tick of a pixel that sees white. With 1, radiance is in spikes per tick.
+        radiance_gain: Spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per tick.
         rows_top_down: The file stores the top row first. The usual order of this camera is bottom row first.
         licence: Licence of the recording.
     """
@@ -90,8 +90,8 @@ def import_spikecv(
 def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False) -> int:
     """Write the streams of a scene as SpikeCV folders, one per camera, rows bottom-up (SpikeCV's default).
 
-    SpikeCV has no place for the rate, the poses, the clock, the radiance gain, gaps and the scored images: they stay
-    behind. Streams whose H*W is no multiple of 8 are packed anew without padding, as SpikeCV counts bytes.
+    SpikeCV does not store the rate, the poses, the clock, the radiance gain, gaps and the scored images: they are left
+    out. Streams whose H*W is no multiple of 8 are packed anew without padding, as SpikeCV counts bytes.
 
     spike4dgs export-spikecv data/car-0-small --out car-spikecv
 
@@ -138,7 +138,7 @@ def _spikecv_folders(folder: Path) -> list[Path]:
 
 
 def _read_config(folder: Path) -> _Source:
-    """The stream of a SpikeCV folder. Raises UserError where config.yaml or the stream is missing or damaged."""
+    """Read config.yaml of a SpikeCV folder. Raises UserError where it or the stream is missing or damaged."""
     import yaml
 
     path = folder / CONFIG
@@ -167,7 +167,7 @@ def _source(path: Path, width: int, height: int) -> _Source:
 
 
 def _read_ticks(source: _Source) -> Iterator[UInt8]:
-    """Rows of our layout, at most _TICKS at a time."""
+    """Yield rows of our layout, at most _TICKS at a time."""
     pixels = source.width * source.height
     with open(source.path, "rb") as file:
         for start in range(0, source.n_ticks, _TICKS):
@@ -178,7 +178,7 @@ def _read_ticks(source: _Source) -> Iterator[UInt8]:
 
 
 def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
-    """A camera for each stream; intrinsics stand at each frame or once at the top, as nerfstudio allows.
+    """Read a camera for each stream; intrinsics are given at each frame or once at the top, as nerfstudio allows.
 
     Raises UserError where a stream has no pose, or the streams do not fit the poses or each other.
     """

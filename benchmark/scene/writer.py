@@ -59,12 +59,12 @@ class SceneDescription:
         return {DEFAULT_SPLIT: default} | dict(self.splits)
 
     def targets_of(self, split: Split) -> tuple[Target, ...]:
-        """The scored images of a split."""
+        """Return the scored images of a split."""
         return tuple(t for t in self.targets if t.camera in split.test)
 
 
 def stream_name(camera: str) -> str:
-    """Path of a camera's stream inside the scene folder."""
+    """Return the path of a camera's stream inside the scene folder."""
     return f"spikes/{camera}.dat"
 
 
@@ -109,7 +109,7 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
 
 
 def _write_targets(root: Path, scene: SceneDescription) -> None:
-    """The scored images: of the default split, and of those splits that hold out other cameras."""
+    """Write the scored images: of the default split, and of those splits that hold out other cameras."""
     lists = {
         name: [{"camera": t.camera, "tick": t.tick} for t in scene.targets_of(split)]
         for name, split in scene.all_splits.items()
@@ -120,7 +120,7 @@ def _write_targets(root: Path, scene: SceneDescription) -> None:
 
 
 def _write_transforms(root: Path, scene: SceneDescription) -> None:
-    """The default split's streams and targets, and in transforms_all.json every image that there is.
+    """Write the default split's streams and targets, and in transforms_all.json every image that there is.
 
     Images of training cameras stay out of transforms_train.json: they are ground truth, which no method may train on.
     """
@@ -171,7 +171,7 @@ def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.flo
 
 
 def read_colmap(folder: Path) -> tuple[Camera, ...]:
-    """Cameras of a COLMAP model of PINHOLE cameras, one per registered image, named by the image."""
+    """Return the cameras of a COLMAP model of PINHOLE cameras, one per registered image, named by the image."""
     import pycolmap
 
     model = pycolmap.Reconstruction(str(folder))

@@ -1,1 +1,1 @@
-"""What all speed measurements share, and those of this room."""
+"""Speed measurements: the parts that all share, and those of this room."""

@@ -15,14 +15,14 @@ COLUMNS = ("operation", "by", "min ms", "median ms", "times as fast", "largest e
 
 
 def random_stream(ticks: int, width: int, height: int, seed: int = 0) -> SpikeStream:
-    """A stream of random bits: no layout or sparsity to profit from."""
+    """Return a stream of random bits: no layout or sparsity to profit from."""
     rng = np.random.default_rng(seed)
     packed = rng.integers(0, 256, (ticks, bytes_per_tick(width, height)), dtype=np.uint8)
     return SpikeStream(packed, width, height, 20_000.0)
 
 
 def unpack_plainly(stream: SpikeStream) -> np.ndarray:
-    """The window that contains all ticks, [T, H, W] uint8 upright: np.unpackbits and a flip of the rows."""
+    """Return the window of all ticks, [T, H, W] uint8 upright, by np.unpackbits and a flip of the rows."""
     bits = np.unpackbits(stream.packed, axis=1, count=stream.width * stream.height, bitorder="little")
     return np.ascontiguousarray(bits.reshape(-1, stream.height, stream.width)[:, ::-1])
 

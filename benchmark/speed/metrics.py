@@ -26,7 +26,7 @@ COLUMNS = ("metric", "height", "width", "by", "min ms", "median ms", "error")
 
 
 def make_image_pair(height: int, width: int, seed: int = 0) -> ImagePair:
-    """A smooth random image, a noisy version, and both as they were one millisecond before."""
+    """Return a smooth random image, a noisy version, and both as they were one millisecond before."""
     from scipy.ndimage import gaussian_filter
 
     rng = np.random.default_rng(seed)
@@ -39,7 +39,7 @@ def make_image_pair(height: int, width: int, seed: int = 0) -> ImagePair:
 
 
 def runs(pair: ImagePair) -> dict[str, Callable[[], object]]:
-    """What to call for each metric that is not another one with a gain."""
+    """Return a call for each metric that is not another one with a gain."""
     calls: dict[str, Callable[[], object]] = {
         m.id: partial(_anew, m, pair) for m in METRICS.values() if not m.aligned and m.weights is None
     }
@@ -51,12 +51,12 @@ def runs(pair: ImagePair) -> dict[str, Callable[[], object]]:
 
 
 def _anew(metric: Metric, pair: ImagePair) -> float | None:
-    """The value from the radiance on: a copy of the pair has nothing computed yet."""
+    """Return the metric's value, computed from the radiance on: a copy of the pair has nothing cached."""
     return metric.measure(replace(pair))
 
 
 def package_flip(truth: UInt8, prediction: UInt8) -> Callable[[], float] | None:
-    """FLIP by the package flip-evaluator on the images as RGB; None where it is not installed."""
+    """Return a call of the package flip-evaluator on the images as RGB; None where it is not installed."""
     try:
         from flip_evaluator import evaluate
     except ImportError:

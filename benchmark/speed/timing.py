@@ -1,4 +1,4 @@
-"""What all speed measurements share: repeated timing, other packages' files, a table on the console and as CSV."""
+"""Repeated timing, modules of other packages, and a table on the console and as CSV, for all speed measurements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spike4dgs.benchmark.files import atomic_path
 
 
 def time_ms(run: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """(minimum, median) wall time in ms of `repeats` calls, after one uncounted (compilation, page faults)."""
+    """Return (minimum, median) wall time in ms of `repeats` calls, after one uncounted (compilation, page faults)."""
     run()
     times = []
     for _ in range(repeats):
@@ -25,9 +25,9 @@ def time_ms(run: Callable[[], object], repeats: int) -> tuple[float, float]:
 
 
 def module_of(package: str, file: str) -> ModuleType | None:
-    """The module in one file of a package, whose own `__init__` does not run; None where the package is not installed.
+    """Import one file of a package without running its `__init__`; return None where the package is not installed.
 
-    Raises ImportError where the file is not there, or needs what is not there.
+    Raises ImportError where the file is missing, or imports something that is missing.
     """
     found = importlib.util.find_spec(package)
     if found is None or not found.submodule_search_locations:
@@ -49,7 +49,7 @@ def show_table(
 ) -> None:
     """Print the rows, and write them to `csv_path` if given.
 
-    `notes`, one a row or none at all, stand below the table, and in the CSV file's last column `note`.
+    `notes`, one a row or none at all, are printed below the table, and are the CSV file's last column `note`.
     """
     from rich.console import Console
     from rich.table import Table

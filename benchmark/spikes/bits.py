@@ -47,14 +47,14 @@ def in_threads(function: Callable[..., None], n: int, *args: object, small: bool
 
 
 def rows(packed: UInt8) -> UInt8:
-    """The same bytes as a plain, contiguous, read-only array: the one type that kernels are compiled for."""
+    """Return the same bytes as a plain, contiguous, read-only array: the one type that kernels are compiled for."""
     view = np.ascontiguousarray(packed).view(np.ndarray)
     view.flags.writeable = False
     return view
 
 
 def lanes(width: int) -> UInt64:
-    """Table [256, width]: the eight bits of a byte as eight numbers in `width` words (uint8 for 1, uint16 for 2)."""
+    """Return a table [256, width]: the eight bits of a byte as eight numbers in `width` words (uint8: 1, uint16: 2)."""
     bits = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
     return bits.astype(np.dtype(f"u{width}")).view(np.uint64)
 

@@ -1,7 +1,7 @@
 """Gaps of a recording: ticks that a camera has no data of. Its stream holds zeros there, which are no measurement.
 
 scene.json (and stream.json of a recording without poses) lists every gap, so that a reader can refuse the recording,
-leave the ticks out of a rate, or draw them.
+leave the ticks out of a rate, or show them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Gap:
 
 
 def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], path: Path) -> tuple[Gap, ...]:
-    """The gaps that a description lists, in order of camera and tick. `n_ticks`: of each camera's stream.
+    """Return the gaps that a description lists, in order of camera and tick. `n_ticks`: of each camera's stream.
 
     Raises UserError where a record is none, names no camera of the recording, leaves its clip or overlaps another.
     """
@@ -56,7 +56,7 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
 
 
 def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:
-    """Raise UserError where there are gaps, unless they are allowed: the one place where a recording is refused."""
+    """Raise UserError where there are gaps, unless they are allowed. Recordings are refused here and nowhere else."""
     if gaps and not allow_gaps:
         g = gaps[0]
         found = f"{len(gaps)} gap(s), the first: {g.camera} from tick {g.first_tick}, {g.ticks} ticks ({g.reason})"
@@ -69,7 +69,7 @@ def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:
 
 
 def present(gaps: Iterable[Gap], n_ticks: int) -> NDArray[np.bool_]:
-    """Which ticks of one camera's clip have data: [n_ticks] bool."""
+    """Return which ticks of one camera's clip have data: [n_ticks] bool."""
     mask = np.ones(n_ticks, np.bool_)
     for gap in gaps:
         mask[gap.first_tick : gap.stop_tick] = False

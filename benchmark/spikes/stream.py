@@ -24,7 +24,7 @@ T = TypeVar("T", bound=np.generic)
 
 
 def bytes_per_tick(width: int, height: int) -> int:
-    """Bytes of one packed tick: ceil(width * height / 8)."""
+    """Return the bytes of one packed tick: ceil(width * height / 8)."""
     return (width * height + 7) // 8
 
 
@@ -50,7 +50,7 @@ class SpikeStream:
         return len(self.packed)
 
     def window(self, start: int, stop: int) -> UInt8:
-        """Spikes of ticks [start, stop) as [stop - start, H, W] uint8 of 0 and 1.
+        """Return the spikes of ticks [start, stop) as [stop - start, H, W] uint8 of 0 and 1.
 
         Raises UserError for a window that leaves the clip.
         """
@@ -60,7 +60,7 @@ class SpikeStream:
         return bits.unpack(self.packed[start:stop], self.width, self.height, self.rows_bottom_up)
 
     def counts(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Spikes per pixel in ticks [start, stop) as [H, W] uint16, counted on the packed bits.
+        """Return the spikes per pixel in ticks [start, stop) as [H, W] uint16, counted on the packed bits.
 
         Raises UserError for a window that leaves the clip or is longer than 65535 ticks.
         """
@@ -103,7 +103,7 @@ def open_stream(
     n_ticks: int | None = None,
     gaps: tuple[Gap, ...] = (),
 ) -> SpikeStream:
-    """Memory-map a stream file. `gaps`: what the file's description says it lacks.
+    """Memory-map a stream file. `gaps`: the ticks that it lacks by its description.
 
     Raises UserError where the file is missing, empty, no whole number of ticks, or not `n_ticks` long (if given).
     """

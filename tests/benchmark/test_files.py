@@ -83,15 +83,15 @@ def test_a_limit_that_is_met_in_the_middle_of_a_file(tmp_path: Path, name: str) 
 
 
 @each_writer
-def test_a_file_in_place_of_a_folder(tmp_path: Path, name: str) -> None:
+def test_a_file_instead_of_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_bytes(b"content")
-    refused(tmp_path / "file" / name, WRITERS[name], "file exists; remove what stands in their place")
-    refused(tmp_path / "file/deeper" / name, WRITERS[name], "not a directory; remove what stands in their place")
+    refused(tmp_path / "file" / name, WRITERS[name], "file exists; remove what is there instead")
+    refused(tmp_path / "file/deeper" / name, WRITERS[name], "not a directory; remove what is there instead")
     assert (tmp_path / "file").read_bytes() == b"content"
 
 
 @each_writer
-def test_a_folder_in_place_of_a_file(tmp_path: Path, name: str) -> None:
+def test_a_folder_instead_of_a_file(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     refused(tmp_path / name, WRITERS[name], "is a directory; remove the folder of that name")
 

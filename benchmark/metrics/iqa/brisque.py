@@ -1,7 +1,7 @@
-"""BRISQUE: how unnatural an image looks, by a regression on the statistics of its brightness.
+"""BRISQUE: the unnaturalness of an image, by a regression on the statistics of its brightness.
 
 36 numbers (18 at each of two scales) go into the support vector machine that the authors trained on the LIVE database.
-About 0 is a good image and 100 a bad one; the regression knows no bounds, so that scores below 0 and above 100 occur
+About 0 is a good image and 100 a bad one; the regression is not bounded, so that scores below 0 and above 100 occur
 and are kept. It was trained on photographs: compare images of one scene with it, not scenes.
 
 Source: Mittal, Moorthy, Bovik, "No-Reference Image Quality Assessment in the Spatial Domain", IEEE TIP 2012, and the
@@ -46,7 +46,7 @@ class _Regression:
 
 
 def brisque(image: UInt8, where: str = "the image") -> float:
-    """BRISQUE of a gray sRGB-encoded image [H, W]: lower is better, 0 to 100 as a rule.
+    """Return BRISQUE of a gray sRGB-encoded image [H, W]: lower is better, 0 to 100 as a rule.
 
     Raises UserError, with `where` as the image's name, for arrays that are no such image, are smaller than 14x14, or
     have too little texture.
@@ -59,7 +59,7 @@ def brisque(image: UInt8, where: str = "the image") -> float:
 
 
 def brisque_features(image: UInt8) -> Float64:
-    """The 36 features of a gray image [H, W]; NaN where there is nothing to fit.
+    """Return the 36 features of a gray image [H, W]; NaN where there is nothing to fit.
 
     Each scale gives shape and variance of the MSCN values, and for the products with the neighbour to the right, below,
     below right and below left: shape, mean, variance of the left side, variance of the right side.
@@ -78,7 +78,7 @@ def brisque_features(image: UInt8) -> Float64:
 
 
 def score(features: Float64) -> float:
-    """The regression: features [36] to a score, sum_i weight_i exp(-gamma |x - vector_i|^2) - offset."""
+    """Return the regression's score of features [36]: sum_i weight_i exp(-gamma |x - vector_i|^2) - offset."""
     r = _regression()
     x = 2 * (features - r.low) / (r.high - r.low) - 1
     likeness = np.exp(-r.gamma * np.square(x - r.vectors).sum(axis=1))  # [774]

@@ -26,7 +26,7 @@ _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
 
 
 def metaiqa_network() -> nn.Module:
-    """The network with random weights, named as in the published state dicts: `resnet_layer.*` and `net.*`."""
+    """Return the network with random weights, named as in the published state dicts: `resnet_layer.*` and `net.*`."""
     from collections import OrderedDict
 
     from torch import nn
@@ -48,7 +48,7 @@ def metaiqa_network() -> nn.Module:
 
 @cache
 def _load(path: Path, sha256: str) -> nn.Module:
-    """The network with the weights of a file; read again when the file's hash changes."""
+    """Return the network with the weights of a file; read again when the file's hash changes."""
     return load_into(metaiqa_network(), read_state(path), path)
 
 
@@ -68,7 +68,7 @@ def predict(network: nn.Module, image: UInt8) -> float:
 
 
 def metaiqa(image: UInt8) -> float:
-    """MetaIQA score of an sRGB-encoded 8-bit gray image [H, W], in 0..1; higher is better.
+    """Return the MetaIQA score of an sRGB-encoded 8-bit gray image [H, W], in 0..1; higher is better.
 
     Raises UserError for other or flat images, WeightsError where the file of weights is absent.
     """

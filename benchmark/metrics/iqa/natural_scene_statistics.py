@@ -2,12 +2,12 @@
 
 A natural image, after each pixel loses its neighbourhood's mean and is divided by its neighbourhood's contrast
 ("mean subtracted, contrast normalised": MSCN), has nearly Gaussian values, and the products of neighbours follow an
-asymmetric distribution. Blur, noise and compression bend these laws; the shapes and widths of the fits say how.
+asymmetric distribution. Blur, noise and compression bend these laws; the shapes and widths of the fits measure that.
 
     mu = w * I      sigma = sqrt(|w * I^2 - mu^2|)      MSCN = (I - mu) / (sigma + 1)
 
-Both metrics look at the image and at half its size. Constants are those of the authors' MATLAB releases, so that the
-scores are theirs. One thing differs: MSCN values that are only rounding noise become exactly zero (`NOISE`).
+Both metrics use the image and the image at half its size. Constants are those of the authors' MATLAB releases, so that
+the scores are theirs. One detail differs: MSCN values that are only rounding noise become exactly zero (`NOISE`).
 
 Sources: Mittal, Moorthy, Bovik, "No-Reference Image Quality Assessment in the Spatial Domain", IEEE TIP 2012;
 Lasmar, Stitou, Berthoumieu, "Multiscale skewed heavy tailed model for texture analysis", ICIP 2009 (asymmetric fit).
@@ -57,12 +57,12 @@ def check_image(image: NDArray[Any], least: tuple[int, int], where: str) -> None
 
 
 def degenerate(where: str, found: str, expected: str = "an image with texture") -> UserError:
-    """The error for an image that has too little texture to have statistics, for the caller to raise."""
+    """Build the error for an image with too little texture to have statistics, for the caller to raise."""
     return problem(where, expected, found, "leave the metric out for it: it has no score")
 
 
 def normalise(image: Float64, border: int) -> Float64:
-    """MSCN [H, W] of gray levels [H, W] (0 to 255); `border` is OpenCV's rule for what lies outside the image."""
+    """Return the MSCN [H, W] of gray levels [H, W] (0 to 255); `border` is OpenCV's rule beyond the edges."""
     import cv2
 
     taps = _window()
@@ -77,7 +77,7 @@ def normalise(image: Float64, border: int) -> Float64:
 
 
 def halve(image: Float64) -> Float64:
-    """Half the size [ceil(H / 2), ceil(W / 2)], low-pass filtered as MATLAB's imresize does by default.
+    """Return the image at half size [ceil(H / 2), ceil(W / 2)], low-pass filtered as MATLAB's imresize does by default.
 
     Output pixel i is the weighted sum of input pixels 2i - 3 to 2i + 4; beyond the edge the image is mirrored.
     """
@@ -89,7 +89,7 @@ def halve(image: Float64) -> Float64:
 
 
 def neighbour_sums(blocks: Float64) -> Float64:
-    """Moments of blocks [n, H, W] and of their neighbour products: [n, 5, 5], one row per kind, columns ABS to N_RIGHT.
+    """Return moments [n, 5, 5] of blocks [n, H, W] and neighbour products: a row per kind, columns ABS to N_RIGHT.
 
     Row 0 is the values, rows 1 to 4 the products with the neighbour to the right, below, below right and below left.
     A block goes on at its other side, as the authors' circular shifts have it.
@@ -162,7 +162,7 @@ class Asymmetric:
 
 
 def fit_symmetric(sums: Float64, count: int) -> tuple[Float64, Float64]:
-    """Shape and variance [...] of generalised Gaussians with mean 0, from moments [..., 5] of `count` values each.
+    """Return shape and variance [...] of generalised Gaussians of mean 0, from moments [..., 5] of `count` values each.
 
     Moment matching: E[v^2] / E[|v|]^2 = Gamma(1/a) Gamma(3/a) / Gamma(2/a)^2, solved for the shape a.
     """
@@ -173,7 +173,7 @@ def fit_symmetric(sums: Float64, count: int) -> tuple[Float64, Float64]:
 
 
 def fit_asymmetric(sums: Float64, count: int) -> Asymmetric:
-    """Asymmetric fits [...] from moments [..., 5] of `count` values each (Lasmar et al. 2009).
+    """Return asymmetric fits [...] from moments [..., 5] of `count` values each (Lasmar et al. 2009).
 
     With g = left / right deviation and R = E[|v|]^2 / E[v^2], the shape a solves
     Gamma(2/a)^2 / (Gamma(1/a) Gamma(3/a)) = R (g^3 + 1) (g + 1) / (g^2 + 1)^2.
@@ -192,7 +192,7 @@ def fit_asymmetric(sums: Float64, count: int) -> Asymmetric:
 
 @cache
 def _window() -> Float64:
-    """The normalised taps [7] of the Gaussian window, which is their outer product."""
+    """Return the normalised taps [7] of the Gaussian window, which is their outer product."""
     offset = np.arange(WINDOW) - WINDOW // 2
     taps = np.exp(-(offset**2) / (2 * WINDOW_SIGMA**2))
     return np.asarray(taps / taps.sum())
@@ -200,7 +200,7 @@ def _window() -> Float64:
 
 @cache
 def _shapes() -> tuple[Float64, Float64]:
-    """The shapes a that a fit may have [9801], and Gamma(2/a)^2 / (Gamma(1/a) Gamma(3/a)) of each, which ascends.
+    """Return the shapes a of a fit [9801], and Gamma(2/a)^2 / (Gamma(1/a) Gamma(3/a)) of each, which ascends.
 
     The authors search this grid; a root finder would be finer, and differ from their scores in the fourth digit.
     """
@@ -211,5 +211,5 @@ def _shapes() -> tuple[Float64, Float64]:
 
 
 def _nearest(table: Float64, values: Float64) -> NDArray[np.intp]:
-    """Index of the entry of an ascending `table` nearest to each value; the last one for NaN."""
+    """Return the index of the entry of an ascending `table` nearest to each value; the last one for NaN."""
     return np.searchsorted((table[1:] + table[:-1]) / 2, values)

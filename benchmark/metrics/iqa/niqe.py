@@ -1,4 +1,4 @@
-"""NIQE: how far an image's statistics lie from those of undistorted photographs.
+"""NIQE: the distance of an image's statistics from those of undistorted photographs.
 
 The image is cut into blocks of 96x96 pixels. The 36 features of the blocks (18 at each of two scales) have a mean and a
 covariance, and so had those of the authors' pristine photographs; the score is a distance between the two Gaussians:
@@ -6,7 +6,7 @@ covariance, and so had those of the authors' pristine photographs; the score is 
     D = sqrt((m - m')^T ((C + C') / 2)^-1 (m - m'))
 
 About 3 is a natural image; larger is worse. Few blocks give an uncertain covariance: parts of one 250x400 image
-have been seen to score between 3.1 and 5.2. Never compare scores of different resolutions.
+scored between 3.1 and 5.2. Never compare scores of different resolutions.
 
 Source: Mittal, Soundararajan, Bovik, "Making a 'Completely Blind' Image Quality Analyzer", IEEE SPL 2013, and the
 release of 2012. MATLAB's Image Processing Toolbox has a `niqe` with another model and other scores.
@@ -35,9 +35,9 @@ BLOCK = 96  # pixels a side; the pristine model was made with blocks of this siz
 
 
 def niqe(image: UInt8, where: str = "the image") -> float:
-    """NIQE of a gray sRGB-encoded image [H, W]: lower is better.
+    """Return NIQE of a gray sRGB-encoded image [H, W]: lower is better.
 
-    What is left over at the right and at the bottom beyond whole blocks is not looked at. Blocks without texture (all
+    Pixels at the right and at the bottom beyond whole blocks are not used. Blocks without texture (all
     one gray level, for example) have no features and are left out.
 
     Raises UserError, with `where` as the image's name, for arrays that are no such image, or where fewer than two
@@ -53,7 +53,7 @@ def niqe(image: UInt8, where: str = "the image") -> float:
 
 
 def niqe_features(image: UInt8) -> Float64:
-    """The 36 features of each block of a gray image [H, W]: [n, 36], row by row; NaN where there is nothing to fit.
+    """Return 36 features of each block of a gray image [H, W]: [n, 36], row by row; NaN where there is nothing to fit.
 
     Each scale gives shape and mean scale of the MSCN values, and for the products with the neighbour to the right,
     below, below right and below left: shape, mean, left scale, right scale.
@@ -74,7 +74,7 @@ def niqe_features(image: UInt8) -> Float64:
 
 
 def distance(features: Float64) -> float:
-    """Distance of the Gaussian of features [n, 36] from the pristine one."""
+    """Return the distance of the Gaussian of features [n, 36] from the pristine one."""
     mean, covariance = _pristine()
     offset = features.mean(axis=0) - mean
     pooled = (covariance + np.cov(features, rowvar=False)) / 2  # the pristine half alone has full rank
@@ -82,13 +82,13 @@ def distance(features: Float64) -> float:
 
 
 def _cut(image: Float64, side: int) -> Float64:
-    """Blocks [n, side, side] of an image [H, W] of whole blocks, row by row."""
+    """Return the blocks [n, side, side] of an image [H, W] of whole blocks, row by row."""
     rows, columns = image.shape[0] // side, image.shape[1] // side
     return image.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(-1, side, side)
 
 
 @cache
 def _pristine() -> tuple[Float64, Float64]:
-    """Mean [36] and covariance [36, 36] of the pristine photographs."""
+    """Return mean [36] and covariance [36, 36] of the pristine photographs."""
     values = load_parameters("niqe")
     return values["mu"].ravel(), values["cov"]

@@ -12,7 +12,7 @@ _FILE = "live_parameters.npz"
 
 
 def load_parameters(metric: str) -> dict[str, Float64]:
-    """The arrays of one metric ("brisque" or "niqe") by name, in float64."""
+    """Return the arrays of one metric ("brisque" or "niqe") by name, in float64."""
     with files("spike4dgs.benchmark.metrics.iqa").joinpath(_FILE).open("rb") as f, np.load(f) as arrays:
         return {
             name.removeprefix(f"{metric}_"): arrays[name].astype(np.float64)

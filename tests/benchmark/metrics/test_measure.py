@@ -48,7 +48,7 @@ def values_of(prediction: NDArray, truth: NDArray | None = None, *ids: str) -> M
     return measure(pair, 1.0, [METRICS[i] for i in ids or ALWAYS])
 
 
-def test_perceptual_metrics_see_the_srgb_encoded_image() -> None:
+def test_perceptual_metrics_take_the_srgb_encoded_image() -> None:
     from spike4dgs.benchmark.metrics.iqa.brisque import brisque
     from spike4dgs.benchmark.metrics.iqa.niqe import niqe
 
@@ -104,10 +104,10 @@ def test_temporal_error_is_the_mean_difference_of_the_rates() -> None:
     assert halved[1:] == [pytest.approx(v / 2) for v in found[1:]]
 
 
-def test_a_constant_error_has_no_temporal_error_and_a_still_image_has_the_truths_rate() -> None:
+def test_a_constant_error_has_no_temporal_error_and_a_constant_image_has_the_truths_rate() -> None:
     assert [m.values["temporal_error"] for m in sequence(0.2, 0.3, 0.5)][1:] == [pytest.approx(0, abs=1e-12)] * 2
-    still = [m.values["temporal_error"] for m in sequence(0.3, 0.3, 0.3)]
-    assert still[1:] == [pytest.approx(0.05), pytest.approx(0.1)]
+    constant = [m.values["temporal_error"] for m in sequence(0.3, 0.3, 0.3)]
+    assert constant[1:] == [pytest.approx(0.05), pytest.approx(0.1)]
 
 
 def test_even_images_have_no_temporal_error() -> None:
@@ -219,7 +219,7 @@ def test_a_weight_file_makes_its_metric_part_of_the_record(
     check_record(json.loads(json.dumps(record)), "r")
 
 
-def test_damaged_truth_is_still_an_error(scene: Scene, tmp_path: Path) -> None:
+def test_damaged_truth_is_an_error_all_the_same(scene: Scene, tmp_path: Path) -> None:
     root = predict(tmp_path / "p", scene)
     copy = Path(shutil.copytree(scene.root, tmp_path / "copy"))
     target = scene.targets[0]

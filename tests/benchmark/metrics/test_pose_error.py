@@ -94,14 +94,14 @@ def test_points_that_determine_no_similarity_are_refused(points: np.ndarray) -> 
         umeyama(points, points)
 
 
-def test_cameras_in_one_place_are_refused() -> None:
-    with pytest.raises(UserError, match="cameras in different places"):
+def test_cameras_at_one_position_are_refused() -> None:
+    with pytest.raises(UserError, match="cameras at different positions"):
         align_cameras(parallel(np.ones((3, 3))), parallel(np.ones((3, 3))))
     with pytest.raises(UserError, match="two or more cameras"):
         align_cameras(parallel(LINE[:1]), parallel(LINE[:1]))
 
 
-def test_a_moved_camera_sees_the_moved_points_in_the_same_pixels() -> None:
+def test_a_transformed_camera_projects_transformed_points_to_the_same_pixels() -> None:
     there, points = random_sim3(5), np.random.default_rng(0).normal(size=(30, 3)) + [0, 5, 1]
     for c in RIGS["planar, turned"]:
         uv, z = c.project(points)

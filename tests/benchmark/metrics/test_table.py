@@ -78,7 +78,7 @@ def test_values_equal_scikit_image_and_opencv(seed: int) -> None:
     assert values["psnr_dynamic"] == pytest.approx(-10 * math.log10(np.mean((t - p)[moving] ** 2)), abs=1e-9)
 
 
-def test_dynamic_metrics_see_only_the_moving_region() -> None:
+def test_dynamic_metrics_use_only_the_moving_region() -> None:
     truth, _ = images()
     moving = np.zeros_like(EVERYWHERE)
     moving[8:16, 10:30] = True
@@ -159,13 +159,13 @@ def test_identical_images_are_capped_and_noted() -> None:
 
 def test_an_image_without_motion_has_no_dynamic_value_and_is_noted() -> None:
     truth, prediction = images()
-    still = measure(truth, prediction, ~EVERYWHERE, 1.0, "x")
-    assert still["psnr_dynamic"] is None and still["ssim_dynamic_aligned"] is None and still["psnr"] is not None
+    without = measure(truth, prediction, ~EVERYWHERE, 1.0, "x")
+    assert without["psnr_dynamic"] is None and without["ssim_dynamic_aligned"] is None and without["psnr"] is not None
     moving = measure(truth, prediction, region(), 1.0, "x")
-    metrics, notes = summary({"a": still, "b": moving})
+    metrics, notes = summary({"a": without, "b": moving})
     assert metrics["psnr_dynamic"] == moving["psnr_dynamic"]
     assert notes["psnr_dynamic"] == "mean over the 1 of 2 images that have a moving region"
-    metrics, notes = summary({"a": still})
+    metrics, notes = summary({"a": without})
     assert metrics["psnr_dynamic"] is None and notes["psnr_dynamic"] == "no image has a moving region"
 
 

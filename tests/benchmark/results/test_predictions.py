@@ -152,7 +152,7 @@ def test_the_smallest_description_of_another_program_is_enough(folder: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "place"),
+    ("key", "value", "found_at"),
     [
         ("scene", 3, "scene"),
         ("surprise", 1, "the top level"),
@@ -164,11 +164,11 @@ def test_the_smallest_description_of_another_program_is_enough(folder: Path) -> 
         ("schema", "other/1", "schema"),
     ],
 )
-def test_a_bad_description_is_refused(folder: Path, key: str, value: object, place: str) -> None:
+def test_a_bad_description_is_refused(folder: Path, key: str, value: object, found_at: str) -> None:
     data = json.loads((folder / INFO).read_text())
     (folder / INFO).write_text(json.dumps({**data, key: value}))
     with pytest.raises(
-        UserError, match=rf"prediction\.json: expected a valid spike4dgs-prediction/1, found at {place}"
+        UserError, match=rf"prediction\.json: expected a valid spike4dgs-prediction/1, found at {found_at}"
     ):
         open_predictions(folder, TARGETS)
 

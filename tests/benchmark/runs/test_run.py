@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark.cli import load
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.runs.cell import FitClock
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -101,7 +103,7 @@ def test_predictions_are_what_the_model_rendered(small_scene: Path, tmp_path: Pa
     assert np.array_equal(found, (models[0].image + 1e-6 * 3000).astype(np.float32).astype(np.float16))
 
 
-def test_a_fit_sees_only_the_training_views(small_scene: Path, tmp_path: Path) -> None:
+def test_a_fit_gets_only_the_training_views(small_scene: Path, tmp_path: Path) -> None:
     seen: list[TrainingScene] = []
 
     class Nosy(CountMethod):
@@ -158,12 +160,12 @@ def test_a_killed_run_resumes_and_equals_an_uninterrupted_one(small_scene: Path,
     for method in (first, second):
         fit = method.fit
 
-        def watched(scene: Any, budget: Any, device: str, seed: int, progress: Any, checkpoint: Any = None, fit=fit):
+        def watched(scene: Any, request: FitRequest, fit=fit):
             def both(done: int, total: int, note: str = "") -> None:
                 steps.append(note)
-                progress(done, total, note)
+                request.progress(done, total, note)
 
-            return fit(scene, budget, device, seed, both, checkpoint)
+            return fit(scene, replace(request, progress=both))
 
         method.fit = watched  # type: ignore[method-assign]
     found = run(killed, [small_scene], first, second, seed=3)
@@ -225,7 +227,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two methods and a failing one, found as those of another package are: by entry point."""
     methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
     methods["bad"] = FailingMethod("bad", ValueError("no luck"))
-    entry = SimpleNamespace(name="theirs", load=lambda: methods)
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
     monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
 
 
@@ -317,7 +319,10 @@ def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPa
 
 
 def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [SimpleNamespace(name=n, load=lambda: {"same": CountMethod("same")}) for n in "ab"]
+    def load() -> dict[str, CountMethod]:
+        return {"same": CountMethod("same")}
+
+    entries = [SimpleNamespace(name=n, value=f"{n}:METHODS", dist=None, load=load) for n in "ab"]
     monkeypatch.setattr(recipes, "entry_points", lambda group: entries)
     with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
         recipes.find_methods()

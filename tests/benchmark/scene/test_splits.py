@@ -29,12 +29,12 @@ from spike4dgs.leaderboard.entry import read_entry
 from spike4dgs.leaderboard.submit_command import submit
 
 
-def at(*places: tuple[float, float]) -> tuple[Camera, ...]:
+def at(*positions: tuple[float, float]) -> tuple[Camera, ...]:
     """Cameras in the plane y = -5 at (x, z), looking at the origin."""
     up = np.array([0.0, 0.0, 1.0])
     return tuple(
         look_at(f"cam_{i:02d}", np.array([x, -5.0, z]), np.zeros(3), up, focal=9.0, width=8, height=6)
-        for i, (x, z) in enumerate(places)
+        for i, (x, z) in enumerate(positions)
     )
 
 
@@ -84,9 +84,9 @@ def test_no_array_around_the_held_out_camera(cameras: tuple[Camera, ...]) -> Non
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=2, max_size=12), st.data())
 def test_each_further_view_is_as_far_from_the_others_as_any(
-    places: list[tuple[float, float]], data: st.DataObject
+    positions: list[tuple[float, float]], data: st.DataObject
 ) -> None:
-    cameras = at(*places)
+    cameras = at(*positions)
     held_out = data.draw(st.sampled_from(cameras)).id
     order = spread_order(cameras, held_out)
     assert sorted(order) == sorted(c.id for c in cameras if c.id != held_out)
@@ -109,7 +109,7 @@ def scene(tmp_path: Path) -> Path:
     return write_small_scene(tmp_path / "scene", splits=True)
 
 
-def test_a_scene_is_seen_through_a_split(scene: Path) -> None:
+def test_a_scene_is_opened_with_a_split(scene: Path) -> None:
     center, corner = open_scene(scene), open_scene(scene, split="corner")
     assert (center.split, corner.split) == ("center", "corner")
     assert center.is_default_split and not corner.is_default_split

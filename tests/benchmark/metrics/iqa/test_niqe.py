@@ -65,7 +65,7 @@ def test_a_transposed_image_has_the_same_blocks_with_two_directions_exchanged() 
     np.testing.assert_allclose(transposed[[0, 2, 1, 3]], features[..., order], rtol=1e-9)
 
 
-def test_what_lies_beyond_whole_blocks_is_not_looked_at() -> None:
+def test_pixels_beyond_whole_blocks_are_not_used() -> None:
     image = leaves(200, 300)
     assert niqe(image) == niqe(np.ascontiguousarray(image[:192, :288]))
 
