@@ -26,8 +26,8 @@ from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 
-_TOLERANCE_PX = 0.005  # of what one focal length and a principal point in the middle may move a pixel
-_VAL_EVERY = 5  # one image between training times for so many training images
+_TOLERANCE_PX = 0.005  # the most that one focal length and a principal point in the middle may move a pixel
+_VAL_EVERY = 5  # training images for one validation image, at a time between them
 _LOSSES = """lost on the way:
   - 8-bit sRGB images, clipped at white, for streams and linear radiance
   - one image per window of spikes (blurred by motion within it) for every tick
@@ -42,7 +42,7 @@ class _Image:
     """An image of the export: linear radiance [H, W] or [H, W, 3]."""
 
     target: Target
-    image: Float32
+    radiance: Float32
 
 
 def export_nerfstudio(
@@ -60,17 +60,17 @@ def export_nerfstudio(
     Training images are made from the spikes of the training cameras; validation images too, at times between;
     test images are the ground truth of the held-out cameras. Lossy: 8-bit sRGB images clipped at white, one per
     window of spikes instead of the stream; one focal length, and the principal point in the middle (other cameras are
-    refused); masks, geometry, calibration and points stay behind. Score here what counts: a predictions folder.
+    refused); masks, geometry, calibration and points stay behind. To compare methods, score a predictions folder here.
 
     Args:
         scene: Scene folder.
         out: New folder to write.
-        images: What makes an image of spikes, such as tfp or tfi.
+        images: The image maker for training and validation images, such as tfp or tfi.
         every: Ticks from one training image of a camera to the next; 2 or more.
         split: Training and held-out cameras; the scene's default split if left out.
         colour: Test images in colour, where the ground truth has it. Spike cameras, and so the training images,
-            see gray: then test images in gray are what can be compared.
-        allow_gaps: Export a recording with gaps all the same.
+            see gray: compare with test images in gray.
+        allow_gaps: Accept a recording with gaps.
     """
     opened = open_scene(scene, allow_gaps, split)
     if images not in IMAGES:
@@ -87,7 +87,7 @@ def export_nerfstudio(
         "train": _from_spikes(opened, images, ticks),
         "val": _from_spikes(opened, images, between),
     }
-    frames = {name: [_write(out, name, opened, p) for p in pictures] for name, pictures in parts.items()}
+    frames = {name: [_write(out, name, opened, image) for image in made] for name, made in parts.items()}
     for name, of_part in frames.items():  # after all images: what is cut off has no description
         path = out / f"transforms_{name}.json"
         print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
@@ -98,7 +98,7 @@ def export_nerfstudio(
 
 
 def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
-    """The field of view along x in radians that all cameras share. Raises UserError where they share none."""
+    """Return the field of view along x in radians that all cameras share. Raises UserError where they share none."""
     first = cameras[0]
     for c in cameras:
         reach = max(c.width, c.height) / 2
@@ -129,9 +129,9 @@ def _from_truth(scene: Scene, colour: bool) -> Iterable[_Image]:
         yield _Image(target, scene.ground_truth_rgb(target) if colour else scene.ground_truth(target))
 
 
-def _write(out: Path, part: str, scene: Scene, picture: _Image) -> dict[str, Any]:
-    """Write one PNG; returns its frame."""
-    target, pixels = picture.target, encode_srgb(picture.image)
+def _write(out: Path, part: str, scene: Scene, image: _Image) -> dict[str, Any]:
+    """Write one PNG and return its frame."""
+    target, pixels = image.target, encode_srgb(image.radiance)
     name = f"{target.camera}_{target.tick:06d}"
     rgb = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     write_png(out / part / f"{name}.png", rgb)

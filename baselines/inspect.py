@@ -1,4 +1,4 @@
-"""`inspect`: what is in a stream or a scene? Rates, bad pixels, interval statistics, and images to look at."""
+"""`inspect`: statistics of a stream or a scene. Rates, bad pixels, inter-spike intervals, and images."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 Mask = NDArray[np.bool_]
 HOT_SIGMA = 6.0  # robust standard deviations above the neighbours' median, from which a pixel is called hot
-_INTERVAL_TICKS = 2000  # inter-spike intervals are looked at in at most so many ticks
-_LONGEST_WINDOW = 60000  # ticks per count image
+_INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
+_LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
 _TIMELINE_BINS = 400
 
 
@@ -41,7 +41,7 @@ class StreamReport:
 
 
 def examine(name: str, stream: SpikeStream) -> StreamReport:
-    """Count a whole stream and judge its pixels.
+    """Return the statistics of a whole stream, and its bad pixels.
 
     A pixel is dead where it never fires while the median of its 5x5 neighbourhood would fire at least ten times. It is
     hot where its rate is more than HOT_SIGMA robust standard deviations of (rate - neighbourhood median), and at least
@@ -64,7 +64,7 @@ def examine(name: str, stream: SpikeStream) -> StreamReport:
 
 
 def _two_intervals(stream: SpikeStream) -> float:
-    """Share of the pixels with at least three spikes whose intervals are all k or k + 1.
+    """Return the share of the pixels with at least three spikes whose intervals are all k or k + 1.
 
     Steady light on a pixel that keeps the charge above the threshold gives exactly that: a test of the sensor model.
     """
@@ -89,8 +89,8 @@ def _two_intervals(stream: SpikeStream) -> float:
 def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     """Write one PNG: TFP and TFI of the middle of the clip, the map of bad pixels, and the histogram of rates.
 
-    Where a recording has gaps, they are drawn over the course of the rate, and the images are of the middle of the
-    longest stretch without one.
+    Where a recording has gaps, a plot of the rate over time marks them, and the images are of the middle of the longest
+    stretch without one.
     """
     import matplotlib
 
@@ -106,11 +106,11 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     for name in ("tfp", "tfi"):
         axes[name].imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
         axes[name].set_title(f"{name.upper()} at tick {middle}")
-    _draw_bad_pixels(axes["bad"], report)
+    _show_bad_pixels(axes["bad"], report)
     axes["rates"].hist(report.rate.ravel(), bins=100, color="0.3")
     axes["rates"].set(xlabel="spikes per tick", ylabel="pixels", title=f"Rates, mean {report.rate.mean():.4f}")
     if stream.gaps:
-        _draw_gaps(axes["time"], stream)
+        _plot_gaps(axes["time"], stream)
     for name in ("tfp", "tfi", "bad"):
         axes[name].set_xticks([])
         axes[name].set_yticks([])
@@ -121,18 +121,18 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
 
 
 def _middle(stream: SpikeStream) -> int:
-    """The tick in the middle of the longest stretch of the clip that has data."""
+    """Return the tick in the middle of the longest stretch of the clip that has data."""
     edges = [-1, *(np.nonzero(~present(stream.gaps, stream.n_ticks))[0]), stream.n_ticks]
     longest = int(np.argmax(np.diff(edges)))
     return min(int(edges[longest] + 1 + edges[longest + 1]) // 2, stream.n_ticks - 1)
 
 
-def _draw_gaps(axis: Any, stream: SpikeStream) -> None:
-    """The course of the rate over the clip, interrupted where ticks lack, which is marked with the reason."""
+def _plot_gaps(axis: Any, stream: SpikeStream) -> None:
+    """Plot the rate over the clip, interrupted and marked with the reason where ticks are missing."""
     bins = np.linspace(0, stream.n_ticks, min(stream.n_ticks, _TIMELINE_BINS) + 1).astype(int)
     spikes = [int(np.bitwise_count(stream.packed[a:b]).sum()) for a, b in zip(bins[:-1], bins[1:], strict=True)]
     seen = np.add.reduceat(present(stream.gaps, stream.n_ticks).astype(int), bins[:-1])
-    with np.errstate(invalid="ignore"):  # nothing is drawn where nothing is known
+    with np.errstate(invalid="ignore"):  # bins without data are NaN, which leaves a hole
         axis.stairs(np.array(spikes) / seen / (stream.width * stream.height), bins, color="0.3", baseline=None)
     for i, reason in enumerate(sorted({gap.reason for gap in stream.gaps}), start=1):
         spans = [(gap.first_tick, gap.ticks) for gap in stream.gaps if gap.reason == reason]
@@ -144,7 +144,7 @@ def _draw_gaps(axis: Any, stream: SpikeStream) -> None:
     axis.legend(loc="upper right")
 
 
-def _draw_bad_pixels(axis: Any, report: StreamReport) -> None:
+def _show_bad_pixels(axis: Any, report: StreamReport) -> None:
     axis.imshow(report.rate, cmap="gray")
     for mask, color, what in ((report.dead, "tab:blue", "dead"), (report.hot, "tab:red", "hot")):
         y, x = np.nonzero(mask)

@@ -25,7 +25,7 @@ from spike4dgs.benchmark.scene.spikecv import export_spikecv, import_spikecv
 
 @dataclass
 class Loaded:
-    """What a D-NeRF reader knows of one frame: float32 poses, one focal length, the middle as principal point."""
+    """One frame as a D-NeRF reader sees it: float32 poses, one focal length, the middle as principal point."""
 
     name: str
     rgb: np.ndarray  # [H, W, 3]
@@ -123,7 +123,7 @@ def test_other_images_and_steps(small_scene: Path, tmp_path: Path) -> None:
     assert np.abs(linear(frames[1].rgb) - np.clip(expected, 0, 1)[..., None]).max() < 0.006
 
 
-def test_what_is_lost_is_said(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_losses_are_printed(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     export_nerfstudio(small_scene, tmp_path / "export", every=40)
     text = capsys.readouterr().out
     assert "transforms_train.json: 6 images" in text and "transforms_test.json: 3 images" in text
@@ -152,7 +152,7 @@ def test_a_recording_without_ground_truth_has_no_test_images(
         ("fl_x", 1.0, "found fl_x of cam_01 off by"),
     ],
 )
-def test_cameras_that_the_layout_cannot_say_are_refused(
+def test_cameras_that_do_not_fit_the_layout_are_refused(
     small_scene: Path, tmp_path: Path, key: str, change: float, message: str
 ) -> None:
     path = small_scene / "transforms_train.json"

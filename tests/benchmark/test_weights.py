@@ -68,7 +68,7 @@ def test_files_are_found_in_the_given_folder_then_in_the_hubs(
     assert (found.path, found.sha256) == (tmp_path / "w.pth", SHA256)
 
 
-def test_an_absent_file_is_named_with_all_that_helps(
+def test_the_error_for_an_absent_file_names_it_and_its_source(
     empty_hub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "mine"))
@@ -144,7 +144,7 @@ def test_the_names_of_torch_hubs_files_hold_the_start_of_their_hashes() -> None:
         assert found and file.sha256 and file.sha256.startswith(found[1]) and len(file.sha256) == 64
 
 
-def test_auto_leaves_out_what_lacks_weights_and_says_so() -> None:
+def test_auto_leaves_out_metrics_without_weights_and_gives_the_reason() -> None:
     selection = select_metrics()
     assert set(selection.absent) == {"lpips_alex", "lpips_vgg", "lpips_squeeze", "metaiqa"}
     assert all(m.weights is None for m in selection.metrics) and set(selection.weights.values()) == {None}
@@ -152,7 +152,7 @@ def test_auto_leaves_out_what_lacks_weights_and_says_so() -> None:
     assert "needs the file vgg16-397923af.pth" in selection.absent["lpips_vgg"]
 
 
-def test_a_metric_that_is_asked_for_needs_its_weights(empty_hub: Path) -> None:
+def test_a_requested_metric_needs_its_weights(empty_hub: Path) -> None:
     with pytest.raises(UserError, match=r"vgg16-397923af\.pth: expected .* 553433881 bytes"):
         select_metrics(("auto", "lpips_vgg"))
     (empty_hub / METAIQA.name).write_bytes(CONTENT)
@@ -186,7 +186,7 @@ class Surprise:
         return os.mkdir, ("surprise",)
 
 
-def test_files_that_are_no_tensors_are_refused_and_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_without_tensors_are_refused_and_run_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     torch.save(Surprise(), tmp_path / "code.pth")
     torch.save([torch.zeros(1)], tmp_path / "list.pth")
