@@ -1,1 +1,1 @@
-"""The image part of a recipe: from spikes to images."""
+"""Image makers: the image part of a recipe, from spikes to images."""

@@ -9,12 +9,12 @@ T = t_j - t_i ticks between them, the rate is
 for both spikes are known to the tick. A count over the same window would leave 1 / 2h to either side of j - i over 2h:
 r_h is 1 / r_h times as precise.
 
-Of windows that grow by half an octave each, a pixel takes the longest before these bounds cease to have a point in
-common: then no constant light explains the spikes. The first of them is the interval that t lies in: that no spike fell
-there is what tells a dark stripe between bright ones. (It is the rule of intersecting confidence intervals, with bounds
-that are certain but for shot noise.) A change that one pixel cannot see, a neighbour often can: of 3x3 pixels, all take
-the shortest window. At rest the window is the whole clip; where things move it shrinks to what the motion leaves. At
-the clip's ends windows are cut. A pixel with fewer than two spikes has their number / the clip.
+Windows grow by half an octave each. A pixel takes the longest one before these bounds cease to have a point in common:
+beyond it no constant light explains the spikes. The first bounds are those of the interval that t lies in. That no
+spike fell there tells a dark stripe between bright ones. (It is the rule of intersecting confidence intervals, with
+bounds that are certain but for shot noise.) A neighbour often sees a change that one pixel cannot see: of 3x3 pixels,
+all take the shortest window. At rest the window is the whole clip; where things move it shrinks. At the clip's ends
+windows are cut. A pixel with fewer than two spikes has their number / the clip.
 """
 
 from __future__ import annotations
@@ -28,12 +28,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.settings import Settings
 
-SHORTEST = 2.0  # ticks on either side
-GROWTH = math.sqrt(2)
 _BLOCK = 64  # bytes of a tick, 512 pixels, whose spikes are gathered at a time
+
+
+@dataclass(frozen=True)
+class AdaptiveSettings(Settings):
+    """The windows that are tried, and the pixels that share one."""
+
+    shortest: float = 2.0  # half length of the first window in ticks; the interval that t lies in is always seen
+    growth: float = math.sqrt(2)  # of each next window: half an octave
+    shared_px: int = 3  # side of the square of pixels that take one window: what one pixel misses, a neighbour may see
+
+    def __post_init__(self) -> None:
+        if not (self.shortest > 0 and self.growth > 1 and self.shared_px > 0 and self.shared_px % 2):
+            expected = "shortest above 0, growth above 1, shared_px odd and above 0"
+            raise problem("adaptive", expected, str(self), "correct the settings")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +60,7 @@ class SpikeTimes:
 
 @lru_cache(maxsize=1)
 def spike_times(stream: SpikeStream) -> SpikeTimes:
-    """All spike times of a stream; those of the last stream are kept, since images come stream by stream."""
+    """Return all spike times of a stream, cached for the last one: images are made stream by stream."""
     packed, pixels = rows(stream.packed), stream.height * stream.width
     starts = np.zeros(pixels + 1, np.int64)
     blocks = -(-packed.shape[1] // _BLOCK)
@@ -82,19 +96,22 @@ def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], 
                     at[p] += 1
 
 
-def half_windows(n_ticks: int) -> NDArray[np.float64]:
-    """The windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
-    steps = max(0, math.ceil(math.log(max(n_ticks, 1) / SHORTEST, GROWTH)))
-    return np.asarray(SHORTEST * GROWTH ** np.arange(steps + 1), np.float64)
+def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDArray[np.float64]:
+    """Return the windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
+    s = settings or AdaptiveSettings()
+    steps = max(0, math.ceil(math.log(max(n_ticks, 1) / s.shortest, s.growth)))
+    return np.asarray(s.shortest * s.growth ** np.arange(steps + 1), np.float64)
 
 
-def adaptive_image(stream: SpikeStream, tick: int) -> Float32:
-    """Spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window."""
-    spikes, halves = spike_times(stream), half_windows(stream.n_ticks)
+def adaptive_image(stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None) -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window."""
+    s = settings or AdaptiveSettings()
+    spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     pixels = stream.height * stream.width
     level, image = np.empty(pixels, np.uint8), np.empty(pixels, np.float32)
     in_threads(_choose, pixels, spikes.ticks, spikes.starts, tick, halves, level, small=pixels < 1 << 12)
-    shared = cv2.erode(level.reshape(stream.height, stream.width), np.ones((3, 3), np.uint8)).reshape(-1)
+    square = np.ones((s.shared_px, s.shared_px), np.uint8)
+    shared = cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1)
     arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, shared, image)
     in_threads(_estimate, pixels, *arguments, small=pixels < 1 << 12)
     upright = image.reshape(stream.height, stream.width)
@@ -103,7 +120,7 @@ def adaptive_image(stream: SpikeStream, tick: int) -> Float32:
 
 @kernel
 def _around(times: NDArray[np.int32], tick: int) -> tuple[int, int]:
-    """The last spike before `tick` and the first that is not; where there is none, the nearest."""
+    """Return the indices of the last spike before `tick` and of the first that is not; the nearest where none is."""
     after = int(np.searchsorted(times, tick))
     return max(after - 1, 0), min(after, len(times) - 1)
 
@@ -118,7 +135,7 @@ def _choose(
     start: int,
     stop: int,
 ) -> None:
-    """The longest window of each pixel whose bounds, and those of all shorter ones, have a point in common."""
+    """Set `level` to the longest window of each pixel up to which the bounds of all windows have a point in common."""
     for p in range(start, stop):
         times = ticks[starts[p] : starts[p + 1]]
         i, j = _around(times, tick)  # the first and the last spike of the window
@@ -150,7 +167,7 @@ def _estimate(
     start: int,
     stop: int,
 ) -> None:
-    """Each pixel's rate over its window, or over the shortest longer one that has two spikes."""
+    """Set each pixel's rate over its window, or over the next longer one that has two spikes."""
     for p in range(start, stop):
         times = ticks[starts[p] : starts[p + 1]]
         image[p] = np.float32(len(times) / n_ticks)
@@ -167,9 +184,10 @@ def _estimate(
 
 ADAPTIVE = ImageMaker(
     name="adaptive",
-    definition="(spikes - 1) / (ticks from the first to the last) over the longest window, of 3x3 pixels the shortest, "
-    "that a constant rate explains",
+    definition="(spikes - 1) / (ticks from the first to the last) over the longest window that a "
+    "constant rate explains, of shared_px x shared_px pixels the shortest",
     source="this project; the rule is that of Goldenshluger and Nemirovski: On spatially adaptive estimation of "
     "nonparametric regression, Math. Methods Stat. 6, 1997",
     rate=adaptive_image,
+    settings=AdaptiveSettings(),
 )

@@ -1,9 +1,9 @@
-"""The first of a recipe's four parts: what image does a spike window give?"""
+"""Image makers, the first of a recipe's four parts: each turns a window of spikes into an image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
+from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 
@@ -40,36 +41,51 @@ def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], A
 
 @dataclass(frozen=True)
 class ImageMaker:
-    """A named way from spikes to images. `rate` gives spikes per tick [H, W] float32 at the start of a tick.
+    """A named way from spikes to images.
 
-    A pixel's own rate can be corrected by its calibration afterwards. What looks at neighbours is better told before:
-    `corrected` gives the rate that an ideal camera's pixels would have. `learned` tells of the weights in use; None
-    where nothing is learned or no weights are there.
+    `rate` returns spikes per tick [H, W] float32 at the start of a tick. A pixel's own rate can be corrected by its
+    calibration afterwards. A maker that looks at neighbours needs the calibration before: `corrected` returns the rate
+    that an ideal camera's pixels would have.
 
-    >>> IMAGES["tfp"](stream, ticks=[100, 200], gain=0.6).shape  # doctest: +SKIP
-    (2, 250, 400)
+    >>> from spike4dgs.baselines.spike_to_image.tfp import TFP, TfpSettings
+    >>> from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+    >>> stream = SpikeStream(pack(np.tile(np.eye(8), (25, 1, 1))), 8, 8, 20_000.0)  # 25 ticks, the diagonal fires
+    >>> TFP(stream, ticks=[10, 12], gain=0.5).shape
+    (2, 8, 8)
+    >>> TFP.with_settings(TfpSettings(half_window=5))(stream, [10], gain=0.5)[0, 0, :2]
+    array([2., 0.], dtype=float32)
     """
 
     name: str
-    definition: str
+    definition: str  # may refer to fields of the settings by their names
     source: str
-    rate: Callable[[SpikeStream, int], Float32]
-    learned: Callable[[], Learned | None] = lambda: None
+    rate: Callable[[SpikeStream, int, Any], Float32]  # of a stream, a tick and the settings
+    settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
+    learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+
+    def with_settings(self, settings: Settings) -> ImageMaker:
+        """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""
+        if type(settings) is not type(self.settings):
+            raise TypeError(f"{self.name} has {type(self.settings).__name__}, not {type(settings).__name__}")
+        return replace(self, settings=settings)
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
     ) -> Float32:
-        """Linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`; `gain`: spikes per tick of white.
+        """Return linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`.
 
-        `camera` corrects the images for what its pixels do to light; a dead pixel has seen nothing, which is not
-        black but NaN. Raises UserError for a tick outside the clip.
+        `gain` is spikes per tick of white. `camera` corrects the images for what its pixels do to light; a dead pixel
+        has seen nothing, which is not black but NaN. Raises UserError for a tick outside the clip.
         """
         images = np.empty((len(ticks), stream.height, stream.width), np.float32)
         for image, tick in zip(images, ticks, strict=True):
             if not 0 <= tick < stream.n_ticks:
                 raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
-            image[:] = self.corrected(stream, tick, camera) if self.corrected and camera else self.rate(stream, tick)
+            if self.corrected and camera:
+                image[:] = self.corrected(stream, tick, camera)
+            else:
+                image[:] = self.rate(stream, tick, self.settings)
         if camera is None:
             images /= gain
             return images

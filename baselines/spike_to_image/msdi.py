@@ -1,4 +1,4 @@
-"""MSDI's images (eq. 12): what its image generator makes of the ticks around an instant, view by view."""
+"""The image maker `msdi`: MSDI's image generator (eq. 12) on the ticks around an instant, view by view."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 
 def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
-    """Spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
+    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
 
-    With a calibration: those of an ideal camera. Beyond the clip's ends the clip is mirrored. Raises UserError where
+    With a calibration they are those of an ideal camera. Beyond its ends the clip is mirrored. Raises UserError where
     the weights are missing or damaged.
     """
     return reconstruct(load_network(weights_path(), choose_device("auto")), stream, tick, camera)
 
 
 def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
-    """What `network` takes the rate to be at the start of `tick`: spikes per tick [H, W] float32, not negative."""
+    """Return the estimate of `network` at the start of `tick`: spikes per tick [H, W] float32, not negative."""
     import torch  # imported where it is used: reading spikes must not wait for it
 
     from spike4dgs.method.msdi.inputs import Sensors
@@ -46,7 +46,7 @@ MSDI = ImageMaker(
     name="msdi",
     definition="MSDI's image generator on the 41 ticks around tick t",
     source="Spike4DGS, eq. 12",
-    rate=msdi_image,
+    rate=lambda stream, tick, _: msdi_image(stream, tick),
     learned=partial(learned_from, WEIGHTS.in_use, read_card),
     corrected=msdi_image,
 )

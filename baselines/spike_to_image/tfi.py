@@ -22,7 +22,7 @@ _BLOCK = 128  # bytes of a tick done at a time in the stack: 1024 pixels
 
 
 def tfi_image(stream: SpikeStream, tick: int) -> Float32:
-    """Spikes per tick [H, W] float32: 1 / the interval of each pixel that contains the start of `tick`."""
+    """Return spikes per tick [H, W] float32: 1 / the interval of each pixel that contains the start of `tick`."""
     image = np.empty(stream.height * stream.width, np.float32)
     in_threads(_image, len(image), rows(stream.packed), tick, image, small=len(image) < 1 << 14)
     upright = image.reshape(stream.height, stream.width)
@@ -31,7 +31,7 @@ def tfi_image(stream: SpikeStream, tick: int) -> Float32:
 
 @kernel
 def find_spike(packed: UInt8, pixel: int, tick: int, step: int) -> int:
-    """The first tick with a spike of a stored pixel, from `tick` in direction `step`; -1 where there is none."""
+    """Return the first tick with a spike of a stored pixel, from `tick` in direction `step`; -1 where there is none."""
     byte, bit = pixel >> 3, pixel & 7
     while 0 <= tick < len(packed):
         if packed[tick, byte] >> bit & 1:
@@ -57,7 +57,7 @@ def _image(packed: UInt8, tick: int, image: Float32, start: int, stop: int) -> N
 
 
 def tfi_stack(stream: SpikeStream, out: Float32 | None = None) -> Float32:
-    """`tfi_image` at every tick: spikes per tick [T, H, W] float32, into `out` if given. Clips of < 2^24 ticks."""
+    """Return `tfi_image` at every tick: spikes per tick [T, H, W] float32, in `out` if given. Clips of < 2^24 ticks."""
     if out is None:
         out = np.empty((stream.n_ticks, stream.height, stream.width), np.float32)
     blocks = (stream.packed.shape[1] + _BLOCK - 1) // _BLOCK
@@ -68,7 +68,7 @@ def tfi_stack(stream: SpikeStream, out: Float32 | None = None) -> Float32:
 
 @kernel
 def _stack(packed: UInt8, table: UInt64, flip: bool, out: Float32, start: int, stop: int) -> None:
-    """Per block of pixels: forward in time note the last spike before each tick, backward divide by the interval."""
+    """For each block of pixels, note the last spike before each tick forward in time, and divide backward in time."""
     n, height, width = out.shape
     words = np.empty(_BLOCK, np.uint64)
     rates = np.empty((n, 8 * _BLOCK), np.float32)  # first the time of the last spike, then 1 / interval
@@ -91,7 +91,7 @@ def _stack(packed: UInt8, table: UInt64, flip: bool, out: Float32, start: int, s
 
 @kernel
 def _note(fired: UInt8, t: np.float32, last: Float32, earlier: Float32, before: Float32) -> None:
-    """before = last; where a pixel fired, (last, earlier) = (t, last)."""
+    """Set before = last; where a pixel fired, (last, earlier) = (t, last)."""
     for p in range(len(fired)):
         i = np.uint64(p)
         a, b, c = last[i], earlier[i], fired[i] != 0
@@ -115,7 +115,7 @@ def _pass_end(n: int, last: Float32, earlier: Float32) -> None:
 
 @kernel
 def _divide(fired: UInt8, t: np.float32, following: Float32, later: Float32, rates: Float32) -> None:
-    """Where a pixel fired, (following, later) = (t, following); then rates = 1 / (following - the spike before)."""
+    """Set (following, later) = (t, following) where a pixel fired, then rates = 1 / (following - the spike before)."""
     for p in range(len(fired)):
         i = np.uint64(p)
         a, b, c = following[i], later[i], fired[i] != 0
@@ -127,7 +127,7 @@ def _divide(fired: UInt8, t: np.float32, following: Float32, later: Float32, rat
 
 @kernel
 def _fill_beginning(n: int, first: Float32, second: Float32, rates: Float32) -> None:
-    """Rates of the ticks up to the first spike, which have no spike before them."""
+    """Set the rates of the ticks up to the first spike, which have no spike before them."""
     for p in range(len(first)):
         if first[p] < n:
             length = max(second[p] - first[p], first[p] + 1) if second[p] < n else np.float32(n)
@@ -153,5 +153,5 @@ TFI = ImageMaker(
     name="tfi",
     definition="1 / (the inter-spike interval that contains the start of tick t)",
     source="Zhu, Dong, Huang, Tian: A retina-inspired sampling method for visual texture reconstruction, ICME 2019",
-    rate=tfi_image,
+    rate=lambda stream, tick, _: tfi_image(stream, tick),
 )

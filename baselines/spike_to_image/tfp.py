@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,25 @@ from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, in_threads, kernel, lanes, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.settings import Settings
 
 Array = NDArray[Any]
-HALF_WINDOW = 20  # ticks on each side; 41 ticks in all are customary for this camera
+
+
+@dataclass(frozen=True)
+class TfpSettings(Settings):
+    """TFP's window."""
+
+    half_window: int = 20  # ticks on each side; 41 ticks in all are customary for this camera
+
+
+HALF_WINDOW = TfpSettings.half_window
 
 
 def tfp_image(stream: SpikeStream, tick: int, half_window: int = HALF_WINDOW) -> Float32:
-    """Spikes per tick [H, W] float32 over ticks [tick - half_window, tick + half_window), centred on the tick's start.
+    """Return spikes per tick [H, W] float32 over ticks [tick - half_window, tick + half_window).
 
-    At the clip's ends the window is what is left of it, and the mean divides by its true length.
+    The window is centred on the tick's start. At the clip's ends it is cut, and the mean divides by its true length.
     Raises UserError for a half window outside 1 ... 32767.
     """
     _check(half_window)
@@ -28,9 +39,9 @@ def tfp_image(stream: SpikeStream, tick: int, half_window: int = HALF_WINDOW) ->
 
 
 def tfp_stack(stream: SpikeStream, half_window: int = HALF_WINDOW, out: Float32 | None = None) -> Float32:
-    """`tfp_image` at every tick: spikes per tick [T, H, W] float32, by a running sum, into `out` if given.
+    """Return `tfp_image` at every tick: spikes per tick [T, H, W] float32, by a running sum, into `out` if given.
 
-    Time does not depend on the window; filling the result's memory takes most of it. `count_stack` is a quarter of it.
+    Time does not depend on the window: most of it goes into the result's memory. `count_stack` takes a quarter of both.
     """
     _check(half_window)
     if out is None:
@@ -42,7 +53,7 @@ def tfp_stack(stream: SpikeStream, half_window: int = HALF_WINDOW, out: Float32 
 
 
 def count_stack(stream: SpikeStream, half_window: int = HALF_WINDOW) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Spikes [T, H, W] in the window of `tfp_image` at every tick, in the smallest type that holds 2 * half_window."""
+    """Return spikes [T, H, W] in the window of `tfp_image` at every tick, in the smallest type for 2 * half_window."""
     _check(half_window)
     dtype = _dtype(half_window)
     out = np.empty((stream.n_ticks, stream.height, stream.width), dtype)
@@ -78,7 +89,7 @@ def _stack(
     start: int,
     stop: int,
 ) -> None:
-    """out[t] = scales[t] * counts in the window around t, for the stored rows of bands [start, stop)."""
+    """Set out[t] = scales[t] * counts in the window around t, for the stored rows of bands [start, stop)."""
     n, height, width = out.shape
     top, end = 8 * start, min(8 * stop, height)
     first, last = start * width, min(stop * width, packed.shape[1])
@@ -122,7 +133,8 @@ def _scale(counts: Array, scale: Any, flip: bool, image: Array) -> None:
 
 TFP = ImageMaker(
     name="tfp",
-    definition=f"mean of the spikes in ticks [t - {HALF_WINDOW}, t + {HALF_WINDOW})",
+    definition="mean of the spikes in ticks [t - half_window, t + half_window)",
     source="Zhu, Dong, Huang, Tian: A retina-inspired sampling method for visual texture reconstruction, ICME 2019",
-    rate=tfp_image,
+    rate=lambda stream, tick, settings: tfp_image(stream, tick, settings.half_window),
+    settings=TfpSettings(),
 )

@@ -11,10 +11,10 @@ interval that it rests at:
     d_R = -D ln[(1 - R') / (1 - R' (1 - u'))],    d_u = -F ln[(u' - u0) / (f - u0 + u' (1 - f))].
 
 The image is (1 / d_R + 1 / d_u) / 2 spikes per tick: exactly the rate where the light is constant and the interval
-a whole number of ticks. Where intervals alternate, d_u lies between the last one and those of the F ticks before, which
-takes some of the quantisation away; where the light changes it lags. Intervals much longer than F are TFI's.
+is a whole number of ticks. Where intervals alternate, d_u lies between the last one and those of the F ticks before,
+which removes some of the quantisation; where the light changes it lags. Intervals much longer than F are TFI's.
 
-What differs from the published program, and why:
+Differences from the published program, and why:
 
 - it has F in the denominator of d_u where its own update gives f, so that no interval comes back out; here it is f;
 - it adds the two rates and stretches the sum to 0 ... 255 with a histogram equalisation; here their mean stays a rate;
@@ -24,48 +24,77 @@ What differs from the published program, and why:
 - it starts all pixels at R = 1, u = u0, and needs several spikes to forget that. Here the oldest interval that is
   looked at counts as one at rest, so that the first interval of a clip already gives its rate.
 
-The state at tick t has seen the interval that contains the start of t, which is TFI's, and at least MEMORY_TICKS before
-it (or all that the clip has). At the clip's ends the interval is the one that TFI takes. Before the first spike there
-is no memory, so it is TFI; pixels with one spike have 1 / (length of the clip), pixels with none have 0.
+The state at tick t has seen the interval that contains the start of t, which is TFI's, and at least `memory_ticks`
+before it (or all that the clip has). At the clip's ends the interval is the one that TFI takes. Before the first spike
+there is no memory, so it is TFI; pixels with one spike have 1 / (length of the clip), pixels with none have 0.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
 from spike4dgs.baselines.spike_to_image.tfi import find_spike
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.settings import Settings
 
 Float64 = NDArray[np.float64]
-U0, JUMP = 0.15, 0.15  # utilisation at rest; share of the rest of it that a spike adds (f)
-D_TICKS, F_TICKS = 1.0, 10.0  # time constants of recovery and facilitation
-MEMORY_TICKS = 120  # older intervals weigh less than exp(-12): rates differ by less than 1e-4 from the whole history's
+Synapse = tuple[float, float, float, float]  # u0, f, D and F
 
 
-def tfstp_image(stream: SpikeStream, tick: int) -> Float32:
-    """Spikes per tick [H, W] float32 at the start of `tick`, from the states of the pixels' synapses."""
+@dataclass(frozen=True)
+class TfstpSettings(Settings):
+    """Constants of the model synapse, as published, and how much of the history is looked at."""
+
+    u0: float = 0.15  # utilisation at rest
+    jump: float = 0.15  # f, the share of the rest of it that a spike adds
+    d_ticks: float = 1.0  # D, the time constant of recovery
+    f_ticks: float = 10.0  # F, that of facilitation: about as many ticks are averaged over
+    memory_ticks: int = 120  # older intervals weigh less than exp(-12): rates move by less than 1e-4
+
+    def __post_init__(self) -> None:
+        if not (0 < self.u0 < 1 and 0 < self.jump < 1 and min(self.d_ticks, self.f_ticks, self.memory_ticks) > 0):
+            expected = "u0 and jump between 0 and 1, d_ticks, f_ticks and memory_ticks above 0"
+            raise problem("tfstp", expected, str(self), "correct the settings")
+
+
+def tfstp_image(stream: SpikeStream, tick: int, settings: TfstpSettings | None = None) -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, from the states of the pixels' synapses."""
+    s = settings or TfstpSettings()
     image = np.empty(stream.height * stream.width, np.float32)
     gaps = np.arange(stream.n_ticks + 1)
-    decays = np.exp(-gaps[:, None] / np.array([F_TICKS, D_TICKS]))  # [gap, 2]
-    in_threads(_image, len(image), rows(stream.packed), decays, tick, image, small=len(image) < 1 << 12)
+    decays = np.exp(-gaps[:, None] / np.array([s.f_ticks, s.d_ticks]))  # [gap, 2]
+    synapse = (float(s.u0), float(s.jump), float(s.d_ticks), float(s.f_ticks))  # one type for numba
+    arguments = (rows(stream.packed), decays, synapse, s.memory_ticks, tick, image)
+    in_threads(_image, len(image), *arguments, small=len(image) < 1 << 12)
     upright = image.reshape(stream.height, stream.width)
     return upright[::-1] if stream.rows_bottom_up else upright
 
 
 @kernel
-def _image(packed: UInt8, decays: Float64, tick: int, image: Float32, start: int, stop: int) -> None:
+def _image(
+    packed: UInt8,
+    decays: Float64,
+    synapse: Synapse,
+    memory: int,
+    tick: int,
+    image: Float32,
+    start: int,
+    stop: int,
+) -> None:
     for p in range(start, stop):
-        image[p] = np.float32(_rate(packed, decays, p, tick))
+        image[p] = np.float32(_rate(packed, decays, synapse, memory, p, tick))
 
 
 @kernel
-def _rate(packed: UInt8, decays: Float64, pixel: int, tick: int) -> float:
-    """Spikes per tick of one stored pixel."""
+def _rate(packed: UInt8, decays: Float64, synapse: Synapse, memory: int, pixel: int, tick: int) -> float:
+    """Return spikes per tick of one stored pixel."""
     n = len(packed)
     before, after = find_spike(packed, pixel, tick - 1, -1), find_spike(packed, pixel, tick, 1)
     if before < 0 and after < 0:
@@ -73,17 +102,20 @@ def _rate(packed: UInt8, decays: Float64, pixel: int, tick: int) -> float:
     if before < 0:
         following = find_spike(packed, pixel, after + 1, 1)
         return 1 / n if following < 0 else 1 / max(following - after, after + 1)
-    oldest = find_spike(packed, pixel, before - MEMORY_TICKS, -1)
+    oldest = find_spike(packed, pixel, before - memory, -1)
     if oldest < 0:
-        oldest = find_spike(packed, pixel, max(0, before - MEMORY_TICKS), 1)
+        oldest = find_spike(packed, pixel, max(0, before - memory), 1)
     if oldest == before:
         return 1 / n if after < 0 else 1 / (after - before)
-    return _remembered_rate(packed, decays, pixel, oldest, before, after)
+    return _remembered_rate(packed, decays, synapse, pixel, oldest, before, after)
 
 
 @kernel
-def _remembered_rate(packed: UInt8, decays: Float64, pixel: int, oldest: int, before: int, after: int) -> float:
-    """Spikes per tick after the spikes oldest ... before (two or more), and the one after them (-1: the clip ends)."""
+def _remembered_rate(
+    packed: UInt8, decays: Float64, synapse: Synapse, pixel: int, oldest: int, before: int, after: int
+) -> float:
+    """Return spikes per tick after the spikes oldest ... before (two or more) and `after` (-1: the clip ends)."""
+    u0, jump, d_ticks, f_ticks = synapse
     v = q = a = b = 0.0  # v = u - u0, q = 1 - R; a, b: A and B before the last spike
     spike, length = oldest, 0
     while spike != after:
@@ -95,13 +127,13 @@ def _remembered_rate(packed: UInt8, decays: Float64, pixel: int, oldest: int, be
         gap = following - spike
         decay_u, decay_r = decays[gap]
         if length == 0:  # at rest: the v and q that this gap leaves as they are
-            v = JUMP * (1 - U0) * decay_u / (1 - (1 - JUMP) * decay_u)
-            q = (U0 + v) * decay_r / (1 - (1 - U0 - v) * decay_r)
-        a, b = U0 + v + q * (1 - U0 - v), v + JUMP * (1 - U0 - v)
+            v = jump * (1 - u0) * decay_u / (1 - (1 - jump) * decay_u)
+            q = (u0 + v) * decay_r / (1 - (1 - u0 - v) * decay_r)
+        a, b = u0 + v + q * (1 - u0 - v), v + jump * (1 - u0 - v)
         v, q = b * decay_u, a * decay_r
         spike, length = following, gap
-    length_r = length + D_TICKS * math.log((U0 + v + q * (1 - U0 - v)) / a)
-    length_u = length + F_TICKS * math.log((v + JUMP * (1 - U0 - v)) / b)
+    length_r = length + d_ticks * math.log((u0 + v + q * (1 - u0 - v)) / a)
+    length_u = length + f_ticks * math.log((v + jump * (1 - u0 - v)) / b)
     return 0.5 / length_r + 0.5 / length_u
 
 
@@ -112,4 +144,5 @@ TFSTP = ImageMaker(
     source="Zheng, Zheng, Yu, Huang, Wang: Capture the moment: high-speed imaging with spiking cameras through "
     "short-term plasticity, IEEE TPAMI 45(7), 2023",
     rate=tfstp_image,
+    settings=TfstpSettings(),
 )

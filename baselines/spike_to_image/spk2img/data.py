@@ -1,7 +1,7 @@
-"""What Spk2ImgNet learns from: spikes and the ground truth of ordinary scene folders.
+"""Training data of Spk2ImgNet: spikes and the ground truth of ordinary scene folders.
 
 Every image of a scene counts, those of the held-out camera (every 20 ticks) and the sparse ones of the others. The
-public benchmark, variant 0 of every world, is refused: nothing that is scored may have been seen.
+public benchmark, variant 0 of every world, is refused: no training may see a scored scene.
 
 Augmentation is exact: the eight symmetries of the square, and time reversal. An integrator's spikes played backwards
 are those of an integrator that saw the light backwards; the image of the start of tick t is then that of the end of
@@ -32,14 +32,14 @@ class Example:
 
     stream: SpikeStream
     tick: int
-    rate: Float32  # [H, W] spikes per tick: radiance times gain, and at most the 1 that the sensor can tell
+    rate: Float32  # [H, W] spikes per tick: radiance times gain, and at most 1, where the sensor saturates
     moving: NDArray[np.int64]  # [M] flat indices of the pixels of the moving region
     gain: float  # spikes per tick of white
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Patches."""
+    """Patches of a training step."""
 
     spikes: Float32  # [B, 41, P, P] of 0 and 1
     rate: Float32  # [B, P, P]
@@ -59,7 +59,7 @@ def open_for_training(folder: Path, allow_gaps: bool = False) -> Scene:
 
 
 def read_examples(scene: Scene) -> list[Example]:
-    """All examples of a scene whose spikes are all there, in the order of camera and tick.
+    """Return the examples of a scene whose spikes are complete, in the order of camera and tick.
 
     Raises UserError where the scene has none.
     """
@@ -80,13 +80,13 @@ def read_examples(scene: Scene) -> list[Example]:
 
 
 def _is_whole(stream: SpikeStream, tick: int) -> bool:
-    """Whether no tick is missing from the windows around `tick`: the image's own, and the reversed, a tick earlier."""
-    first, stop = tick - 1 - HALF_WINDOW, tick + HALF_WINDOW + 1
+    """Return whether no tick is missing from the windows around `tick`: the image's own, and the reversed one."""
+    first, stop = tick - 1 - HALF_WINDOW, tick + HALF_WINDOW + 1  # the reversed window begins a tick earlier
     return all(gap.stop_tick <= first or stop <= gap.first_tick for gap in stream.gaps)
 
 
 def draw(examples: Sequence[Example], count: int, patch: int, moving_share: float, rng: np.random.Generator) -> Batch:
-    """Draw `count` patches of random examples; a `moving_share` of them around a moving pixel, where there is one.
+    """Return `count` random patches, a `moving_share` of them around a moving pixel where there is one.
 
     `patch` is in pixels, at most the images' shorter side.
     """
@@ -101,7 +101,7 @@ def draw(examples: Sequence[Example], count: int, patch: int, moving_share: floa
 
 
 def _patch(example: Example, size: int, on_motion: bool, rng: np.random.Generator) -> tuple[Float32, Float32]:
-    """One patch and its truth, turned, flipped and reversed at random."""
+    """Return one patch and its truth, turned, flipped and reversed at random."""
     height, width = example.rate.shape
     if on_motion and len(example.moving):
         y, x = divmod(int(rng.choice(example.moving)), width)

@@ -1,4 +1,4 @@
-"""Modulated deformable convolution (DCNv2), 3x3: every tap of every group looks where an offset sends it.
+"""Modulated deformable convolution (DCNv2), 3x3: an offset moves every tap of every group.
 
 y(p) = bias + sum over taps k of weight_k * mask_k(p) * x(p + k + offset_k(p)), x read bilinearly and 0 outside the
 image (Zhu, Hu, Lin, Dai: Deformable ConvNets v2, CVPR 2019). The samples of all taps and groups are one call of
@@ -17,15 +17,15 @@ from spike4dgs.baselines.spike_to_image.spk2img.deformable_cpu import TAPS
 
 
 def deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Convolve x [B, C, H, W] with weight [O, C, 3, 3] and bias [O] to [B, O, H, W].
+    """Return the convolution of x [B, C, H, W] with weight [O, C, 3, 3] and bias [O]: [B, O, H, W].
 
     offsets [B, G, 9, 2, H, W] are pixels (right, down), masks [B, G, 9, H, W]; taps run row by row from the top left.
     The C channels are G groups of neighbours; each group has its own offsets and masks.
     """
     batch, channels, height, width = x.shape
     groups = offsets.shape[1]
-    u = offsets[:, :, :, 0] + _places(width, x).view(1, 1, 1, 1, width) + _taps(x).repeat(3).view(TAPS, 1, 1)
-    v = offsets[:, :, :, 1] + _places(height, x).view(1, 1, 1, height, 1)
+    u = offsets[:, :, :, 0] + _centers(width, x).view(1, 1, 1, 1, width) + _taps(x).repeat(3).view(TAPS, 1, 1)
+    v = offsets[:, :, :, 1] + _centers(height, x).view(1, 1, 1, height, 1)
     v = v + _taps(x).repeat_interleave(3).view(TAPS, 1, 1)
     # grid_sample without aligned corners: the image's outer edges, half a pixel off the outer centres, are -1 and 1.
     grid = torch.stack([u * (2 / width) - 1, v * (2 / height) - 1], dim=-1)  # [B, G, 9, H, W, 2]
@@ -40,8 +40,8 @@ def deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, b
     return (weight.flatten(1) @ columns + bias[:, None]).view(batch, -1, height, width)
 
 
-def _places(n: int, like: Tensor) -> Tensor:
-    """Coordinates [n] of pixel centres, in the type and on the device of `like`."""
+def _centers(n: int, like: Tensor) -> Tensor:
+    """Return coordinates [n] of pixel centres, in the type and on the device of `like`."""
     return torch.arange(n, dtype=like.dtype, device=like.device) + 0.5
 
 
@@ -64,7 +64,7 @@ class DeformableConv(nn.Module):
         self.groups = groups
 
     def forward(self, x: Tensor, guide: Tensor) -> Tensor:
-        """Feature x and guide, both [B, width, H, W], to [B, width, H, W]."""
+        """Return [B, width, H, W] from feature x and guide, both [B, width, H, W]."""
         batch, channels, height, width = x.shape
         found = self.guide(guide)
         suits = x.device.type == "cpu" and x.dtype == torch.float32 and channels == deformable_cpu.GROUP * self.groups

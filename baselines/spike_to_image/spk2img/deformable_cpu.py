@@ -29,7 +29,7 @@ def _pool() -> ThreadPoolExecutor:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _blend(typing_context: Any, x: Any, corners: Any, weights: Any, columns: Any, at: Any) -> Any:
-    """columns[at : at + 8] = sum of weights[j] * x[corners[j] : corners[j] + 8]; four of each, x and columns flat."""
+    """Set columns[at : at + 8] to the sum of four weights[j] * x[corners[j] : corners[j] + 8]; both arrays are flat."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         lanes = Lanes(builder, GROUP)
@@ -45,11 +45,11 @@ def _blend(typing_context: Any, x: Any, corners: Any, weights: Any, columns: Any
 
 
 @njit(inline="always")
-def _side(place: np.float32, size: int) -> tuple[int, int, np.float32, np.float32]:
-    """The two neighbours of a place within the image, and their weights: 0 for a neighbour outside."""
-    place = min(max(place, np.float32(-2)), np.float32(size + 1))  # no offset is too large for an integer
-    low = np.floor(place)
-    i, upper = int(low), place - low
+def _side(position: np.float32, size: int) -> tuple[int, int, np.float32, np.float32]:
+    """Return the two neighbours of a position within the image, and their weights: 0 for a neighbour outside."""
+    position = min(max(position, np.float32(-2)), np.float32(size + 1))  # no offset is too large for an integer
+    low = np.floor(position)
+    i, upper = int(low), position - low
     lower = np.float32(1) - upper if 0 <= i < size else np.float32(0)
     upper = upper if -1 <= i < size - 1 else np.float32(0)
     return min(max(i, 0), size - 1), min(max(i + 1, 0), size - 1), lower, upper
@@ -86,14 +86,14 @@ def _sample(x, found, columns, channels, first, step):
 
 
 def convolve(x: Tensor, found: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Deformable convolution of x [B, C, H, W] float32 with weight [O, C, 3, 3]; no gradients.
+    """Return the deformable convolution of x [B, C, H, W] float32 with weight [O, C, 3, 3]; no gradients.
 
     found [B, G * 27, H, W] has the offsets and the masks before their sigmoid, as DeformableConv's guide gives them.
     """
     batch, channels, height, width = x.shape
-    places, guides = (t.permute(0, 2, 3, 1).contiguous().numpy() for t in (x, found))
+    pixels, guides = (t.permute(0, 2, 3, 1).contiguous().numpy() for t in (x, found))
     columns = torch.empty(batch, height, width, TAPS * channels)
-    sample: Any = functools.partial(_sample, places.reshape(-1), guides, columns.view(-1).numpy(), channels)
+    sample: Any = functools.partial(_sample, pixels.reshape(-1), guides, columns.view(-1).numpy(), channels)
     helper = _pool().submit(sample, 1, 2)  # every other row of pixels each
     sample(0, 2)
     helper.result()

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 def spk2img_image(stream: SpikeStream, tick: int) -> Float32:
-    """Spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
+    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
 
-    Beyond the clip's ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
+    Beyond its ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
     """
     return reconstruct(load_network(weights_path(), choose_device("auto")), stream, tick)
 
 
 def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
-    """What `network` takes the rate to be at the start of `tick`: spikes per tick [H, W] float32, not negative."""
+    """Return the estimate of `network` at the start of `tick`: spikes per tick [H, W] float32, not negative."""
     import torch  # imported where it is used: reading spikes must not wait for it
 
     device = next(network.parameters()).device
@@ -40,6 +40,6 @@ SPK2IMG = ImageMaker(
     definition=f"Spk2ImgNet on the {WINDOW} ticks around tick t",
     source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike stream, "
     "CVPR 2021",
-    rate=spk2img_image,
+    rate=lambda stream, tick, _: spk2img_image(stream, tick),
     learned=partial(learned_from, WEIGHTS.in_use, read_card),
 )

@@ -6,7 +6,7 @@ convolutions, masked, and fused to one image: the rate of spikes at the middle t
 
 All channel counts follow `width`; 64 is the paper's, with 3,904,185 parameters. Deformable groups have 8 channels at
 every width (the paper has 8 groups), which keeps the cost proportional to width squared. The published sources leave
-open what separates a residual block's three convolutions; here it is ReLU.
+open which activation separates a residual block's three convolutions; here it is ReLU.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _LEVELS = 3
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What the network gives, in spikes per tick."""
+    """The output of the network, in spikes per tick."""
 
     rate: Tensor  # [B, H, W] at the middle tick
-    estimates: Tensor  # [B, 5, 4, H, W] each branch's own guess at the middle of each block
+    estimates: Tensor  # [B, 5, 4, H, W] each branch's own estimate at the middle of each block
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
@@ -62,7 +62,7 @@ class _Residual(nn.Module):
 
 
 class Extractor(nn.Module):
-    """A block's features, and what each of the four branches takes the image to be."""
+    """The shared extractor: features of a block, and an estimate of the image by each of its four branches."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Extractor(nn.Module):
         self.body = nn.Sequential(*(_Residual(width) for _ in range(_RESIDUAL_BLOCKS)))
 
     def forward(self, block: Tensor) -> tuple[Tensor, Tensor]:
-        """Spikes [B, 13, H, W] to features [B, width, H, W] and estimates [B, 4, H, W]."""
+        """Return features [B, width, H, W] and estimates [B, 4, H, W] from spikes [B, 13, H, W]."""
         cuts = [(BLOCK - n) // 2 for n in BRANCHES]
         estimates = torch.cat(
             [branch(block[:, cut : BLOCK - cut]) for cut, branch in zip(cuts, self.branches, strict=True)], dim=1
@@ -98,7 +98,7 @@ class _Level(nn.Module):
     def forward(
         self, feature: Tensor, reference: Tensor, coarser: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Guide and aligned feature, before its activation; `coarser` has the next level's, which are upsampled."""
+        """Return guide and aligned feature, before its activation. `coarser` has those of the next coarser level."""
         guide = _leaky(self.compare(torch.cat([feature, reference], dim=1)))
         if coarser is None or self.merge is None or self.fuse is None:
             guide = _leaky(self.refine(guide))
@@ -132,14 +132,14 @@ class Alignment(nn.Module):
         self.cascade = _Level(width, has_coarser=False)
 
     def pyramid(self, x: Tensor) -> list[Tensor]:
-        """Features at full, half and quarter size."""
+        """Return features at full, half and quarter size."""
         levels = [x]
         for halve in self.down:
             levels.append(halve(levels[-1]))
         return levels
 
     def forward(self, features: Sequence[Tensor], reference: Sequence[Tensor]) -> Tensor:
-        """Align the pyramid of features to that of the reference: [B, width, H, W]."""
+        """Return the features [B, width, H, W] aligned to the reference; both are pyramids."""
         guide, aligned = self.levels[-1](features[-1], reference[-1])
         aligned = _leaky(aligned)
         for i in range(_LEVELS - 2, -1, -1):
@@ -149,7 +149,7 @@ class Alignment(nn.Module):
 
 
 def _mask(width: int) -> nn.Sequential:
-    """What to trust of an aligned feature, seen beside the reference: [B, 2 * width, H, W] to [B, width, H, W]."""
+    """Return the layers that weight an aligned feature beside the reference: 2 * width channels to width."""
     return nn.Sequential(
         _conv(2 * width, width), nn.PReLU(), _conv(width, width), nn.PReLU(), _conv(width, width), nn.Sigmoid()
     )
@@ -174,7 +174,7 @@ class Spk2ImgNet(nn.Module):
         )
 
     def forward(self, spikes: Tensor) -> Reconstruction:
-        """Spikes [B, 41, H, W] of 0 and 1, float."""
+        """Return the reconstruction from spikes [B, 41, H, W] of 0 and 1, float."""
         batch, _, height, width = spikes.shape
         padded, top, left = _pad(spikes)
         blocks = torch.stack([padded[:, s : s + BLOCK] for s in BLOCK_STARTS])  # [5, B, 13, H, W]
@@ -193,13 +193,13 @@ class Spk2ImgNet(nn.Module):
         return Reconstruction(rate[:, rows, columns], estimates[..., rows, columns])
 
 
-def place(network: Spk2ImgNet, device: str) -> Spk2ImgNet:
+def on_device(network: Spk2ImgNet, device: str) -> Spk2ImgNet:
     """Move the network to `device`, channels last in memory: twice as fast as channels first on the CPU."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
 def _pad(x: Tensor) -> tuple[Tensor, int, int]:
-    """Mirror [..., H, W] at its sides up to multiples of four; with the rows above and the columns left of the old."""
+    """Return [..., H, W] mirrored at its sides up to multiples of four, and the rows above and columns left added."""
     before = [-x.shape[dim] % 4 // 2 for dim in (-2, -1)]
     for dim, start in zip((-2, -1), before, strict=True):
         n = x.shape[dim]

@@ -29,7 +29,7 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_rate
+from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_learning_rate
 
 # Width 64; Adam at 1e-4, a tenth of it after epoch 20 of 61; batches of 16 patches of 40x40 pixels.
 PUBLISHED: dict[str, int] = {"width": 64, "epochs": 61, "batch": 16, "patch": 40}
@@ -40,25 +40,25 @@ _SCORED_IMAGES = 8  # of each hidden scene
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Hyper-parameters. Small networks bear a higher rate than the published one, and need it."""
+    """Hyper-parameters. Small networks need a higher learning rate than the published one."""
 
     width: int = 8
     steps: int = 20_000
     batch: int = 8  # patches a step
     patch: int = 48  # pixels
-    rate: float = 2e-3  # Adam's, after the warm-up; it falls to nothing with the cosine
+    lr: float = 2e-3  # Adam's, after the warm-up; it falls to 0 with the cosine
     warm_up: int = 200  # steps
-    moving_share: float = 0.5  # of the patches lie around a moving pixel: most of a scene stands still
+    moving_share: float = 0.5  # of the patches lie around a moving pixel: most of a scene is static
     estimate_weight: float = 0.02  # of each branch's estimate, as published
 
     @property
     def schedule(self) -> WarmCosine:
         """Adam's learning rate by step."""
-        return WarmCosine(self.rate, self.warm_up, self.steps)
+        return WarmCosine(self.lr, self.warm_up, self.steps)
 
 
 def loss_of(found: Reconstruction, rate: Tensor, gain: Tensor, estimate_weight: float) -> Tensor:
-    """L1 in radiance, of the image and of the middle block's estimates. rate [B, P, P], gain [B]."""
+    """Return the L1 loss in radiance of the image and of the middle block's estimates. rate [B, P, P], gain [B]."""
     scale = 1 / gain
     image = ((found.rate - rate).abs().mean(dim=(1, 2)) * scale).mean()
     estimates = (found.estimates[:, MIDDLE] - rate[:, None]).abs().mean(dim=(2, 3))  # [B, 4]
@@ -78,16 +78,16 @@ class Training:
         self.step = 0
 
     def batch(self) -> Batch:
-        """The current step's patches."""
+        """Return the current step's patches."""
         s = self.settings
         return draw(self.examples, s.batch, s.patch, s.moving_share, np.random.default_rng([self.seed, self.step]))
 
     def train_step(self) -> float:
-        """One step; returns its loss."""
+        """Take one step and return its loss."""
         batch = self.batch()
         spikes = torch.from_numpy(batch.spikes).to(self.device, memory_format=torch.channels_last)
         rate, gain = (torch.from_numpy(a).to(self.device) for a in (batch.rate, batch.gain))
-        set_rate(self.adam, self.settings.schedule.at(self.step))
+        set_learning_rate(self.adam, self.settings.schedule.at(self.step))
         loss = loss_of(self.network(spikes), rate, gain, self.settings.estimate_weight)
         self.adam.zero_grad(set_to_none=True)
         loss.backward()
@@ -98,7 +98,7 @@ class Training:
         return loss.item()
 
     def save(self, path: Path, key: str) -> None:
-        """Write everything needed to go on."""
+        """Write a checkpoint."""
         save_training(path, self.step, self.network, self.adam, key)
 
     def resume(self, path: Path, key: str) -> None:
@@ -107,7 +107,7 @@ class Training:
 
 
 def score(network: Spk2ImgNet, scene: Scene) -> float:
-    """Mean PSNR in dB over targets of a scene, evenly chosen from its default split."""
+    """Return the mean PSNR in dB over targets of a scene, evenly chosen from its default split."""
     chosen = scene.targets[:: max(1, len(scene.targets) // _SCORED_IMAGES)]
     values = []
     for target in chosen:
@@ -163,7 +163,9 @@ def train_spk2img(
 
 def _run(training: Training, hidden: Sequence[Scene], names: tuple[str, ...], out: Path) -> None:
     settings = training.settings
-    key = sha256_json([asdict(settings), training.seed, names])
+    facts = asdict(settings)
+    facts["rate"] = facts.pop("lr")  # its name in the keys of checkpoints that earlier versions wrote
+    key = sha256_json([facts, training.seed, names])
     training.resume(out / "checkpoint.safetensors", key)
     first, start = training.step, time.perf_counter()
     shown = saved = start

@@ -61,7 +61,7 @@ def read_card(path: Path) -> Card:
 @cache
 def load_network(path: Path, device: str) -> Spk2ImgNet:
     """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
-    from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet, place
+    from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet, on_device
 
     network = Spk2ImgNet(read_card(path).width)
-    return place(fill_network(WEIGHTS, path, network, f"width {network.width}"), device)
+    return on_device(fill_network(WEIGHTS, path, network, f"width {network.width}"), device)

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.baselines.spike_to_image.adaptive import adaptive_image, half_windows, spike_times
+from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adaptive_image, half_windows, spike_times
 from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 
@@ -24,10 +25,11 @@ def fire(rates, charge):
     return np.diff(np.floor(total), axis=0, prepend=np.floor(charge)[None]) > 0
 
 
-def slow(spikes, tick):
+def slow(spikes, tick, settings=None):
     """The definition, pixel by pixel, window by window."""
     n, height, width = spikes.shape
-    halves = half_windows(n)
+    settings = settings or AdaptiveSettings()
+    halves, reach = half_windows(n, settings), settings.shared_px // 2
 
     def window(y, x, half):
         t = np.flatnonzero(spikes[:, y, x])
@@ -50,7 +52,7 @@ def slow(spikes, tick):
                 break
     image = spikes.sum(axis=0) / n
     for y, x in np.ndindex(height, width):
-        s = level[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].min()
+        s = level[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].min()
         rates = [window(y, x, half)[0] for half in halves[s:]]
         image[y, x] = next((r for r in rates if r is not None), image[y, x])
     return image
@@ -65,6 +67,21 @@ def test_images_are_those_of_the_definition(height, width, n, bottom_up, seed):
     tick = int(rng.integers(n))
     found = adaptive_image(stream_of(spikes, bottom_up), tick)
     np.testing.assert_allclose(found, slow(spikes, tick), rtol=1e-6)
+
+
+def test_the_windows_are_settings_of_the_maker():
+    rng = np.random.default_rng(8)
+    spikes = fire(np.where(np.arange(90) < 40, 0.2, 0.5)[:, None, None] * rng.random((9, 11)), rng.random((9, 11)))
+    wide = AdaptiveSettings(shortest=3.0, growth=1.2, shared_px=5)
+    found = IMAGES["adaptive"].with_settings(wide)(stream_of(spikes), [35], 1.0)[0]
+    np.testing.assert_allclose(found, slow(spikes, 35, wide), rtol=1e-6)
+    assert half_windows(90, wide)[0] == 3 and not np.array_equal(found, adaptive_image(stream_of(spikes), 35))
+
+
+@pytest.mark.parametrize("wrong", [{"shortest": 0.0}, {"growth": 1.0}, {"shared_px": 2}])
+def test_windows_without_a_meaning_are_refused(wrong):
+    with pytest.raises(UserError, match="adaptive: expected shortest above 0, .* found AdaptiveSettings"):
+        AdaptiveSettings(**wrong)
 
 
 def test_constant_light_is_known_as_well_as_the_clip_allows():
@@ -88,7 +105,7 @@ def test_a_step_of_light_is_not_blurred():
 
 
 def test_a_dark_stripe_between_bright_ones_is_dark():
-    """No spike falls while it passes: that there is none must count, though a constant rate explains all there are."""
+    """No spike falls while it passes. The gap must count, though a constant rate explains the spikes on both sides."""
     rates = np.full((400, 24, 24), 0.5)
     rates[180:210] = 0.004
     stream = stream_of(fire(rates, np.random.default_rng(4).random((24, 24))))
@@ -97,7 +114,7 @@ def test_a_dark_stripe_between_bright_ones_is_dark():
 
 
 @pytest.mark.parametrize("fired", [[], [7]])
-def test_pixels_with_fewer_than_two_spikes_have_their_number_over_the_clip(fired):
+def test_pixels_with_fewer_than_two_spikes_have_the_clips_mean_rate(fired):
     spikes = np.zeros((50, 2, 9), bool)
     spikes[fired] = True
     for tick in (0, 25, 49):

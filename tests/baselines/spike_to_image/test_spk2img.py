@@ -146,7 +146,7 @@ def test_loss_from_its_definition() -> None:
     assert loss_of(perfect, torch.from_numpy(truth), torch.from_numpy(gain), 0.02).item() == 0
 
 
-SMALL = TrainingSettings(width=4, steps=25, batch=2, patch=16, warm_up=5, rate=5e-3)
+SMALL = TrainingSettings(width=4, steps=25, batch=2, patch=16, warm_up=5, lr=5e-3)
 
 
 def test_training_learns(small_scene: Path) -> None:

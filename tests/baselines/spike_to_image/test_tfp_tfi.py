@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image, tfi_stack
-from spike4dgs.baselines.spike_to_image.tfp import count_stack, tfp_image, tfp_stack
+from spike4dgs.baselines.spike_to_image.tfp import TfpSettings, count_stack, tfp_image, tfp_stack
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.settings import Settings
 
 
 def slow_tfp(spikes: np.ndarray, tick: int, half_window: int) -> np.ndarray:
@@ -138,3 +139,13 @@ def test_a_tick_outside_the_clip_is_refused(tick: int) -> None:
 def test_a_window_out_of_range_is_refused(half_window: int) -> None:
     with pytest.raises(UserError, match="half_window: expected 1 to 32767 ticks"):
         tfp_stack(stream_of(np.ones((20, 2, 2), np.uint8)), half_window)
+
+
+def test_the_window_is_a_setting_of_the_maker() -> None:
+    stream, tfp = stream_of(random_spikes(60, 6, 9, 1)), IMAGES["tfp"]
+    narrow = tfp.with_settings(TfpSettings(half_window=4))
+    np.testing.assert_array_equal(narrow(stream, [30], 1.0)[0], tfp_image(stream, 30, 4))
+    np.testing.assert_array_equal(tfp(stream, [30], 1.0)[0], tfp_image(stream, 30, 20))
+    with pytest.raises(TypeError, match="tfp has TfpSettings, not Settings"):
+        tfp.with_settings(Settings())
+    assert IMAGES["tfi"].settings == Settings()

@@ -13,22 +13,23 @@ from hypothesis import strategies as st
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
-from spike4dgs.baselines.spike_to_image.tfstp import MEMORY_TICKS, tfstp_image
+from spike4dgs.baselines.spike_to_image.tfstp import TfstpSettings, tfstp_image
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
-U0 = f = Decimal("0.15")
-D, F = Decimal(1), Decimal(10)
+PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # u0, f, D, F
 
 
-def update(R: Decimal, u: Decimal, d: int) -> tuple[Decimal, Decimal]:
-    return (
-        1 - (1 - R * (1 - u)) * (-d / D).exp(),
-        U0 + (u + f * (1 - u) - U0) * (-d / F).exp(),
-    )
-
-
-def slow_rate(fired: list[int], n: int, tick: int) -> float:
+def slow_rate(fired: list[int], n: int, tick: int, constants: tuple[Decimal, ...] = PUBLISHED) -> float:
     """One pixel, from the published equations: the whole history, and both inversions as they are printed."""
+    U0, f, D, F = constants
+
+    def update(R: Decimal, u: Decimal, d: int) -> tuple[Decimal, Decimal]:
+        return (
+            1 - (1 - R * (1 - u)) * (-d / D).exp(),
+            U0 + (u + f * (1 - u) - U0) * (-d / F).exp(),
+        )
+
     before, after = [t for t in fired if t < tick], [t for t in fired if t >= tick]
     if len(fired) < 2:
         return len(fired) / n
@@ -76,12 +77,28 @@ def test_images_equal_the_published_equations(n: int, height: int, width: int, b
         np.testing.assert_allclose(image.ravel(), expected, rtol=1e-6)
 
 
+def test_other_constants_are_settings_of_the_maker() -> None:
+    n, rng = 120, np.random.default_rng(5)
+    pixels = [list(np.flatnonzero(rng.random(n) < p)) for p in (0.05, 0.2, 0.5)]
+    maker = IMAGES["tfstp"].with_settings(TfstpSettings(u0=0.25, jump=0.5, d_ticks=2, f_ticks=5.0, memory_ticks=200))
+    constants = Decimal("0.25"), Decimal("0.5"), Decimal(2), Decimal(5)
+    expected = [slow_rate(p, n, 80, constants) for p in pixels]
+    np.testing.assert_allclose(maker(one_row(n, *pixels), [80], 1.0)[0, 0], expected, rtol=1e-6)
+    assert not np.allclose(IMAGES["tfstp"](one_row(n, *pixels), [80], 1.0)[0, 0], expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("wrong", [{"u0": 0.0}, {"jump": 1.0}, {"d_ticks": -1.0}, {"memory_ticks": 0}])
+def test_constants_without_a_meaning_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match="tfstp: expected u0 and jump between 0 and 1, .* found TfstpSettings"):
+        TfstpSettings(**wrong)
+
+
 def test_forgetting_what_is_older_than_the_memory_changes_little() -> None:
     """Bright, then dark, just before the memory begins, and the other way round: the worst cases; then random ones."""
-    n, rng = 400, np.random.default_rng(3)
+    n, rng, memory = 400, np.random.default_rng(3), TfstpSettings().memory_ticks
     pixels = [
         [*range(0, start, first), *range(start, n, second)]
-        for start in (200, 260, 300 - MEMORY_TICKS, 300 - MEMORY_TICKS - 1)
+        for start in (200, 260, 300 - memory, 300 - memory - 1)
         for first, second in ((1, 40), (1, 119), (1, 121), (40, 1), (3, 60), (90, 7))
     ]
     pixels += [list(np.flatnonzero(rng.random(n) < p)) for p in (0.01, 0.02, 0.05, 0.3, 0.8)]
@@ -99,7 +116,7 @@ def test_a_constant_interval_gives_exactly_its_rate(interval: int) -> None:
 
 
 def test_sparse_pixels_at_the_ends_of_the_clip() -> None:
-    """What has no memory is TFI: no spike, one spike, and all that lies before the second one."""
+    """Without a memory it is TFI: with no spike, with one spike, and before the second one."""
     stream = one_row(20, [], [0], [19], [7], [0, 19], [0, 4], [15, 19], [3, 5])
     for tick, same in ((0, 8), (4, 8), (5, 5)):
         np.testing.assert_allclose(tfstp_image(stream, tick)[0, :same], tfi_image(stream, tick)[0, :same], rtol=1e-6)

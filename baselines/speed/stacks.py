@@ -8,31 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.baselines.speed.streams import fired_stream
 from spike4dgs.baselines.spike_to_image.base import Float32
 from spike4dgs.baselines.spike_to_image.tfi import tfi_stack
-from spike4dgs.baselines.spike_to_image.tfp import HALF_WINDOW, count_stack, tfp_stack
+from spike4dgs.baselines.spike_to_image.tfp import TfpSettings, count_stack, tfp_stack
 from spike4dgs.benchmark.speed.decode import unpack_plainly
 from spike4dgs.benchmark.speed.timing import show_table, time_ms
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 COLUMNS = ("images", "by", "min ms", "median ms", "times as fast", "largest error")
 
 
-def fired_stream(ticks: int, width: int, height: int, seed: int = 0) -> SpikeStream:
-    """Ideal integrate-and-fire at rates of 0.01 to 0.6 spikes per tick, fixed in time."""
-    rng = np.random.default_rng(seed)
-    rate, charge = rng.uniform(0.01, 0.6, (height, width)), rng.random((height, width))
-    packed = []
-    for _ in range(ticks):
-        charge += rate
-        fired = charge >= 1
-        charge -= fired
-        packed.append(pack(fired[None]))
-    return SpikeStream(np.concatenate(packed), width, height, 20_000.0)
-
-
-def tfp_plainly(stream: SpikeStream, half_window: int = HALF_WINDOW) -> Float32:
-    """TFP at every tick from numpy's cumulative sum of the unpacked clip."""
+def tfp_plainly(stream: SpikeStream, half_window: int = TfpSettings.half_window) -> Float32:
+    """Return TFP at every tick from numpy's cumulative sum of the unpacked clip."""
     sums = np.zeros((stream.n_ticks + 1, stream.height, stream.width), np.int32)
     np.cumsum(unpack_plainly(stream), axis=0, dtype=np.int32, out=sums[1:])
     t = np.arange(stream.n_ticks)
@@ -41,7 +29,7 @@ def tfp_plainly(stream: SpikeStream, half_window: int = HALF_WINDOW) -> Float32:
 
 
 def tfi_plainly(stream: SpikeStream) -> Float32:
-    """TFI at every tick inside complete intervals, NaN elsewhere: numpy's running maximum over the unpacked clip."""
+    """Return TFI at every tick inside complete intervals, NaN elsewhere, by running maxima over the unpacked clip."""
     fired = unpack_plainly(stream)
     n = len(fired)
     t = np.arange(n, dtype=np.float32)[:, None, None]
@@ -84,7 +72,8 @@ def tfp(argv: Sequence[str] = ()) -> int:
     stream = fired_stream(a.ticks, a.width, a.height)
     out = np.empty((a.ticks, a.height, a.width), np.float32)
     error = f"{np.abs(tfp_plainly(stream) - tfp_stack(stream, out=out)).max():.1e}"
-    lengths = np.minimum(np.arange(a.ticks) + HALF_WINDOW, a.ticks) - np.maximum(np.arange(a.ticks) - HALF_WINDOW, 0)
+    ticks, half_window = np.arange(a.ticks), TfpSettings.half_window
+    lengths = np.minimum(ticks + half_window, a.ticks) - np.maximum(ticks - half_window, 0)
     off = int(np.abs(count_stack(stream) - np.rint(out * lengths[:, None, None])).max())
     ours = (
         ("counts, uint8", lambda: count_stack(stream), str(off)),

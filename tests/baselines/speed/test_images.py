@@ -1,4 +1,4 @@
-"""`speed images`: every generator is timed and scored as its images deserve; what cannot run says why."""
+"""`speed images`: every image maker is timed and scored; one that cannot run says why."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from small_scenes import GAIN, HEIGHT, WIDTH, array_cameras, write_small_scene
 
-from spike4dgs.baselines import speed_images
+from spike4dgs.baselines.speed import images, rows
+from spike4dgs.baselines.speed.other_programs import tfstp_plainly
 from spike4dgs.baselines.spike_to_image.table import IMAGES, ImageMaker
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image
 from spike4dgs.baselines.spike_to_image.tfp import TFP
@@ -28,6 +29,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.generators.sensor import calibration
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor
+from spike4dgs.method.settings import Settings
 
 MEAN = """
 import torch
@@ -40,13 +42,13 @@ NEEDS_CUDA = "import torch\nclass TFIModel(torch.nn.Module):\n    def forward(se
 UNTRAINED = "import torch\nclass SpikeNet(torch.nn.Module):\n    def forward(self, x): return x[:, :1] * 0"
 
 
-def needs_weights(stream: SpikeStream, tick: int) -> np.ndarray:
+def needs_weights(stream: SpikeStream, tick: int, settings: Settings) -> np.ndarray:
     raise problem("net.safetensors", "weights", "no such file", "train them")
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Two scenes, a generator without its weights, and a package that stands in for spikezoo; yields the output."""
+    """Two scenes, an image maker without its weights, and a package that stands in for spikezoo; yields the output."""
     tmp_path = tmp_path_factory.mktemp("speed")
     with pytest.MonkeyPatch.context() as monkeypatch:
         prepare(tmp_path, monkeypatch)
@@ -63,18 +65,18 @@ def prepare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     makers = {name: IMAGES[name] for name in ("tfp", "tfi", "tfstp")}
     makers["spk2img"] = ImageMaker(name="spk2img", definition="", source="", rate=needs_weights)
-    monkeypatch.setattr(speed_images, "IMAGES", makers)
+    monkeypatch.setattr(images, "IMAGES", makers)
     for name, value in {"WIDTH": 40, "HEIGHT": 24, "TICKS": 60}.items():
-        monkeypatch.setattr(speed_images, name, value)
+        monkeypatch.setattr(rows, name, value)
 
 
-def rows(path: Path, key: str = "images") -> dict[str, dict[str, str]]:
+def read_rows(path: Path, key: str = "images") -> dict[str, dict[str, str]]:
     with open(path) as f:
         return {row[key]: row for row in csv.DictReader(f)}
 
 
-def test_each_generator_has_a_row_with_times_scores_and_the_papers_numbers(measured: Path) -> None:
-    table = rows(measured / "images.csv")
+def test_each_maker_has_a_row_with_times_scores_and_the_papers_numbers(measured: Path) -> None:
+    table = read_rows(measured / "images.csv")
     ours = ["tfp", "tfi", "tfstp", "spk2img", "msdi"]
     assert list(table) == [*ours, "tfstp, numpy", *(f"{name}, spikezoo" for name in ("tfi", "tfp", "tfstp", "spk2img"))]
     for name in ("tfp", "tfi", "tfstp", "tfp, spikezoo"):
@@ -91,11 +93,11 @@ def test_each_generator_has_a_row_with_times_scores_and_the_papers_numbers(measu
     assert "stands in for TVS" in table["tfstp"]["note"]
 
 
-def test_what_cannot_run_is_a_row_with_its_reason(measured: Path) -> None:
-    table = rows(measured / "images.csv")
+def test_a_maker_that_cannot_run_is_a_row_with_its_reason(measured: Path) -> None:
+    table = read_rows(measured / "images.csv")
     for name, reason in (
         ("spk2img", "net.safetensors: expected weights, found no such file; train them"),
-        ("msdi", "not among the generators"),
+        ("msdi", "not among the image makers"),
         ("tfi, spikezoo", "does not run here: AssertionError: no CUDA"),
         ("tfstp, spikezoo", "does not run here: ImportError: spikezoo has no archs/tfstp/nets.py"),
     ):
@@ -106,7 +108,7 @@ def test_what_cannot_run_is_a_row_with_its_reason(measured: Path) -> None:
 
 
 def test_scores_are_those_of_the_held_out_streams_images(measured: Path) -> None:
-    by_scene = rows(measured / "images_by_scene.csv", "scene")
+    by_scene = read_rows(measured / "images_by_scene.csv", "scene")
     psnr, ssim = [], []
     for i in range(2):
         scene = open_scene(measured.parent / f"s{i}")
@@ -121,20 +123,20 @@ def test_scores_are_those_of_the_held_out_streams_images(measured: Path) -> None
         options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
         ssim.append(np.mean([structural_similarity(*pair, **options) for pair in pairs]))
         assert float(by_scene[scene.id]["tfp"]) == pytest.approx(psnr[-1], abs=0.006)
-    row = rows(measured / "images.csv")["tfp"]
+    row = read_rows(measured / "images.csv")["tfp"]
     assert float(row["PSNR"]) == pytest.approx(np.mean(psnr), abs=0.006)
     assert float(row["SSIM"]) == pytest.approx(np.mean(ssim), abs=6e-5)
 
 
 def test_images_are_scored_again_where_the_camera_is_known(measured: Path, tmp_path: Path) -> None:
-    assert rows(measured / "images.csv")["tfp"]["PSNR, corrected"] == "-"
+    assert read_rows(measured / "images.csv")["tfp"]["PSNR, corrected"] == "-"
     for camera in array_cameras():
         pixels = camera.height, camera.width, 0, camera.id
         sensor = Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels))
         calibration.write_calibration(tmp_path / "s/calibration", camera, sensor, [1])
     facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
     scene = open_scene(write_small_scene(tmp_path / "s", extras={"calibration": facts}))
-    row = next(r for r in speed_images.measure_generators([scene], 1) if r.title == "tfp")
+    row = next(r for r in images.measure_makers([scene], 1) if r.title == "tfp")
     known, expected = scene.recordings("cam_03"), []
     assert known is not None
     camera = estimate(known)
@@ -149,7 +151,7 @@ def test_images_are_scored_again_where_the_camera_is_known(measured: Path, tmp_p
 
 def test_spikezoo_sees_the_stream_upright_and_at_the_right_time(measured: Path) -> None:
     """Its mean of 41 ticks is ours of 40 but for one tick: it cannot be worse by more than that."""
-    table = rows(measured / "images.csv")
+    table = read_rows(measured / "images.csv")
     assert abs(float(table["tfp, spikezoo"]["PSNR"]) - float(table["tfp"]["PSNR"])) < 0.5
 
 
@@ -162,11 +164,12 @@ def test_a_strip_of_images_for_each_scene(measured: Path) -> None:
 
 
 def test_without_scenes_only_time_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed_images, "IMAGES", {"tfp": TFP})
-    for name, value in {"WIDTH": 40, "HEIGHT": 24, "TICKS": 60, "SPIKEZOO": {}}.items():
-        monkeypatch.setattr(speed_images, name, value)
-    assert speed_images.images(["--repeats", "1", "--out", str(tmp_path)]) == 0
-    row = rows(tmp_path / "images.csv")["tfp"]
+    monkeypatch.setattr(images, "IMAGES", {"tfp": TFP})
+    monkeypatch.setattr(images, "SPIKEZOO", {})
+    for name, value in {"WIDTH": 40, "HEIGHT": 24, "TICKS": 60}.items():
+        monkeypatch.setattr(rows, name, value)
+    assert images.images(["--repeats", "1", "--out", str(tmp_path)]) == 0
+    row = read_rows(tmp_path / "images.csv")["tfp"]
     assert float(row["ms 40x24"]) > 0 and row["PSNR"] == row["ms, scene"] == "-"
     assert not list(tmp_path.glob("*.png"))
 
@@ -175,7 +178,7 @@ def test_a_scene_without_ground_truth_is_refused(small_scene: Path, monkeypatch:
     scene = open_scene(small_scene)
     object.__setattr__(scene, "targets", ())
     with pytest.raises(UserError, match="expected a scene with targets, found none in targets.json"):
-        speed_images.middle_target(scene)
+        rows.middle_target(scene)
 
 
 def test_gaps_are_refused_unless_allowed(
@@ -186,7 +189,7 @@ def test_gaps_are_refused_unless_allowed(
     (small_scene / "scene.json").write_text(json.dumps(meta))
     write_manifest(small_scene)
     seen: list[str] = []
-    monkeypatch.setattr(speed_images, "measure_generators", lambda scenes, _: seen.extend(s.id for s in scenes) or [])
+    monkeypatch.setattr(images, "measure_makers", lambda scenes, _: seen.extend(s.id for s in scenes) or [])
     for command in (["speed", "images", str(small_scene)], ["run-benchmark", str(small_scene), "--table", "6"]):
         command += ["--out", str(tmp_path)]
         assert main(command) == 2
@@ -198,7 +201,7 @@ def test_gaps_are_refused_unless_allowed(
 def test_plain_numpy_is_the_same_method() -> None:
     spikes = np.random.default_rng(0).random((150, 12, 16)) < np.linspace(0.03, 1, 16)
     stream = SpikeStream(pack(spikes), 16, 12, 20000.0)
-    plain = speed_images.tfstp_plainly(spikes, 110)
+    plain = tfstp_plainly(spikes, 110)
     complete = np.isfinite(plain)
     np.testing.assert_array_equal(complete, spikes[:110].any(0) & spikes[110:].any(0))
     # It starts as published, not at rest: after 110 ticks that shows where only a few spikes have come.
