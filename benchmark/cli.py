@@ -83,7 +83,7 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.benchmark.runs.run_command:make_run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
-        needs=("spike4dgs.leaderboard.submit_command:submit", "spike4dgs.baselines.speed_images:images"),
+        needs=("spike4dgs.leaderboard.submit_command:submit", "spike4dgs.baselines.speed.images:images"),
     ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
@@ -170,10 +170,10 @@ SPEED: dict[str, Command] = {
         "spike4dgs.benchmark.speed.decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
     ),
     "metrics": Command("spike4dgs.benchmark.speed.metrics:metrics", "every metric for one image", "speed metrics"),
-    "tfi": Command("spike4dgs.baselines.speed:tfi", "images from spike intervals, whole stack", "speed tfi"),
-    "tfp": Command("spike4dgs.baselines.speed:tfp", "images from spike counts, whole stack", "speed tfp"),
+    "tfi": Command("spike4dgs.baselines.speed.stacks:tfi", "images from spike intervals, whole stack", "speed tfi"),
+    "tfp": Command("spike4dgs.baselines.speed.stacks:tfp", "images from spike counts, whole stack", "speed tfp"),
     "images": Command(
-        "spike4dgs.baselines.speed_images:images",
+        "spike4dgs.baselines.speed.images:images",
         "time and quality of each way from spikes to an image, beside the paper's Table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),
