@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.method import Budget, Model, Progress, Recipe
+from spike4dgs.benchmark.method import FitRequest, Model, Recipe
 from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -27,11 +27,11 @@ from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.splat import Views, render
+from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.tracking.model import TrackedModel
-from spike4dgs.method.trainer import one_torch_thread
 
 Float32 = NDArray[np.float32]
-Draw = Callable[[Views], Tensor]  # one view -> its image [1, H, W], differentiable in `views.w2c`
+Render = Callable[[Views], Tensor]  # one view -> its image [1, H, W], differentiable in `views.w2c`
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Refinement:
     """Adam on the six numbers of a rigid motion: rotation in radians, translation in units of the scene's depth."""
 
     steps: int = 100  # BARF
-    rate: float = 1e-3  # BARF on synthetic scenes; at a focal length of 225 px about 0.2 px a step
-    rate_last: float = 1e-5  # cosine decay, so that noise is averaged at the end
+    lr: float = 1e-3  # BARF on synthetic scenes; at a focal length of 225 px about 0.2 px a step
+    lr_last: float = 1e-5  # cosine decay, so that noise is averaged at the end
 
 
 class PosedRecipe(RecipeMethod):
@@ -53,23 +53,15 @@ class PosedRecipe(RecipeMethod):
         if self.refines_views:
             self.params["refinement"] = asdict(self.refinement)
 
-    def fit(
-        self,
-        scene: TrainingScene,
-        budget: Budget,
-        device: str,
-        seed: int,
-        progress: Progress,
-        checkpoint: Path | None = None,
-    ) -> Model:
+    def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """As `RecipeMethod.fit`; the model has `refine`."""
-        model = super().fit(scene, budget, device, seed, progress, checkpoint)
+        model = super().fit(scene, request)
         return RefinableModel(model, self.refinement) if isinstance(model, FittedModel | TrackedModel) else model
 
 
 @dataclass(frozen=True, eq=False)
 class RefinableModel:
-    """A fitted model that can also say from where it sees an image."""
+    """A fitted model that can also estimate the pose of a camera from its image."""
 
     model: FittedModel | TrackedModel
     refinement: Refinement
@@ -87,53 +79,54 @@ class RefinableModel:
         """The model's own."""
         self.model.save(path, provenance)
 
-    def refine(self, camera: Camera, picture: Float32, still: NDArray[np.bool_], t_us: float) -> Camera:
-        """The camera near `camera` from which the model looks most like `image`; see `refine_pose`."""
+    def refine(self, camera: Camera, image: Float32, background: NDArray[np.bool_], t_us: float) -> Camera:
+        """Return the camera near `camera` whose render is most like `image` [H, W]; see `refine_pose`."""
         model = self.model
         with torch.no_grad():
             splats = model.splats(t_us)
         _, z = camera.project(splats.means.double().cpu().numpy())
         depth_m = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
 
-        def draw(views: Views) -> Tensor:
+        def render_view(views: Views) -> Tensor:
             return model.image(render(splats, views).image, views)
 
-        return refine_pose(draw, camera, picture, still, depth_m, self.refinement, model.device)
+        return refine_pose(render_view, camera, image, background, depth_m, self.refinement, model.device)
 
 
 def refine_pose(
-    draw: Draw,
+    render_view: Render,
     camera: Camera,
     image: Float32,
-    still: NDArray[np.bool_],
+    background: NDArray[np.bool_],
     depth_m: float,
     settings: Refinement,
     device: str = "cpu",
 ) -> Camera:
-    """The pose near `camera`'s that makes mean |drawn - image| over the pixels of `still` [H, W] smallest.
+    """Return the camera near `camera` that makes mean |rendered - image| over the mask `background` [H, W] smallest.
 
     The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
-    included, so that refinement never ends worse than it began. Raises UserError where no pixel is still.
+    included, so that refinement never ends worse than it began. Raises UserError where the mask is empty.
     """
     shape = (camera.height, camera.width)
-    if image.shape != shape or still.shape != shape or not still.any():
-        found = f"{image.shape}, {still.shape}, {int(still.sum())} still pixels"
-        raise problem("pose refinement", f"an image and a mask of shape {shape} with still pixels", found, "check it")
+    if image.shape != shape or background.shape != shape or not background.any():
+        found = f"{image.shape}, {background.shape}, {int(background.sum())} background pixels"
+        expected = f"an image and a mask of shape {shape} with background pixels"
+        raise problem("pose refinement", expected, found, "check it")
     start = Views.from_cameras([camera], device=device)
     target = torch.as_tensor(image, device=device)[None]
-    weight = torch.as_tensor(still, dtype=target.dtype, device=device)[None] / float(still.sum())
+    weight = torch.as_tensor(background, dtype=target.dtype, device=device)[None] / float(background.sum())
     xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([1.0, 1.0, 1.0, depth_m, depth_m, depth_m], dtype=torch.float64)
-    adam = torch.optim.Adam([xi], lr=settings.rate)
+    adam = torch.optim.Adam([xi], lr=settings.lr)
     best, best_loss = start.w2c[0].cpu().numpy(), math.inf
     with one_torch_thread():
         for step in range(settings.steps + 1):
             w2c = rigid_motion(xi * units).to(device) @ start.w2c
-            loss = ((draw(Views(w2c, start.K, camera.width, camera.height)) - target).abs() * weight).sum()
+            loss = ((render_view(Views(w2c, start.K, camera.width, camera.height)) - target).abs() * weight).sum()
             if (value := loss.item()) < best_loss:
                 best, best_loss = w2c[0].detach().cpu().numpy(), value
             share = 0.5 * (1 + math.cos(math.pi * step / max(settings.steps, 1)))
-            adam.param_groups[0]["lr"] = settings.rate_last + (settings.rate - settings.rate_last) * share
+            adam.param_groups[0]["lr"] = settings.lr_last + (settings.lr - settings.lr_last) * share
             adam.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()

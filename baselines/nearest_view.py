@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.method import Budget, Progress
+from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import ImageMaker
+from spike4dgs.method.images import ImageMaker
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +22,7 @@ class NearestViewModel:
     images: ImageMaker
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """The image [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
+        """Return the image [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
         distances = [float(np.linalg.norm(c.center - camera.center)) for c in self.scene.cameras]
         # Rounded to a micrometre: equals on paper must not be told apart by the last bit.
         nearest = int(np.argmin(np.round(distances, 6)))
@@ -32,7 +31,7 @@ class NearestViewModel:
 
 @dataclass
 class NearestView:
-    """`benchmark.recipes.Method` without any reconstruction: what a method must beat to be worth its time."""
+    """`benchmark.method.Method` without any reconstruction: what a method must beat to be worth its time."""
 
     name: str
     images: ImageMaker
@@ -42,15 +41,7 @@ class NearestView:
     def __post_init__(self) -> None:
         self.params = {"name": self.name, "images": self.images_name}
 
-    def fit(
-        self,
-        scene: TrainingScene,
-        budget: Budget,
-        device: str,
-        seed: int,
-        progress: Progress,
-        checkpoint: Path | None = None,
-    ) -> NearestViewModel:
-        """Return the model at once; `budget`, `device`, `seed` and `checkpoint` have nothing to act on."""
-        progress(1, 1)
+    def fit(self, scene: TrainingScene, request: FitRequest) -> NearestViewModel:
+        """Return the model at once; nothing but the progress of the request is used."""
+        request.progress(1, 1)
         return NearestViewModel(scene, self.images)

@@ -13,13 +13,13 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.initialization.colmap import clip_means, map_views
 from spike4dgs.baselines.initialization.dust3r import estimate as estimate_dust3r
-from spike4dgs.baselines.initialization.msdi import look, place, unposed
+from spike4dgs.baselines.initialization.msdi import infer, matched_poses, unposed
 from spike4dgs.baselines.initialization.rig import rig, window_means
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.display import RunDisplay
@@ -28,6 +28,7 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.initialization import Initialization
 
 Row = dict[str, float | int | str | None]
 CLIP = "clip"  # means of the whole clip, as they are
@@ -36,36 +37,36 @@ FLAT = "flat"  # the same, corrected by the cameras' calibrations
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Cameras that were placed, and how many points came with them."""
+    """Cameras with poses, and how many points came with them."""
 
     cameras: Sequence[Camera]
     points: int
 
 
-def _rig(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = rig(scene, seed)
+def _rig(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = rig(scene)
     return Estimate(start.cameras, len(start.points))
 
 
-def _colmap(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
-    found = map_views(scene, pictures, seed, calibrated=calibrated)
+def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    found = map_views(scene, images, seed, calibrated=calibrated)
     return Estimate(found.cameras, len(found.points))
 
 
-def _msdi(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = unposed(scene, look(scene, calibrated=calibrated), seed, calibrated=calibrated)
+def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = unposed(scene, infer(scene, calibrated=calibrated), seed, calibrated=calibrated)
     return Estimate(start.cameras, len(start.points))
 
 
-def _msdi_matched(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
+def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
     if not calibrated:
         raise problem("msdi-matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
-    found = place(scene, look(scene, calibrated=True), seed)
+    found = matched_poses(scene, infer(scene, calibrated=True), seed)
     return Estimate(found.cameras, len(found.points))
 
 
-def _dust3r(scene: TrainingScene, pictures: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = estimate_dust3r(scene, pictures, seed, calibrated=calibrated)
+def _dust3r(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = estimate_dust3r(scene, images, seed, calibrated=calibrated)
     return Estimate(start.cameras, len(start.points))
 
 
@@ -114,7 +115,7 @@ def poses(
         initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
             view, and what views match).
         images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
-            calibrations: what `colmap-flat` sees), or images of the clip's middle, such as tfp.
+            calibrations, as in recipes with flat_field), or images of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
         refine: Also fit 4DGS to TFP images from these poses, poses included, and measure what they became.
         seed: Seed of everything random.
@@ -130,10 +131,10 @@ def poses(
     rows = []
     for path in scenes:
         scene = open_scene(path, allow_gaps, split).training
-        pictures = _images(scene, images)
+        shown = _images(scene, images)
         for name in initialization:
             budget = Budget() if refine else None
-            rows += measure_poses(scene, pictures, name, seed, calibrated=not unknown_intrinsics, refine=budget)
+            rows += measure_poses(scene, shown, name, seed, calibrated=not unknown_intrinsics, refine=budget)
     _print(rows)
     if out:
         settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "refine": refine, "seed": seed}
@@ -142,7 +143,7 @@ def poses(
 
 
 def _images(scene: TrainingScene, images: str) -> Float32:
-    """One image of each training view [C, H, W], linear radiance."""
+    """Return one image of each training view [C, H, W], linear radiance."""
     if images == CLIP:
         return clip_means(scene)
     if images == FLAT:
@@ -151,15 +152,15 @@ def _images(scene: TrainingScene, images: str) -> Float32:
 
 
 def measure_poses(
-    scene: TrainingScene, pictures: Float32, name: str, seed: int, *, calibrated: bool, refine: Budget | None = None
+    scene: TrainingScene, images: Float32, name: str, seed: int, *, calibrated: bool, refine: Budget | None = None
 ) -> list[Row]:
-    """Rows of the table: what was found, its errors (None where fewer than two views are placed), seconds.
+    """Return rows of the table: errors (None where fewer than two views have poses) and seconds.
 
-    What an estimator refuses stands in the row's `error`. With a budget to refine, a row of the refined poses follows.
+    An estimator's refusal stands in the row's `error`. With a budget to refine, a row of the refined poses follows.
     """
     start = time.perf_counter()
     try:
-        found = ESTIMATORS[name](scene, pictures, seed, calibrated)
+        found = ESTIMATORS[name](scene, images, seed, calibrated)
     except UserError as e:
         empty: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
         return [{**empty, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}]
@@ -172,13 +173,13 @@ def measure_poses(
 
 
 def refined(scene: TrainingScene, cameras: Sequence[Camera], budget: Budget, seed: int) -> tuple[Camera, ...]:
-    """`cameras`, in any order, after 4DGS was fitted to TFP images from where they stand, poses included."""
-    placed = {camera.id: camera for camera in cameras}
-    start = rig(replace(scene, cameras=tuple(placed[camera.id] for camera in scene.cameras)), seed)
-    parts = replace(PARTS, initialization={"given": lambda scene, seed: start})
-    recipe = Recipe("refined", "tfp", "given", "hexplane", "pixel", {"refine_poses": True})
+    """Return `cameras`, in any order, after 4DGS was fitted to TFP images from their poses, poses included."""
+    posed = {camera.id: camera for camera in cameras}
+    start = rig(replace(scene, cameras=tuple(posed[camera.id] for camera in scene.cameras)))
+    parts = replace(PARTS, initialization={"given": Initialization(lambda request: start)})
+    recipe = Recipe("refined", "tfp", "given", "hexplane", "pixel", {"trainer.refine_poses": True})
     with RunDisplay(make_console(), 1) as display, display.cell(f"poses of {scene.id}, refined") as shown:
-        model = RecipeMethod(recipe, parts).fit(scene, budget, "cpu", seed, shown.progress)
+        model = RecipeMethod(recipe, parts).fit(scene, FitRequest(budget, "cpu", seed, shown.progress))
     assert isinstance(model, FittedModel)
     return model.cameras
 
@@ -187,7 +188,7 @@ def _row(scene: TrainingScene, name: str, found: Estimate, seconds: float) -> Ro
     row: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS), "seconds": seconds}
     row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": found.points}
     if len(found.cameras) < 2:
-        return {**row, "error": "fewer than two views are placed"}
+        return {**row, "error": "fewer than two views have poses"}
     true = {camera.id: camera for camera in scene.cameras}
     partners = [true[camera.id] for camera in found.cameras]
     ratios = [a.fx / b.fx for a, b in zip(found.cameras, partners, strict=True)]

@@ -7,38 +7,50 @@ with one `msdi` for images and points.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from typing import Any
 
 from spike4dgs.baselines.held_out_pose import PosedRecipe
-from spike4dgs.baselines.initialization.colmap import colmap, colmap_flat, colmap_uncalibrated
+from spike4dgs.baselines.initialization.colmap import ColmapSettings, colmap, colmap_uncalibrated
 from spike4dgs.baselines.initialization.dust3r import dust3r, dust3r_uncalibrated
 from spike4dgs.baselines.initialization.msdi import msdi, msdi_matched, msdi_uncalibrated
-from spike4dgs.baselines.initialization.rig import rig, rig_flat
+from spike4dgs.baselines.initialization.rig import RigSettings, rig
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.method import Method, Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.radiance_field import RADIANCE_FIELD
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.tracking.fit import TRACKING
 
+
+def _seeded(start: Callable[[TrainingScene, int], Start]) -> Initialization:
+    """Return the entry of an initialisation without settings."""
+    return Initialization(lambda r: start(r.scene, r.seed))
+
+
+def _colmap(r: StartRequest) -> Start:
+    return colmap(r.scene, r.seed, flat_field=r.settings.flat_field)
+
+
+INITIALIZATIONS = {
+    "rig": Initialization(lambda r: rig(r.scene, flat_field=r.settings.flat_field), RigSettings()),
+    "colmap": Initialization(_colmap, ColmapSettings()),
+    "colmap-uncalibrated": _seeded(colmap_uncalibrated),
+    "dust3r": _seeded(dust3r),
+    "dust3r-uncalibrated": _seeded(dust3r_uncalibrated),
+    "msdi": Initialization(lambda r: msdi(r.scene)),
+    "msdi-matched": _seeded(msdi_matched),
+    "msdi-uncalibrated": _seeded(msdi_uncalibrated),
+}
 PARTS = Parts(
     images=IMAGES,
-    initialization={
-        "rig": rig,
-        "rig-flat": rig_flat,
-        "colmap": colmap,
-        "colmap-flat": colmap_flat,
-        "colmap-uncalibrated": colmap_uncalibrated,
-        "dust3r": dust3r,
-        "dust3r-uncalibrated": dust3r_uncalibrated,
-        "msdi": msdi,
-        "msdi-matched": msdi_matched,
-        "msdi-uncalibrated": msdi_uncalibrated,
-    },
+    initialization=INITIALIZATIONS,
     motion=MOTIONS,
     supervision=SUPERVISIONS,
     algorithms={"tracking": TRACKING, "radiance-field": RADIANCE_FIELD},
@@ -49,8 +61,8 @@ _MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
 # STG has a sixth and 4DGS, the slowest, a quarter fewer steps.
 _SPK2IMG: dict[str, dict[str, Any]] = {
     "d3dgs": {},
-    "stg": {"time_spacing_ticks": 20, "fine_steps": 950},
-    "4dgs": {"time_spacing_ticks": 20, "coarse_steps": 250, "fine_steps": 900},
+    "stg": {"images.time_spacing_ticks": 20, "trainer.fine_steps": 950},
+    "4dgs": {"images.time_spacing_ticks": 20, "trainer.coarse_steps": 250, "trainer.fine_steps": 900},
 }
 
 RECIPES = (
@@ -61,12 +73,17 @@ RECIPES = (
     Recipe("dy-spikegs", "tfp", "rig", "hexplane", "spike-render"),
     Recipe("dy-spikenerf", "tfp", "rig", "radiance-field", "spike"),
     # The floor gets as many steps as the deforming recipes have in all, so that only motion makes the difference.
-    Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"coarse_steps": 1500}),
+    Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"trainer.coarse_steps": 1500}),
 )
 
 # The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s: there are a
 # tenth fewer steps. Half as many images would cost 2.7 dB on the turntable (1150 steps, `adaptive` images).
-_MSDI: dict[str, Any] = {"flat_field": True, "time_spacing_ticks": 10, "coarse_steps": 250, "fine_steps": 1100}
+_MSDI: dict[str, Any] = {
+    "images.flat_field": True,
+    "images.time_spacing_ticks": 10,
+    "trainer.coarse_steps": 250,
+    "trainer.fine_steps": 1100,
+}
 SPIKE4DGS = (
     Recipe("spike4dgs", "msdi", "msdi", "hexplane", "spss", _MSDI),
     Recipe("msdi+4dgs", "msdi", "msdi", "hexplane", "pixel", _MSDI),
@@ -74,26 +91,29 @@ SPIKE4DGS = (
     Recipe("msdi+4dgs+pixel+spike", "msdi", "msdi", "hexplane", "pixel+spike", _MSDI),
 )
 
+# Images and first points corrected by the cameras' calibrations: what method names call rig-flat.
+_FLAT: dict[str, Any] = {"images.flat_field": True}
+
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
 # corrected by the cameras' calibration; what does not move is fitted first and becomes a background; what moves follows
 # paths of its own. The rows before it have a part of that each: the calibration alone, then the windows too.
 BEYOND = (
-    Recipe("tfp+rig-flat+stg", "tfp", "rig-flat", "spacetime", "pixel", {"flat_field": True}),
-    Recipe("tfp+rig-flat+4dgs", "tfp", "rig-flat", "hexplane", "pixel", {"flat_field": True}),
-    Recipe("adaptive+rig-flat+4dgs", "adaptive", "rig-flat", "hexplane", "pixel", {"flat_field": True}),
+    Recipe("tfp+rig-flat+stg", "tfp", "rig", "spacetime", "pixel", _FLAT),
+    Recipe("tfp+rig-flat+4dgs", "tfp", "rig", "hexplane", "pixel", _FLAT),
+    Recipe("adaptive+rig-flat+4dgs", "adaptive", "rig", "hexplane", "pixel", _FLAT),
     Recipe(
         "spike4dgs-x",
         "adaptive",
-        "rig-flat",
+        "rig",
         "paths",
         "pixel",
         {
-            "flat_field": True,
-            "freeze_still": True,
-            "moving_change": 0.012,
-            "initial_scale": 0.5,
-            "coarse_steps": 600,
-            "max_gaussians": 36_000,
+            **_FLAT,
+            "trainer.freeze_background": True,
+            "trainer.moving_change": 0.012,
+            "trainer.initial_scale": 0.5,
+            "trainer.coarse_steps": 600,
+            "density.max_gaussians": 36_000,
         },
     ),
 )
@@ -116,14 +136,15 @@ POSED = (
         for name, start in (
             ("dy-spikegs", "colmap"),
             ("dy-spikenerf", "colmap"),
-            ("spike4dgs", "colmap-flat"),
-            ("spike4dgs-x", "colmap-flat"),
+            ("spike4dgs", "colmap"),
+            ("spike4dgs-x", "colmap"),
         )
     ),
     Recipe("spike4dgs-uncalibrated", "msdi", "msdi-matched", "hexplane", "spss", _MSDI),
     # Tables 3 and 7.
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
-    Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI),
+    # COLMAP saw raw images when this row was published.
+    Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", _MSDI | {"initialization.flat_field": False}),
     Recipe("msdi+dust3r+4dgs", "msdi", "dust3r", "hexplane", "pixel", _MSDI),
     Recipe("tfi+dust3r+4dgs", "tfi", "dust3r", "hexplane", "pixel"),
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),

@@ -1,14 +1,21 @@
 """The method protocol and the recipe: a method is four choices.
 
-A method sees a `TrainingScene` and returns a model that renders a camera at a time. The runner, the judge and the
-leaderboard know nothing else of it. Methods of other packages come in by the entry-point group `spike4dgs.methods`.
+A method gets a `TrainingScene` and a `FitRequest`, and returns a model that renders a camera at a time. The runner, the
+judge and the leaderboard know nothing else of it. Methods of other packages come in by the entry-point group
+`spike4dgs.methods`.
+
+A recipe overrides the numbers of its parts by name, PART.NAME:
+
+    Recipe("tfp+4dgs, half the images", "tfp", "rig", "hexplane", "pixel",
+           {"images.time_spacing_ticks": 20, "motion.lr_grid": 5e-3, "trainer.fine_steps": 900})
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,17 +31,17 @@ GROUP = "spike4dgs.methods"
 
 @dataclass(frozen=True)
 class Recipe:
-    """A method named by its four parts; `settings` overrides hyper-parameters of the trainer by name."""
+    """A method named by its four parts; `settings` overrides the parts' hyper-parameters, by names PART.NAME."""
 
     name: str
-    images: str  # what image does a spike window give? tfi, tfp, ...
-    initialization: str  # where are the cameras and the first points? rig, ...
-    motion: str  # how do Gaussians move? static, hexplane, ...
-    supervision: str  # what is compared with what? pixel, ...
+    images: str  # from spikes: tfi, tfp, ...
+    initialization: str  # of cameras and first points: rig, ...
+    motion: str  # of the Gaussians: static, hexplane, ...
+    supervision: str  # the loss: pixel, ...
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for the result record and the content key."""
+        """Return plain values for the result record and the content key."""
         return {**asdict(self), "settings": dict(self.settings)}
 
 
@@ -44,19 +51,19 @@ PAPER = "paper"
 
 @dataclass(frozen=True)
 class Budget:
-    """What a fit may spend. `scale` multiplies a recipe's step counts; with `published` they are its publication's."""
+    """Steps of a fit. `scale` multiplies a recipe's step counts; with `published` they are its publication's."""
 
     scale: float = 1.0
     published: bool = False
 
     @property
     def label(self) -> float | str:
-        """How records name it: the scale, or "paper"."""
+        """The name in records: the scale, or "paper"."""
         return PAPER if self.published else self.scale
 
 
 def make_budget(text: str) -> Budget:
-    """The budget that a command line names: quick, standard, paper, or a multiple of quick.
+    """Return the budget that a command line names: quick, standard, paper, or a multiple of quick.
 
     Raises UserError for anything else.
     """
@@ -80,12 +87,30 @@ class Progress(Protocol):
         ...
 
 
+def no_progress(done: int, total: int, note: str = "") -> None:
+    """Report to nobody."""
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """Everything that a fit is asked for beside the scene. A new field has a default, so that methods need not change.
+
+    `checkpoint` is a file to save progress to, and to resume from if it exists; a method may ignore it.
+    """
+
+    budget: Budget = Budget()
+    device: str = "cpu"  # as torch names it: cpu, cuda, cuda:1
+    seed: int = 0
+    progress: Progress = no_progress
+    checkpoint: Path | None = None
+
+
 class Model(Protocol):
-    """A fitted scene. Two attributes may be added: `size_bytes`, what it takes on disk, without code, and `save`, which
-    writes it (`provenance.Savable`): a run keeps what it can save."""
+    """A fitted scene. Two attributes may be added: `size_bytes`, its size on disk, without code, and `save`, which
+    writes it (`provenance.Savable`): a run keeps the models that it can save."""
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """Gray linear radiance [H, W] float32 (1.0 = white) seen by `camera` at the time `t_us`."""
+        """Return gray linear radiance [H, W] float32 (1.0 = white) seen by `camera` at the time `t_us`."""
         ...
 
 
@@ -99,23 +124,36 @@ class Method(Protocol):
     name: str
     params: dict[str, Any]
 
-    def fit(
-        self,
-        scene: TrainingScene,
-        budget: Budget,
-        device: str,
-        seed: int,
-        progress: Progress,
-        checkpoint: Path | None = None,
-    ) -> Model:
-        """Fit the training views. With `checkpoint`, save progress to that file and resume from it if it exists."""
+    def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
+        """Fit the training views and return the model."""
         ...
 
 
-def find_methods() -> dict[str, Method]:
-    """All methods of all installed packages, by name. Each entry point names a mapping from name to method.
+def check_protocol(method: Any, source: str) -> None:
+    """Raise UserError where a method's `fit` does not take (scene, request); `source` is where the method comes from.
 
-    Raises UserError where two packages use one name, and where one cannot be imported.
+    A signature that is not known, or that takes any arguments, passes.
+    """
+    name = getattr(method, "name", type(method).__name__)
+    expected, fix = "fit(self, scene, request)", "take a FitRequest, with budget, device, seed, progress and checkpoint"
+    if not callable(getattr(method, "fit", None)):
+        raise problem(f"method {name!r} of {source}", expected, "no fit", fix)
+    try:
+        signature = inspect.signature(method.fit, follow_wrapped=False)
+    except (TypeError, ValueError):  # compiled
+        return
+    try:
+        signature.bind("scene", "request")
+    except TypeError:
+        earlier = "budget" in signature.parameters
+        found = f"{'the earlier protocol, ' if earlier else ''}fit{signature}"
+        raise problem(f"method {name!r} of {source}", expected, found, fix) from None
+
+
+def find_methods() -> dict[str, Method]:
+    """Return all methods of all installed packages, by name. Each entry point names a mapping from name to method.
+
+    Raises UserError where two packages use one name, and where one cannot be imported or has another protocol.
     """
     methods: dict[str, Method] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
@@ -127,12 +165,19 @@ def find_methods() -> dict[str, Method]:
         for name, method in found.items():
             if name in methods:
                 raise problem(f"entry point {entry.name}", "a new method name", f"'{name}' twice", "rename one of them")
+            check_protocol(method, _source(entry))
             methods[name] = method
     return methods
 
 
+def _source(entry: EntryPoint) -> str:
+    """Return the words for an error by which a user finds an entry point."""
+    package = f"{entry.dist.name} {entry.dist.version}, " if entry.dist else ""
+    return f"{package}entry point {entry.name} = {entry.value}"
+
+
 def get_method(name: str) -> Method:
-    """The method called `name`. Raises UserError that lists the known names."""
+    """Return the method called `name`. Raises UserError that lists the known names."""
     methods = find_methods()
     if name not in methods:
         raise problem(

@@ -18,12 +18,12 @@ HALF_WINDOW = 20  # ticks on each side of the instant
 
 
 def read_json(path):
-    """The content of a JSON file."""
+    """Return the content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def radiance(packed, meta, tick):
-    """Linear radiance [H, W] (1.0 = white) from packed ticks [T, bytes]: bits are pixels, the lowest bit first."""
+    """Return linear radiance [H, W] (1.0 = white) of packed ticks [T, bytes]: bits are pixels, lowest bit first."""
     height, width = meta["height"], meta["width"]
     window = packed[max(0, tick - HALF_WINDOW) : tick + HALF_WINDOW]
     spikes = np.unpackbits(window, axis=1, count=height * width, bitorder="little")

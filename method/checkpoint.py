@@ -23,7 +23,7 @@ class Checkpoint:
     tensors: dict[str, Tensor]
 
     def part(self, prefix: str) -> dict[str, Tensor]:
-        """The tensors whose name starts with `prefix.`, without it."""
+        """Return the tensors whose name starts with `prefix.`, without it."""
         return part(self.tensors, prefix)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,74 +13,24 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.method import Budget, Model, Progress, Recipe
-from spike4dgs.benchmark.scene.calibration import Calibration
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.method import FitRequest, Model, Recipe
+from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.motion.table import PUBLISHED, Extent, Motion
+from spike4dgs.method.images import ImageMaker, ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.initialization import Initialization, Start, StartRequest
+from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.observations.training_images import TrainingImages
-from spike4dgs.method.settings import TrainSettings, make_settings
-from spike4dgs.method.splat import Views
+from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.supervision.base import Supervision
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
-Float32 = NDArray[np.float32]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """What an initialisation gives: a pose for each training camera, and first points on surfaces."""
-
-    cameras: tuple[Camera, ...]
-    points: Float32  # [N, 3] m
-    values: Float32  # [N] gray radiance
-
-
-Initialization = Callable[[TrainingScene, int], Start]  # scene, seed
-MotionMaker = Callable[[Extent, TrainSettings, torch.Generator], Motion]
-SupervisionMaker = Callable[[TrainSettings, TrainingScene], Supervision]
-
-
-class ImageMaker(Protocol):
-    """Images from spikes, corrected if the camera's calibration is given; `spike_to_image.images` says more."""
-
-    def __call__(
-        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
-    ) -> Float32:
-        """Linear radiance [n, H, W]; `gain` is spikes per tick of white."""
-        ...
-
-
-class FitSettings(Protocol):
-    """What every algorithm's settings have: when images are made, and how a budget changes the step counts."""
-
-    @property
-    def time_spacing_ticks(self) -> int:
-        """Ticks between two training images."""
-        ...
-
-    @property
-    def edge_ticks(self) -> int:
-        """Ticks at the clip's ends without an image."""
-        ...
-
-    @property
-    def max_times(self) -> int:
-        """The most training images a view."""
-        ...
-
-    @property
-    def flat_field(self) -> bool:
-        """Whether images are corrected by the cameras' calibrations."""
-        ...
-
-    def scaled(self, scale: float) -> FitSettings:
-        """The same settings with the step counts multiplied by a budget's scale."""
-        ...
+FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,24 +41,22 @@ class FitJob:
     start: Start
     training_images: TrainingImages
     extent: Extent
-    settings: Any  # the algorithm's own, scaled by the budget
-    device: str
-    seed: int
-    progress: Progress
-    checkpoint: Path | None
+    settings: Mapping[str, Any]  # by part, step counts scaled by the budget
+    request: FitRequest
     key: str
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A fitting loop, the defaults of its settings, the step counts of its publication, and what it compares.
+    """A fitting loop, the defaults of its parts' settings, its publication's step counts, and what it compares.
 
-    `supervisions` names what the loop itself implements; empty for the trainer, which takes any of the table.
+    `settings` has the parts that it runs beside the initialisation. `supervisions` names what the loop itself
+    implements; empty for the trainer, which takes any of the table.
     """
 
-    settings: FitSettings
+    settings: SettingsByPart
     fit: Callable[[FitJob], Model]
-    published: Mapping[str, float] = field(default_factory=dict)
+    published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
     supervisions: tuple[str, ...] = ()
 
 
@@ -119,93 +66,108 @@ class Parts:
 
     images: Mapping[str, ImageMaker]
     initialization: Mapping[str, Initialization]
-    motion: Mapping[str, MotionMaker]
-    supervision: Mapping[str, SupervisionMaker]
+    motion: Mapping[str, type[Motion]]
+    supervision: Mapping[str, type[Supervision]]
     algorithms: Mapping[str, Algorithm] = field(default_factory=dict)
 
 
 class RecipeMethod:
-    """`benchmark.recipes.Method` for a recipe whose parts are found in `parts`.
+    """`benchmark.method.Method` for a recipe whose parts are found in `parts`.
 
-    `params` holds the recipe and all settings of the trainer, overridden or not. Raises UserError for unknown settings.
+    `params` holds the recipe and all settings by part, overridden or not. Raises UserError for an unknown part or
+    setting.
     """
 
     def __init__(self, recipe: Recipe, parts: Parts) -> None:
-        self.name, self.recipe, self.parts = recipe.name, recipe, parts
-        self.algorithm = parts.algorithms.get(recipe.motion) or self._trainer()
-        self.settings = make_settings(recipe.settings, f"recipe {recipe.name}", self.algorithm.settings)
-        self.params: dict[str, Any] = {**recipe.as_dict(), "settings": asdict(self.settings)}  # type: ignore[call-overload]
+        self.name, self.recipe = recipe.name, recipe
+        self.images = _part(parts.images, recipe, "images")
+        self.initialization = _part(parts.initialization, recipe, "initialization")
+        _part({**parts.motion, **parts.algorithms}, recipe, "motion")
+        self.algorithm = parts.algorithms.get(recipe.motion) or trainer_algorithm(recipe, parts)
+        _part(dict.fromkeys(self.algorithm.supervisions) or parts.supervision, recipe, "supervision")
+        defaults = {**self.algorithm.settings, "initialization": self.initialization.settings}
+        found = override(defaults, recipe.settings, f"recipe {recipe.name}")
+        self.settings = follow_images(found, recipe.settings)
+        self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
         self.trained_on: tuple[str, ...] = ()
-        if learned := getattr(parts.images.get(recipe.images), "learned", lambda: None)():
+        if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
 
-    def fit(
-        self,
-        scene: TrainingScene,
-        budget: Budget,
-        device: str,
-        seed: int,
-        progress: Progress,
-        checkpoint: Path | None = None,
-    ) -> Model:
-        """Fit the training views; see `benchmark.recipes.Method`.
+    def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
+        """Fit the training views; see `benchmark.method.Method`.
 
-        Raises UserError for an unknown part or setting, a foreign checkpoint, or a device that is not there.
+        Raises UserError for a foreign checkpoint, or a device that is not there.
         """
-        check_device(device)
-        recipe, parts = self.recipe, self.parts
-        settings = self._for(budget)
-        images = _part(parts.images, recipe.images, recipe, "images")
-        initialize = _part(parts.initialization, recipe.initialization, recipe, "initialization")
-        _part({**parts.motion, **parts.algorithms}, recipe.motion, recipe, "motion")
-        own = dict.fromkeys(self.algorithm.supervisions)
-        _part(own or parts.supervision, recipe.supervision, recipe, "supervision")
-        progress(0, 1, "initialisation")
-        start = initialize(scene, seed)
-        progress(0, 1, "images")
-        footage = make_training_images(scene, start.cameras, images, settings, device)
-        key = sha256_json([scene.revision, self.params, budget.label, seed])
-        extent = measure(start, scene)
-        job = FitJob(scene, start, footage, extent, settings, device, seed, progress, checkpoint, key)
-        return self.algorithm.fit(job)
+        check_device(request.device)
+        settings: dict[str, Any] = self._for(request)
+        request.progress(0, 1, "initialisation")
+        start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"]))
+        request.progress(0, 1, "images")
+        images = make_training_images(scene, start.cameras, self.images, settings["images"], request.device)
+        key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
+        extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
+        return self.algorithm.fit(FitJob(scene, start, images, extent, settings, request, key))
 
-    def _trainer(self) -> Algorithm:
-        """The one trainer, with the recipe's motion and supervision."""
-        recipe, parts = self.recipe, self.parts
-
-        def fit(job: FitJob) -> FittedModel:
-            spec = MotionSpec(recipe.motion, job.extent, job.settings)
-            return fit_gaussians(job, spec, parts.motion[recipe.motion], parts.supervision[recipe.supervision])
-
-        return Algorithm(TrainSettings(), fit, PUBLISHED.get(recipe.motion, {}))
-
-    def _for(self, budget: Budget) -> Any:
-        if not budget.published:
-            return self.settings.scaled(budget.scale)
+    def _for(self, request: FitRequest) -> dict[str, Settings]:
+        """Return the settings with the step counts of a request's budget."""
+        if not request.budget.published:
+            return scaled(self.settings, request.budget.scale)
         where = f"recipe {self.name}"
         if not (steps := self.algorithm.published):
             fix = "choose another budget"
             raise problem(where, "a publication's step counts for --budget paper", "none", fix)
-        return make_settings(steps, where, self.settings)
+        return override(self.settings, steps, where)
 
 
-def fit_gaussians(job: FitJob, spec: MotionSpec, make_motion: MotionMaker, supervise: SupervisionMaker) -> FittedModel:
-    """Run the trainer on Gaussians that start at the job's points."""
-    settings, start = job.settings, job.start
-    motion = make_motion(spec.extent, spec.settings, seeded(job.seed, -1)).to(job.device)
-    points, values = at_most(settings.max_gaussians, start, job.seed)
-    look = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
-    first = from_points(points, values, **look, device=job.device)
-    first = motion.attach(first, job.training_images)
-    supervision = supervise(settings, job.scene).to(job.device)
-    trainer = Trainer(job.training_images, first, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
-    trainer.run(job.progress, job.checkpoint, job.key)
+def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:
+    """Return settings whose initialisation corrects images where the fit's are corrected, unless overridden."""
+    first = settings["initialization"]
+    has = any(f.name == FLAT_FIELD for f in fields(first))
+    if not has or f"initialization.{FLAT_FIELD}" in overrides:
+        return dict(settings)
+    images: Any = settings["images"]
+    return {**settings, "initialization": replace(first, **{FLAT_FIELD: images.flat_field})}
+
+
+def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
+    """Return the one trainer, with the recipe's motion and supervision."""
+    motion = _part(parts.motion, recipe, "motion")
+    supervision = _part(parts.supervision, recipe, "supervision")
+    settings = {
+        "images": ImageSettings(),
+        "motion": motion.defaults,
+        "supervision": supervision.defaults,
+        "trainer": TrainerSettings(),
+        "density": DensitySettings(),
+    }
+
+    def fit(job: FitJob) -> FittedModel:
+        return fit_gaussians(job, MotionSpec(recipe.motion, job.extent, job.settings["motion"]), motion, supervision)
+
+    return Algorithm(settings, fit, motion.published)
+
+
+def fit_gaussians(
+    job: FitJob, spec: MotionSpec, make_motion: type[Motion], supervise: type[Supervision]
+) -> FittedModel:
+    """Run the trainer on Gaussians that start at the job's points; return the fitted model."""
+    request, start = job.request, job.start
+    settings, density = job.settings["trainer"], job.settings["density"]
+    motion = make_motion(spec.extent, spec.settings, seeded(request.seed, -1)).to(request.device)
+    points, values = at_most(density.max_gaussians, start, request.seed)
+    initial = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
+    first = motion.attach(from_points(points, values, **initial, device=request.device), job.training_images)
+    loss = supervise(job.settings["supervision"], job.scene).to(request.device)
+    scale = job.extent.scale
+    trainer = Trainer(job.training_images, first, motion, loss, settings, density, scale=scale, seed=request.seed)
+    trainer.run(request.progress, request.checkpoint, job.key)
     cameras = trainer.poses.cameras(start.cameras)
-    return FittedModel(trainer.pieces(), trainer.still, motion, job.scene.duration_us, job.device, spec, cameras)
+    duration_us, device = job.scene.duration_us, request.device
+    return FittedModel(trainer.pieces(), trainer.background, motion, duration_us, device, spec, cameras)
 
 
 def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
-    """The points [N, 3] and gray values [N] of a start, or as many of them as a fit may have, drawn at random."""
+    """Return the points [N, 3] and gray values [N] of a start, or a random choice of as many as a fit may have."""
     points, values = start.points, start.values
     if len(points) <= count:
         return points, values
@@ -213,7 +175,9 @@ def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
     return points[kept], values[kept]
 
 
-def _part(table: Mapping[str, T], name: str, recipe: Recipe, part: str) -> T:
+def _part(table: Mapping[str, T], recipe: Recipe, part: str) -> T:
+    """Return the entry that a recipe names for a part. Raises UserError with the table's names."""
+    name = getattr(recipe, part)
     if name not in table:
         raise problem(f"recipe {recipe.name}", f"{part} among {', '.join(sorted(table))}", repr(name), "correct it")
     return table[name]
@@ -228,31 +192,8 @@ def check_device(device: str) -> None:
         raise problem("device", "cpu, or a CUDA device of this machine", found, "use --device cpu") from None
 
 
-def choose_ticks(n_ticks: int, settings: FitSettings) -> tuple[int, ...]:
-    """Ticks of the training images: evenly spaced, an edge away from the clip's ends, where windows are cut."""
-    edge = min(settings.edge_ticks, (n_ticks - 1) // 2)
-    span = n_ticks - 2 * edge
-    count = min(settings.max_times, max(1, round(span / settings.time_spacing_ticks) + 1))
-    return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
-
-
-def make_training_images(
-    scene: TrainingScene, cameras: Sequence[Camera], images: ImageMaker, settings: FitSettings, device: str
-) -> TrainingImages:
-    """Images of all training views at the chosen times; see `FitSettings.flat_field`."""
-    ticks = choose_ticks(scene.n_ticks, settings)
-    gain, cameras_known = scene.radiance_gain, scene.calibrations if settings.flat_field else None
-    if cameras_known:
-        made = [images(s, ticks, gain, camera) for s, camera in zip(scene.streams, cameras_known, strict=True)]
-    else:
-        made = [images(s, ticks, gain) for s in scene.streams]
-    pictures = np.stack(made, axis=1)
-    views = Views.from_cameras(cameras, device=device)
-    return TrainingImages(views, ticks, torch.from_numpy(pictures).to(device), scene.n_ticks)
-
-
 def measure(start: Start, scene: TrainingScene) -> Extent:
-    """The scene's box and size, from the points seen and not only from the array, which is small beside the scene.
+    """Return the scene's box and size, from the points seen and not only from the array, small beside the scene.
 
     The box holds 98 % of the points on each axis and a margin of a tenth. Size: the larger of 1.1 x the array's radius
     (3DGS) and half the points' median distance.

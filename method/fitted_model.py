@@ -1,4 +1,4 @@
-"""What the one trainer gives: Gaussians and how they move, in memory and in a file."""
+"""The model that the one trainer fits: Gaussians and how they move, in memory and in a file."""
 
 from __future__ import annotations
 
@@ -16,32 +16,35 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.model_files.names import BACKGROUND, from_file_names, motion_settings, to_file_names
 from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
-from spike4dgs.method.settings import TrainSettings, make_settings
+from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import join
-from spike4dgs.method.trainer import one_torch_thread
+from spike4dgs.method.torch_state import one_torch_thread
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSpec:
-    """What a motion model is built from: with it and the model's state, it can be built again."""
+    """The source of a motion model: with it and the model's state, the model can be built again."""
 
-    name: str  # in `motion.MOTIONS`
+    name: str  # in `motion.table.MOTIONS`
     extent: Extent
-    settings: TrainSettings
+    settings: Settings  # the motion's own
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         e = self.extent
         extent = {"low": e.low.tolist(), "high": e.high.tolist(), "scale": e.scale, "n_ticks": e.n_ticks}
         return {"name": self.name, "extent": {**extent, "width": e.width}, "settings": asdict(self.settings)}
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any], where: str) -> MotionSpec:
-        """What `as_dict` gave. Raises UserError for settings that are not there."""
+        """Return the spec that `as_dict` gave, or an earlier version's. Raises UserError for unknown settings."""
         extent = {**value["extent"], **{k: torch.tensor(value["extent"][k]) for k in ("low", "high")}}
-        return cls(value["name"], Extent(**extent), make_settings(value["settings"], where, TrainSettings()))
+        defaults = MOTIONS[value["name"]].defaults
+        settings = make_settings(motion_settings(value["settings"], defaults), where, defaults)
+        return cls(value["name"], Extent(**extent), settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +54,7 @@ class FittedModel:
     KIND: ClassVar = "gaussians"
 
     pieces: tuple[Gaussians, ...]  # of equal parts of the clip, one after the other
-    still: Gaussians  # none unless the fit froze some
+    background: Gaussians  # none unless the fit froze some
     motion: Motion
     duration_us: float
     device: str
@@ -61,54 +64,58 @@ class FittedModel:
     @property
     def size_bytes(self) -> int:
         """Bytes of the Gaussians and of the motion model."""
-        tensors = [t for g in (*self.pieces, self.still) for t in g.tensors().values()]
+        tensors = [t for g in (*self.pieces, self.background) for t in g.tensors().values()]
         return count_bytes([*tensors, *self.motion.state_dict().values()])
 
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
-        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
         with one_torch_thread():
             image = render(self.splats(t_us), views).image
             return self.image(image, views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
-        """What is drawn at `t_us`."""
+        """Return what is rendered at `t_us`."""
         t, count = min(max(t_us / self.duration_us, 0.0), 1.0), len(self.pieces)
         piece = min(int(t * count), count - 1)
         moving = self.motion.splats(self.pieces[piece], t * count - piece)
-        if not len(self.still):
+        if not len(self.background):
             return moving
-        return join(self._background, moving)
+        return join(self._static_splats, moving)
 
     @cached_property
-    def _background(self) -> Splats:
-        return self.still.splats()
+    def _static_splats(self) -> Splats:
+        return self.background.splats()
 
     def image(self, image: Tensor, views: Views) -> Tensor:
-        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
         return self.motion.image(image, views)
 
     def save(self, path: Path, provenance: Provenance) -> None:
         """Write the model to one file; see `saved_model.load_model`."""
-        pieces = {f"piece{i}": g.tensors() for i, g in enumerate(self.pieces)}
-        tensors = group(**pieces, still=self.still.tensors(), motion=self.motion.state_dict())
+        pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
+        background = {BACKGROUND: to_file_names(self.background.tensors())}
+        tensors = group(**pieces, **background, motion=self.motion.state_dict())
         config = {"motion": self.spec.as_dict(), "pieces": len(pieces)}
         write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> FittedModel:
-        """What `save` wrote. Raises KeyError, TypeError, RuntimeError or UserError for another version's."""
+        """Return the model that `save` wrote.
+
+        Raises KeyError, TypeError, RuntimeError or UserError for another version's.
+        """
         spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
         motion = MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator())
         motion.load_state_dict(file.part("motion"))
-        *pieces, still = (
-            Gaussians.from_tensors({k: v.to(device) for k, v in file.part(part).items()})
-            for part in (*(f"piece{i}" for i in range(file.config["pieces"])), "still")
+        *pieces, background = (
+            Gaussians.from_tensors({k: v.to(device) for k, v in from_file_names(file.part(part)).items()})
+            for part in (*(f"piece{i}" for i in range(file.config["pieces"])), BACKGROUND)
         )
-        return cls(tuple(pieces), still, motion.to(device), file.provenance.duration_us, device, spec)
+        return cls(tuple(pieces), background, motion.to(device), file.provenance.duration_us, device, spec)
 
 
 def count_bytes(tensors: Iterable[Tensor]) -> int:
-    """What tensors take in a file."""
+    """Return the bytes that tensors take in a file."""
     return sum(t.numel() * t.element_size() for t in tensors)

@@ -1,8 +1,8 @@
-"""Poses of the training cameras, fitted together with what they see: nine cameras and all times, six numbers a camera.
+"""Poses of the training cameras, fitted together with the scene: nine cameras and all times, six numbers a camera.
 
-A camera's pose is exp(xi) w2c with xi = (rotation, translation / depth). The first camera stays where it is: it holds
-the frame, in which the held-out cameras are given too. What it cannot hold is the scale; that starts right and pixels
-do not pull at it.
+A camera's pose is exp(xi) w2c with xi = (rotation, translation / depth). The first camera keeps its pose: it holds
+the frame, in which the held-out cameras are given too. It cannot hold the scale, which starts right and which pixels
+do not pull at.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from spike4dgs.method.splat import Views
 
 
 def rigid_motion(xi: Tensor) -> Tensor:
-    """The exponential of se(3): xi [..., 6] (rotation vector, translation part) -> [..., 4, 4]; smooth at zero too."""
+    """Return the exponential [..., 4, 4] of xi [..., 6] (rotation vector, translation part); smooth at zero too."""
     x, y, z, a, b, c = xi.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero]
@@ -27,7 +27,7 @@ def rigid_motion(xi: Tensor) -> Tensor:
 
 
 class Poses(nn.Module):
-    """Corrections of the poses of `views`; `depth_m` is how far away things are."""
+    """Corrections of the poses of `views`; `depth_m` is the scene's distance."""
 
     def __init__(self, views: Views, depth_m: float) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Poses(nn.Module):
         self.xi = nn.Parameter(torch.zeros(len(views) - 1, 6, dtype=views.w2c.dtype, device=views.w2c.device))
 
     def views(self, chosen: Sequence[int]) -> Views:
-        """Some of the views where they are taken to stand now, differentiable in `xi`."""
+        """Return some of the views at their present poses, differentiable in `xi`."""
         start, index = self._start, list(chosen)
         units = torch.tensor([1.0] * 3 + [self._depth_m] * 3, dtype=self.xi.dtype, device=self.xi.device)
         moved = nn.functional.pad(self.xi * units, (0, 0, 1, 0))[index]
@@ -43,6 +43,6 @@ class Poses(nn.Module):
 
     @torch.no_grad()
     def cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-        """`cameras`, those that the views were made of, where they are taken to stand now."""
+        """Return `cameras`, those that the views were made of, at their present poses."""
         found = self.views(range(len(cameras))).w2c.double().cpu().numpy()
         return tuple(replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, found, strict=True))

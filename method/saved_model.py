@@ -15,7 +15,7 @@ from spike4dgs.method.model_files.model_file import FIX, ModelFile, read_model
 from spike4dgs.method.radiance_field.model import RadianceModel
 from spike4dgs.method.tracking.model import TrackedModel
 
-# What reads the tensors of each kind: file, device -> model. Its class writes that kind in `save`.
+# Readers of the tensors of each kind: file, device -> model. Its class writes that kind in `save`.
 KINDS: dict[str, Callable[[ModelFile, str], Model]] = {
     FittedModel.KIND: FittedModel.from_file,
     TrackedModel.KIND: TrackedModel.from_file,
@@ -25,7 +25,7 @@ KINDS: dict[str, Callable[[ModelFile, str], Model]] = {
 
 @dataclass(frozen=True, eq=False)
 class SavedModel:
-    """A model from a file, and where it comes from."""
+    """A model from a file, and its provenance."""
 
     model: Model
     provenance: Provenance
@@ -36,14 +36,14 @@ class SavedModel:
         return f"{self.provenance.name} on {self.provenance.scene}"
 
 
-def load_model(path: Path, device: str = "cpu") -> SavedModel:
-    """The model of a file, on `device`.
+def load_model(path: Path | str, device: str = "cpu") -> SavedModel:
+    """Return the model of a file, on `device`.
 
     Raises UserError where the file is missing, damaged, foreign, or of a version that this one cannot read, and where
     the device is not there.
     """
     check_device(device)
-    file = read_model(path)
+    file = read_model(Path(path))
     if file.kind not in KINDS:
         raise problem(path, f"a model of kind {', '.join(KINDS)}", repr(file.kind), FIX)
     try:

@@ -1,4 +1,4 @@
-"""When a fit sees what: stages of steps, each on a part of the clip that opens up while the stage goes on.
+"""The schedule of a fit: stages of steps, each on a part of the clip that opens up while the stage goes on.
 
 A long clip may be fitted in pieces, each with Gaussians of its own: the middle one first, from the static stage; then,
 outwards, every other one from where its neighbour ends.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.trainer_settings import TrainerSettings
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
 
@@ -23,21 +23,21 @@ class Stage:
     steps: int
     deforms: bool
     span: Interval = (0.0, 1.0)  # the part of the clip that the stage fits
-    begin: Interval = (0.0, 1.0)  # what it sees of that at its first step
+    begin: Interval = (0.0, 1.0)  # the part of that which it sees at its first step
     piece: int = 0
     neighbour: int | None = None  # the piece that this one continues
 
     def fraction(self, step: int) -> float:
-        """Position of a step within the stage, in [0, 1)."""
+        """Return the position of a step within the stage, in [0, 1)."""
         return (step - self.first) / self.steps
 
     def within(self, t: float) -> float:
-        """A time of the clip as a time of the stage's span, which is [0, 1]."""
+        """Return a time of the clip as a time of the stage's span, which is [0, 1]."""
         return (t - self.span[0]) / (self.span[1] - self.span[0])
 
 
-def stages(settings: TrainSettings, moves: bool, rests_first: bool = True, pieces: int = 1) -> list[Stage]:
-    """The static stage, followed by deforming ones where the motion model moves; or one that deforms throughout.
+def stages(settings: TrainerSettings, moves: bool, rests_first: bool = True, pieces: int = 1) -> list[Stage]:
+    """Return the static stage, followed by deforming ones where the motion model moves; or one that deforms throughout.
 
     A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd.
     """
@@ -59,8 +59,8 @@ def stages(settings: TrainSettings, moves: bool, rests_first: bool = True, piece
     return plan
 
 
-def choose_time(settings: TrainSettings, stage: Stage, step: int, times: int) -> int:
-    """Index of the step's time among `times`: in what the stage begins with, and then, as that opens up, in its span.
+def choose_time(settings: TrainerSettings, stage: Stage, step: int, times: int) -> int:
+    """Return the index of a step's time among `times`: in the stage's first interval, which opens up to its span.
 
     Motion is followed from known into unknown times. A static scene sees all times throughout.
     """

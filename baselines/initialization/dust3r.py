@@ -2,9 +2,9 @@
 
 The network sees the first training view beside each of the others and gives, per pair, the points of both images in
 the first one's frame, at a scale of the pair's own. The pairs share the first view's points, so their scales follow
-from the ratios of its distances. Each other view is then placed by PnP with RANSAC between its pixels and its points,
-and all is moved to the scene's frame as COLMAP's result is. Pairs beyond this star, and the joint optimisation over all
-of them, are left out: with 8 views of an array every view overlaps the first.
+from the ratios of its distances. Each other view then gets its pose by PnP with RANSAC between its pixels and its
+points, and all is moved to the scene's frame as COLMAP's result is. Pairs beyond this star, and the joint optimisation
+over all of them, are left out: with 8 views of an array every view overlaps the first.
 
 `dust3r` keeps the calibrated intrinsics in PnP; `dust3r-uncalibrated` takes one focal length from the first view's
 points (`focal_from_points`). Images are the means of the clip, as for COLMAP.
@@ -28,7 +28,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import NamedWeights, find_weights
-from spike4dgs.method.fit import Start
+from spike4dgs.method.initialization import Start
 from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 
 Float32 = NDArray[np.float32]
@@ -58,28 +58,28 @@ Predict = Callable[[int], Pair]  # of view 0 beside view i
 
 
 def dust3r(scene: TrainingScene, seed: int) -> Start:
-    """Poses and points with the calibrated intrinsics; see the module.
+    """Return poses and points with the calibrated intrinsics; see the module.
 
-    Raises WeightsError where the weights are absent, UserError where they are others or a view is not placed.
+    Raises WeightsError where the weights are absent, UserError where they are others or a view gets no pose.
     """
     return estimate(scene, clip_means(scene), seed, calibrated=True)
 
 
 def dust3r_uncalibrated(scene: TrainingScene, seed: int) -> Start:
-    """The same, with intrinsics unknown."""
+    """Return the same, with intrinsics unknown."""
     return estimate(scene, clip_means(scene), seed, calibrated=False)
 
 
-def estimate(scene: TrainingScene, pictures: Float32, seed: int, *, calibrated: bool) -> Start:
-    """Poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
+def estimate(scene: TrainingScene, images: Float32, seed: int, *, calibrated: bool) -> Start:
+    """Return poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
     network = load_dust3r(find_weights(WEIGHTS).path)
     views = [resized(camera, network.shape.patch) for camera in scene.cameras]
-    shown = np.stack([_resize(p, v) for p, v in zip(pictures, views, strict=True)])
-    return place(predictor(network, shown), views, shown, scene, seed, calibrated=calibrated)
+    shown = np.stack([_resize(p, v) for p, v in zip(images, views, strict=True)])
+    return solve(predictor(network, shown), views, shown, scene, seed, calibrated=calibrated)
 
 
 def resized(camera: Camera, patch: int) -> Camera:
-    """The view at the network's size: `LONG_SIDE` px the long way, sides cut to whole patches about the middle."""
+    """Return the view at the network's size: `LONG_SIDE` px the long way, cut to whole patches about the middle."""
     scale = LONG_SIDE / max(camera.width, camera.height)
     width, height = (int(n * scale + 1e-9) // patch * patch for n in (camera.width, camera.height))
     cx = camera.cx * scale - (camera.width * scale - width) / 2
@@ -88,7 +88,7 @@ def resized(camera: Camera, patch: int) -> Camera:
 
 
 def _resize(image: Float32, view: Camera) -> Float32:
-    """Linear radiance [H, W] -> sRGB-encoded gray in [0, 1] at the network's size [h, w]."""
+    """Return linear radiance [H, W] as sRGB-encoded gray in [0, 1] at the network's size [h, w]."""
     scale = LONG_SIDE / max(image.shape)
     left, top = ((n * scale - m) / 2 for n, m in zip(image.shape[::-1], (view.width, view.height), strict=True))
     # From pixel indices of the result to those of the image; the centre of pixel i lies at i + 0.5.
@@ -100,7 +100,7 @@ def _resize(image: Float32, view: Camera) -> Float32:
 
 
 def predictor(network: Dust3r, shown: Float32) -> Predict:
-    """The network on images [C, H, W] in [0, 1]; on the GPU where there is one."""
+    """Return the network on images [C, H, W] in [0, 1]; on the GPU where there is one."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = network.to(device)
     inputs = torch.as_tensor(2 * shown - 1, device=device)[:, None].expand(-1, 3, -1, -1)
@@ -116,12 +116,12 @@ def predictor(network: Dust3r, shown: Float32) -> Predict:
     return predict
 
 
-def place(
+def solve(
     predict: Predict, views: Sequence[Camera], shown: Float32, scene: TrainingScene, seed: int, *, calibrated: bool
 ) -> Start:
-    """Cameras and points from the network's answers; `views` are the training cameras at the size of `shown`.
+    """Return cameras and points from the network's answers; `views` are the training cameras at the size of `shown`.
 
-    Raises UserError where a view is not placed.
+    Raises UserError where a view gets no pose.
     """
     pairs = [predict(i) for i in range(1, len(views))]
     confidence = np.mean([p.confidence[0] for p in pairs], axis=0)
@@ -136,7 +136,7 @@ def place(
             fix = "use rig or colmap"
             raise problem(f"DUSt3R on {scene.id}", "points that give a focal length", "none before the camera", fix)
     known = [v if focal is None else replace(v, fx=focal, fy=focal, cx=v.width / 2, cy=v.height / 2) for v in views]
-    placed, clouds = [replace(known[0], R=np.eye(3), t=np.zeros(3))], [(shared[sure], shown[0][sure])]
+    posed, clouds = [replace(known[0], R=np.eye(3), t=np.zeros(3))], [(shared[sure], shown[0][sure])]
     for view, pair, scale, image in zip(known[1:], pairs, scales, shown[1:], strict=True):
         chosen = pair.confidence[1] >= np.quantile(pair.confidence[1], LEAST_CONFIDENCE)
         points = scale * pair.points[1][chosen]
@@ -144,9 +144,9 @@ def place(
         if pose is None:
             fix = "use rig or colmap"
             raise problem(f"DUSt3R on {scene.id}", f"a pose for {view.id}", "no consistent points", fix)
-        placed.append(replace(view, R=pose[0], t=pose[1]))
+        posed.append(replace(view, R=pose[0], t=pose[1]))
         clouds.append((points, image[chosen]))
-    cameras = [_at_size(p, c) for p, c in zip(placed, scene.cameras, strict=True)]
+    cameras = [_at_size(p, c) for p, c in zip(posed, scene.cameras, strict=True)]
     move = align_cameras(cameras, scene.cameras)
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
     few = np.random.default_rng(seed).permutation(len(points))[:MAX_POINTS]
@@ -155,18 +155,18 @@ def place(
 
 
 def _scale(points: Float64, same: Float64) -> float:
-    """What brings `same` [N, 3] to the size of `points`: the median ratio of their distances to the camera."""
+    """Return the median ratio of the distances to the camera of `points` [N, 3] and of `same` [N, 3]."""
     return float(np.median(np.linalg.norm(points, axis=-1) / np.maximum(np.linalg.norm(same, axis=-1), 1e-12)))
 
 
 def _pixels(mask: NDArray[np.bool_]) -> Float64:
-    """Coordinates [N, 2] of the centres of a mask's pixels."""
+    """Return coordinates [N, 2] of the centres of a mask's pixels."""
     v, u = np.nonzero(mask)
     return np.stack([u + 0.5, v + 0.5], axis=-1)
 
 
 def _at_size(view: Camera, camera: Camera) -> Camera:
-    """A placed view with the size of the scene's camera."""
+    """Return a posed view with the size of the scene's camera."""
     scale = max(camera.width, camera.height) / LONG_SIDE
     cx = view.cx * scale + (camera.width - view.width * scale) / 2
     cy = view.cy * scale + (camera.height - view.height * scale) / 2

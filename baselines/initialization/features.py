@@ -1,4 +1,4 @@
-"""What views have in common: SIFT features of one image per view, and their matches, in a database of COLMAP's.
+"""SIFT features of one image per view, and their matches between views, in a database of COLMAP's.
 
 Images are enlarged before features are found, and all pairs are matched. Everything runs in one thread, so that the
 same seed gives the same matches.
@@ -37,7 +37,7 @@ FOCAL_PRIOR = 1.2  # image widths, COLMAP's own
 
 @dataclass(frozen=True)
 class Features:
-    """Where COLMAP finds images and matches; `names` are the images', in the views' order."""
+    """The folder in which COLMAP finds images and matches; `names` are the images', in the views' order."""
 
     folder: Path
     database: Path
@@ -46,14 +46,14 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """What structure from motion found, in the frame of the calibrated training cameras."""
+    """The result of structure from motion, in the frame of the calibrated training cameras."""
 
     cameras: tuple[Camera, ...]  # those registered, in the scene's order
     points: NDArray[np.float64]  # [N, 3] m
     values: Float32  # [N] gray radiance
 
     def of_all(self, scene: TrainingScene, who: str) -> Mapping:
-        """The same, if it has all training views of `scene`. Raises UserError."""
+        """Return the same, if it has all training views of `scene`. Raises UserError."""
         count, wanted = len(self.cameras), len(scene.cameras)
         if count < wanted:
             fix = "use rig, or a scene with more static texture"
@@ -65,31 +65,31 @@ NOTHING = Mapping((), np.zeros((0, 3)), np.zeros(0, np.float32))
 
 
 @contextmanager
-def find_features(cameras: Sequence[Camera], pictures: Float32, seed: int, *, calibrated: bool) -> Iterator[Features]:
-    """Features and matches of images [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
+def find_features(cameras: Sequence[Camera], images: Float32, seed: int, *, calibrated: bool) -> Iterator[Features]:
+    """Yield features and matches of images [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
 
     All views share one camera: the calibrated one, or one whose focal length is a guess.
     """
     import pycolmap
 
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
-        names = _write_images(Path(folder), cameras, pictures)
+        names = _write_images(Path(folder), cameras, images)
         database = Path(folder) / "database.db"
         pycolmap.set_random_seed(seed)
         _match(database, Path(folder), cameras[0], seed, calibrated)
         yield Features(Path(folder), database, tuple(names))
 
 
-def _write_images(folder: Path, cameras: Sequence[Camera], pictures: Float32) -> list[str]:
+def _write_images(folder: Path, cameras: Sequence[Camera], images: Float32) -> list[str]:
     names = [f"{camera.id}.png" for camera in cameras]
-    for name, picture in zip(names, pictures, strict=True):
-        image = cv2.resize(encode_srgb(picture), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
-        write_png(folder / name, np.asarray(image, np.uint8))
+    for name, image in zip(names, images, strict=True):
+        larger = cv2.resize(encode_srgb(image), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
+        write_png(folder / name, np.asarray(larger, np.uint8))
     return names
 
 
 def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: bool) -> None:
-    """Features and matches of all pairs into the database; all views share one camera."""
+    """Write features and matches of all pairs into the database; all views share one camera."""
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
@@ -121,26 +121,26 @@ def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: 
 
 
 def in_scene(
-    model: pycolmap.Reconstruction, cameras: Sequence[Camera], names: Sequence[str], pictures: Float32
+    model: pycolmap.Reconstruction, cameras: Sequence[Camera], names: Sequence[str], images: Float32
 ) -> Mapping:
-    """The model's views and points, moved by the similarity that fits its views to the calibrated ones.
+    """Return the model's views and points, moved by the similarity that fits its views to the calibrated ones.
 
     With fewer than two views nothing can be aligned: then it is `NOTHING`.
     """
-    images = {i.name: i for i in model.images.values() if i.has_pose}
+    posed = {i.name: i for i in model.images.values() if i.has_pose}
     camera = next(iter(model.cameras.values()))  # all views share it
-    places = [k for k, name in enumerate(names) if name in images]
-    if len(places) < 2:
+    found = [k for k, name in enumerate(names) if name in posed]
+    if len(found) < 2:
         return NOTHING
     K = camera.calibration_matrix() / ENLARGE
-    estimated = [_camera(images[names[k]], K, cameras[k]) for k in places]
-    move = align_cameras(estimated, [cameras[k] for k in places])
-    view = {images[names[k]].image_id: k for k in places}
+    estimated = [_camera(posed[names[k]], K, cameras[k]) for k in found]
+    move = align_cameras(estimated, [cameras[k] for k in found])
+    view = {posed[names[k]].image_id: k for k in found}
     points, values = [], []
     for point in model.points3D.values():
         points.append(point.xyz)
         seen = [(view[e.image_id], model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
-        values.append(np.mean([_at(pictures[k], xy / ENLARGE) for k, xy in seen]))
+        values.append(np.mean([_at(images[k], xy / ENLARGE) for k, xy in seen]))
     return Mapping(
         tuple(move.camera(c) for c in estimated),
         move(np.asarray(points, np.float64).reshape(-1, 3)),
@@ -149,14 +149,14 @@ def in_scene(
 
 
 def _camera(image: pycolmap.Image, K: NDArray[np.float64], like: Camera) -> Camera:
-    """The view as COLMAP places it, with the intrinsics K that it used."""
+    """Return the view with COLMAP's pose, with the intrinsics K that it used."""
     pose = image.cam_from_world().matrix()
     return replace(like, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], R=pose[:, :3], t=pose[:, 3])
 
 
-def _at(picture: Float32, xy: NDArray[np.float64]) -> float:
-    u, v = np.clip(xy.astype(int), 0, [picture.shape[1] - 1, picture.shape[0] - 1])
-    return float(picture[v, u])
+def _at(image: Float32, xy: NDArray[np.float64]) -> float:
+    u, v = np.clip(xy.astype(int), 0, [image.shape[1] - 1, image.shape[0] - 1])
+    return float(image[v, u])
 
 
 @contextmanager

@@ -1,10 +1,11 @@
-"""Poses from a rough guess of what one view sees, and from what views match: a network's depth, COLMAP's geometry.
+"""Poses from a rough guess of one view's points, and from matches of all views: a network's depth, COLMAP's geometry.
 
 MSDI knows the points of view 0 to a tenth, and an array is small beside its distance to the scene: seen from the other
-views such points fall only a few pixels beside their places. So the features that a view has in common with view 0
-place that view to a degree or two, by PnP, where the network's points of that view itself do not (`method.msdi.pose`).
-Triangulation and bundle adjustment of what all views match do the rest. A view may then stand in a wrong but locally
-best place: therefore each is placed again, by points that the others agree on, and everything is adjusted once more.
+views such points fall only a few pixels beside their images. So the features that a view has in common with view 0
+give that view's pose to a degree or two, by PnP, where the network's points of that view itself do not
+(`method.msdi.pose`). Triangulation and bundle adjustment of all matches do the rest. A view may then have a wrong but
+locally best pose: therefore each pose is solved again, by points that the others agree on, and everything is adjusted
+once more.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ RESECT_PX = 1.0  # of a triangulated one
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Where an observation of a point ends, in enlarged pixels and degrees of its ray; COLMAP's own are 4 and 2."""
+    """The reach of an observation of a point, in enlarged pixels and degrees of its ray; COLMAP's own are 4 and 2."""
 
     error_px: float
     angle_deg: float
@@ -60,17 +61,17 @@ class Seen:
     same: dict[tuple[int, int], NDArray[np.int64]]  # [M, 2] of views (i, j), i < j: indices of features
 
     def partners(self, i: int, j: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Indices of the features that views i and j have in common, in i and in j."""
+        """Return indices of the features that views i and j have in common, in i and in j."""
         both = self.same[min(i, j), max(i, j)].T
         return (both[0], both[1]) if i < j else (both[1], both[0])
 
 
 def bundle(scene: TrainingScene, guess: Float64, factor: int, images: Float32, seed: int) -> Mapping:
-    """Poses of the training cameras, whose intrinsics are taken as given, and the points that they match.
+    """Return poses of the training cameras, whose intrinsics are taken as given, and the points that they match.
 
-    guess: [h, w, 3] what the pixels of view 0 see, in view 0's frame, at any scale, NaN where unknown; a pixel is a
+    guess: [h, w, 3] points of the pixels of view 0, in view 0's frame, at any scale, NaN where unknown; a pixel is a
     block of `factor` x `factor` of the camera's. images: [C, H, W] linear radiance. The same seed gives the same
-    poses. A view that cannot be placed is left out.
+    poses. A view without a pose is left out.
     """
     with find_features(scene.cameras, images, seed, calibrated=True) as found:
         seen = _read(found)
@@ -78,7 +79,7 @@ def bundle(scene: TrainingScene, guess: Float64, factor: int, images: Float32, s
         model = _adjust(found, seen, _first_poses(seen, guess, factor, intrinsics, seed), ROUGH)
         if model is None:
             return NOTHING
-        model = _adjust(found, seen, _placed_again(model, seen, intrinsics, seed), FINE)
+        model = _adjust(found, seen, _poses_again(model, seen, intrinsics, seed), FINE)
         return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images)
 
 
@@ -99,20 +100,20 @@ def _read(found: Features) -> Seen:
 def _first_poses(
     seen: Seen, guess: Float64, factor: int, intrinsics: Sequence[Float64], seed: int
 ) -> list[Pose | None]:
-    """View 0's pose, the identity, and where PnP on the guessed points of its features places the others."""
+    """Return view 0's pose, the identity, and the others' by PnP on the guessed points of its features."""
     u, v = np.floor(seen.pixels[0] / factor).astype(np.int64).T
     points = guess[v.clip(0, guess.shape[0] - 1), u.clip(0, guess.shape[1] - 1)]
     poses: list[Pose | None] = [(np.eye(3), np.zeros(3))]
     for view in range(1, len(seen.ids)):
         first, other = seen.partners(0, view)
-        poses.append(_place(points[first], seen.pixels[view][other], intrinsics[view], GUESS_PX, seed))
+        poses.append(_solve(points[first], seen.pixels[view][other], intrinsics[view], GUESS_PX, seed))
     return poses
 
 
-def _placed_again(
+def _poses_again(
     model: pycolmap.Reconstruction, seen: Seen, intrinsics: Sequence[Float64], seed: int
 ) -> list[Pose | None]:
-    """Each view's pose by the points of features that it has in common with the views of the model."""
+    """Return each view's pose by the points of features that it has in common with the views of the model."""
     at = [_points_of(model, image, len(pixels)) for image, pixels in zip(seen.ids, seen.pixels, strict=True)]
     poses: list[Pose | None] = []
     for view in range(len(seen.ids)):
@@ -121,11 +122,11 @@ def _placed_again(
             mine, theirs = seen.partners(view, other)
             points.append(at[other][theirs])
             pixels.append(seen.pixels[view][mine])
-        poses.append(_place(np.concatenate(points), np.concatenate(pixels), intrinsics[view], RESECT_PX, seed))
+        poses.append(_solve(np.concatenate(points), np.concatenate(pixels), intrinsics[view], RESECT_PX, seed))
     return poses
 
 
-def _place(points: Float64, pixels: Float64, K: Float64, reach_px: float, seed: int) -> Pose | None:
+def _solve(points: Float64, pixels: Float64, K: Float64, reach_px: float, seed: int) -> Pose | None:
     known = np.isfinite(points).all(axis=1)
     if known.sum() < LEAST_POINTS:
         return None
@@ -133,7 +134,7 @@ def _place(points: Float64, pixels: Float64, K: Float64, reach_px: float, seed: 
 
 
 def _points_of(model: pycolmap.Reconstruction, image: int, count: int) -> Float64:
-    """The points [count, 3] of a view's features; NaN for those without one, and all NaN for a view left out."""
+    """Return the points [count, 3] of a view's features; NaN for those without one, and all NaN for a view left out."""
     points = np.full((count, 3), np.nan)
     if model.exists_image(image):
         for k, feature in enumerate(model.image(image).points2D):
@@ -145,17 +146,17 @@ def _points_of(model: pycolmap.Reconstruction, image: int, count: int) -> Float6
 def _adjust(
     found: Features, seen: Seen, poses: Sequence[Pose | None], tolerance: Tolerance
 ) -> pycolmap.Reconstruction | None:
-    """Points triangulated from the views that have poses, then both adjusted; None for fewer than two views."""
+    """Return points triangulated from the views that have poses, then both adjusted; None for fewer than two views."""
     import pycolmap
 
-    placed = [(i, n, p) for i, n, p in zip(seen.ids, found.names, poses, strict=True) if p is not None]
-    if len(placed) < 2:
+    posed = [(i, n, p) for i, n, p in zip(seen.ids, found.names, poses, strict=True) if p is not None]
+    if len(posed) < 2:
         return None
     with pycolmap.Database.open(found.database) as database:
         (camera,) = database.read_all_cameras()
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
-    for image, name, (R, t) in placed:
+    for image, name, (R, t) in posed:
         view = pycolmap.Image(image_id=image, camera_id=camera.camera_id, name=name)
         model.add_image_with_trivial_frame(view, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
     model = pycolmap.triangulate_points(
@@ -166,7 +167,7 @@ def _adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # some matches are wrong
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
-    for image, _, _ in placed:
+    for image, _, _ in posed:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()

@@ -4,10 +4,10 @@ The network sees the ticks around the middle of the clip in all training views a
 was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
 view 0's frame, at a scale of its own.
 
-`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, what views match is measured
-better than a network guesses it: those are the points of `rig-flat`. Where nothing matches, for lack of texture, the
-network's points take the place of the nearest depth; of view 0's, as inverse depths that a line brings to the matched
-ones.
+`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, matches of the views are
+measured better than a network guesses them: those are the points of `rig` with `flat_field`. Where nothing matches, for
+lack of texture, the network's points replace the nearest depth: those of view 0, as inverse depths that a line brings
+to the matched ones.
 
 `msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
 views match in corrected means of the clip (`bundle`). From there on it is `msdi`.
@@ -37,7 +37,7 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Start
+from spike4dgs.method.initialization import Start
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
 from spike4dgs.method.msdi.shrink import shrink
@@ -54,8 +54,8 @@ FARTHEST = 2.0  # times the farthest match
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
-    """What the network made of V views of h x w pixels."""
+class Estimate:
+    """The network's estimate for V views of h x w pixels."""
 
     factor: int  # the cameras' pixels are blocks of so many by so many
     cameras: tuple[Camera, ...]  # the training cameras at this size
@@ -70,44 +70,44 @@ class Glance:
         return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
 
 
-def msdi(scene: TrainingScene, seed: int) -> Start:
-    """Points at the calibrated poses; see the module. Nothing is random, `seed` is not used.
+def msdi(scene: TrainingScene) -> Start:
+    """Return points at the calibrated poses; see the module.
 
-    Raises WeightsError where there are no weights, UserError where all cameras stand in one place.
+    Raises WeightsError where there are no weights, UserError where all cameras have one centre.
     """
-    return _given(scene, look(scene, calibrated=True))
+    return _given(scene, infer(scene, calibrated=True))
 
 
-def _given(scene: TrainingScene, glance: Glance) -> Start:
+def _given(scene: TrainingScene, estimate: Estimate) -> Start:
     cloud, mean = matched(scene, flat_field=True)
-    return filled(scene, completed(cloud, glance), mean)
+    return filled(scene, completed(cloud, estimate), mean)
 
 
 def msdi_matched(scene: TrainingScene, seed: int) -> Start:
-    """Poses by the network's points of view 0 and by matches, and points there; raises as `msdi`, and `place` does."""
-    glance = look(scene, calibrated=True)
-    cameras = place(scene, glance, seed).cameras
-    small = tuple(shrunk(camera, glance.factor) for camera in cameras)
-    return _given(replace(scene, cameras=cameras), replace(glance, cameras=small))
+    """Return poses by the network's points of view 0 and by matches, and points; raises as `matched_poses` too."""
+    estimate = infer(scene, calibrated=True)
+    cameras = matched_poses(scene, estimate, seed).cameras
+    small = tuple(shrunk(camera, estimate.factor) for camera in cameras)
+    return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small))
 
 
-def place(scene: TrainingScene, glance: Glance, seed: int) -> Mapping:
-    """The training cameras, whose intrinsics are known, and the points that they match.
+def matched_poses(scene: TrainingScene, estimate: Estimate, seed: int) -> Mapping:
+    """Return the training cameras, whose intrinsics are known, and the points that they match.
 
     Raises UserError unless all have poses.
     """
-    guess = np.where(glance.sure[0][..., None], glance.points[0], np.nan)
-    pictures = window_means(scene, 0, scene.n_ticks, flat_field=True)
-    return bundle(scene, guess, glance.factor, pictures, seed).of_all(scene, "MSDI")
+    guess = np.where(estimate.sure[0][..., None], estimate.points[0], np.nan)
+    images = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    return bundle(scene, guess, estimate.factor, images, seed).of_all(scene, "MSDI")
 
 
 def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
-    """Poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, look(scene, calibrated=False), seed, calibrated=False)
+    """Return poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
+    return unposed(scene, infer(scene, calibrated=False), seed, calibrated=False)
 
 
-def look(scene: TrainingScene, *, calibrated: bool) -> Glance:
-    """What the network in use makes of the middle of the clip, told the intrinsics or not; raises as `msdi`."""
+def infer(scene: TrainingScene, *, calibrated: bool) -> Estimate:
+    """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
     device = choose_device("auto")
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
@@ -121,20 +121,20 @@ def look(scene: TrainingScene, *, calibrated: bool) -> Glance:
         gain = float(np.mean([c.radiance_gain for c in calibrations]))
     with torch.inference_mode():
         found = network(small.to(device), K.to(device) if calibrated else None, sensors)
-    pictures = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
+    images = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
     points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
-    return Glance(factor, cameras, pictures, points, confidence)
+    return Estimate(factor, cameras, images, points, confidence)
 
 
 def shrunk(camera: Camera, factor: int) -> Camera:
-    """The view of a sensor whose pixels are blocks of `factor` x `factor`, sides rounded up."""
+    """Return the view of a sensor whose pixels are blocks of `factor` x `factor`, sides rounded up."""
     width, height = -(-camera.width // factor), -(-camera.height // factor)
     fx, fy, cx, cy = (x / factor for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -> Sensors:
-    """The maps [1, V, h, w] of sensors with larger pixels."""
+    """Return the maps [1, V, h, w] of sensors with larger pixels."""
 
     def small(maps: list[Float32]) -> torch.Tensor:
         whole = torch.from_numpy(np.stack(maps)).to(device)[None]
@@ -143,9 +143,9 @@ def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -
     return Sensors(small([c.gain for c in calibrations]), small([c.dark for c in calibrations]))
 
 
-def completed(cloud: Cloud, glance: Glance) -> Cloud:
-    """The matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
-    camera, depth, sure = glance.cameras[0], glance.points[0, :, :, 2], glance.sure[0]
+def completed(cloud: Cloud, estimate: Estimate) -> Cloud:
+    """Return the matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
+    camera, depth, sure = estimate.cameras[0], estimate.points[0, :, :, 2], estimate.sure[0]
     uv, z = camera.project(cloud.points)
     uv, z = uv[z > 0], z[z > 0]
     line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z)
@@ -153,13 +153,13 @@ def completed(cloud: Cloud, glance: Glance) -> Cloud:
         return cloud
     v, u = np.nonzero(sure & (depth > 0))
     at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
-    hole = (cKDTree(uv).query(at)[0] > HOLE_PX / glance.factor) & (inverse * z.max() * FARTHEST > 1)
+    hole = (cKDTree(uv).query(at)[0] > HOLE_PX / estimate.factor) & (inverse * z.max() * FARTHEST > 1)
     points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
-    return Cloud(points, np.concatenate([cloud.values, glance.images[0, v[hole], u[hole]]]))
+    return Cloud(points, np.concatenate([cloud.values, estimate.images[0, v[hole], u[hole]]]))
 
 
 def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | None:
-    """(a, b) of the line a / depth + b that comes closest to the inverse depths 1 / z of points seen at pixels uv.
+    """Return (a, b) of the line a / depth + b that is closest to the inverse depths 1 / z of points at pixels uv.
 
     The sum of the absolute differences is made smallest, by least squares that the last residuals weigh. `depth` [h, w]
     is NaN where nothing is known. None for fewer than `LEAST_MATCHES` points, or where the line does not rise.
@@ -179,35 +179,35 @@ def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | Non
     return line if line[0] > 0 else None
 
 
-def unposed(scene: TrainingScene, glance: Glance, seed: int, *, calibrated: bool) -> Start:
-    """Poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
+def unposed(scene: TrainingScene, estimate: Estimate, seed: int, *, calibrated: bool) -> Start:
+    """Return poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
 
     Raises UserError where a view has no pose.
     """
-    first, f = scene.cameras[0], glance.factor
-    cameras = list(scene.cameras) if calibrated else _one_focal(scene, glance)
+    first, f = scene.cameras[0], estimate.factor
+    cameras = list(scene.cameras) if calibrated else _one_focal(scene, estimate)
     K = np.stack([shrunk(camera, f).K for camera in cameras])
-    poses = solve_poses(glance.points, glance.confidence, K, seed)
-    if bad := [f"{c.id} ({p.reason})" for c, p in zip(glance.cameras, poses, strict=True) if not p.found]:
+    poses = solve_poses(estimate.points, estimate.confidence, K, seed)
+    if bad := [f"{c.id} ({p.reason})" for c, p in zip(estimate.cameras, poses, strict=True) if not p.found]:
         fix = "use rig or colmap"
         raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
     known = [pose.w2c for pose in poses if pose.w2c is not None]
     placed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
     move = align_cameras(placed, scene.cameras)
     moved = tuple(move.camera(c) for c in placed)
-    cloud = thin(moved, Cloud(move(glance.points[glance.sure]), glance.images[glance.sure]))
-    pictures = glance.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
-    cloud = fill(moved, pictures, cloud)
+    cloud = thin(moved, Cloud(move(estimate.points[estimate.sure]), estimate.images[estimate.sure]))
+    images = estimate.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = fill(moved, images, cloud)
     return Start(moved, cloud.points.astype(np.float32), cloud.values)
 
 
-def _one_focal(scene: TrainingScene, glance: Glance) -> list[Camera]:
-    """The cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
-    first, f = scene.cameras[0], glance.factor
+def _one_focal(scene: TrainingScene, estimate: Estimate) -> list[Camera]:
+    """Return the cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
+    first, f = scene.cameras[0], estimate.factor
     middle = first.width / 2, first.height / 2
-    v, u = np.nonzero(glance.sure[0])
+    v, u = np.nonzero(estimate.sure[0])
     offsets = np.stack([u + 0.5, v + 0.5], axis=-1) - np.divide(middle, f)
-    focal = focal_from_points(glance.points[0, v, u], offsets)
+    focal = focal_from_points(estimate.points[0, v, u], offsets)
     if focal is None:
         fix = "use rig or colmap"
         raise problem(f"MSDI on {scene.id}", "points that give a focal length", "none before the camera", fix)

@@ -38,25 +38,25 @@ class DepthMap:
 
 
 def widest_baseline(cameras: Sequence[Camera]) -> float:
-    """Largest distance between two cameras, m."""
+    """Return the largest distance between two cameras, m."""
     centers = np.stack([c.center for c in cameras])
     return float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
 
 
 def inverse_depth_step(cameras: Sequence[Camera]) -> float:
-    """Difference of inverse depth, 1/m, that shifts a point by `PARALLAX_STEP` px in the widest pair."""
+    """Return the difference of inverse depth, 1/m, that shifts a point by `PARALLAX_STEP` px in the widest pair."""
     return PARALLAX_STEP / (cameras[0].fx * widest_baseline(cameras))
 
 
 def full_range(cameras: Sequence[Camera]) -> Float64:
-    """Inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
+    """Return the inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
     step = inverse_depth_step(cameras)
     planes = int(MAX_PARALLAX * cameras[0].width / PARALLAX_STEP)
     return step * np.arange(planes + 1, dtype=np.float64)
 
 
 def find_range(cameras: Sequence[Camera], images: Float32) -> Float64:
-    """The inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
+    """Return the inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
 
     Everything is kept where nothing matches.
     """
@@ -72,14 +72,14 @@ def find_range(cameras: Sequence[Camera], images: Float32) -> Float64:
 
 
 def half_size(camera: Camera) -> Camera:
-    """The same view with half as many pixels each way."""
+    """Return the same view with half as many pixels each way."""
     c, width, height = camera, camera.width // 2, camera.height // 2
     x, y = width / c.width, height / c.height
     return Camera(c.id, width, height, c.fx * x, c.fy * y, c.cx * x, c.cy * y, c.R, c.t)
 
 
 def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> Float64:
-    """Pixels of `reference`, seen on the plane z = 1 / inverse_depth of its frame, to pixels of `other`: [3, 3].
+    """Return the homography [3, 3] from `reference` to `other` over the plane z = 1 / inverse_depth of its frame.
 
     x' ~ K' (R + t w n^T) K^-1 x with the relative pose (R, t), w the inverse depth and n the optical axis.
     Coordinates have pixel centres at +0.5.
@@ -92,7 +92,7 @@ def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> 
 def sweep(
     cameras: Sequence[Camera], images: Float32, index: int, planes: Float64, pixels: Mask | None = None
 ) -> DepthMap:
-    """Depth of view `index` from all other views; images [C, H, W], inverse depths `planes` ascending.
+    """Return the depth of view `index` from all other views; images [C, H, W], inverse depths `planes` ascending.
 
     With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
     """
@@ -125,7 +125,7 @@ def sweep(
 
 
 def _rectangle(pixels: Mask) -> tuple[int, int, int, int]:
-    """Top, left, bottom, right of the smallest rectangle that holds a mask and a margin of one window."""
+    """Return top, left, bottom, right of the smallest rectangle that holds a mask and a margin of one window."""
     rows, columns = np.nonzero(pixels.any(axis=1))[0], np.nonzero(pixels.any(axis=0))[0]
     if not len(rows):
         return 0, 0, 1, 1
@@ -145,7 +145,7 @@ def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32) -
 
 
 def _peak(scores: Float32, planes: Float64) -> DepthMap:
-    """Best plane per pixel with a parabola through its neighbours."""
+    """Return the best plane per pixel with a parabola through its neighbours."""
     best = scores.argmax(axis=0)
     inner = np.clip(best, 1, len(planes) - 2)
 
@@ -161,14 +161,14 @@ def _peak(scores: Float32, planes: Float64) -> DepthMap:
 
 
 def lift(camera: Camera, inverse: Float32, pixels: Mask) -> Float64:
-    """World points [N, 3] of the masked pixels, at their inverse depths."""
+    """Return world points [N, 3] of the masked pixels, at their inverse depths."""
     v, u = np.nonzero(pixels)
     depth = 1 / np.maximum(inverse[v, u].astype(np.float64), 1e-9)
     return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
 
 
 def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> Mask:
-    """Pixels [H, W] of view `index` whose depth at least `MIN_AGREE` other views see at the same place."""
+    """Return the pixels [H, W] of view `index` on whose depth at least `MIN_AGREE` other views agree."""
     camera, own = cameras[index], maps[index]
     believed = (own.score > MIN_SCORE) & (own.inverse > 0)
     points = lift(camera, own.inverse, believed)

@@ -4,7 +4,7 @@ Static pixels are matched on the mean of the whole clip, where the spikes' quant
 that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
 ends those that are quiet just then, which is the background that something moving hides in the middle.
 
-`rig-flat` corrects every image by its camera's calibrated gain and dark rate, where a scene has them.
+With `flat_field` every image is corrected by its camera's calibrated gain and dark rate, where a scene has them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -31,15 +32,23 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.fit import Start
+from spike4dgs.method.initialization import Start
+from spike4dgs.method.observations.changes import COUNTS, changing, without_specks
+from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 
-WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as standing still
-CHANGE = 3  # spikes by which two windows of a pixel that sees constant radiance never differ (they differ by 1)
+WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as static
 CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
 HOLE_PX = 2.0  # from the nearest point: further away it is empty
-NEIGHBOURS = 5  # points that tell the depth of a place without any
+NEIGHBOURS = 5  # points that tell the depth where there are none
+
+
+@dataclass(frozen=True)
+class RigSettings(Settings):
+    """Images of the plane sweep (prefix `initialization`)."""
+
+    flat_field: bool = False  # correct them by each camera's calibration, if known
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +59,16 @@ class Cloud:
     values: Float32
 
 
-def rig(scene: TrainingScene, seed: int, flat_field: bool = False) -> Start:
-    """First points of a scene; see the module. Nothing is random, `seed` is not used.
+def rig(scene: TrainingScene, *, flat_field: bool = False) -> Start:
+    """Return the calibrated poses and first points of a scene; see the module.
 
-    Raises UserError where all cameras stand in one place.
+    Raises UserError where all cameras have one centre.
     """
     return filled(scene, *matched(scene, flat_field))
 
 
 def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
-    """The points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
+    """Return the points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} in one place"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
@@ -71,11 +80,11 @@ def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
     maps = [sweep(scene.cameras, mean, i, planes) for i in range(len(scene.cameras))]
     clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
     middle, last = len(windows) // 2, len(windows) - 1
-    for place in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
-        start, stop = windows[place]
+    for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
+        start, stop = windows[at]
         images = window_means(scene, start, stop, flat_field)
-        near = slice(max(0, place - 1), place + 2)
-        quiet = [~_moving(np.stack(c[near])) | (place == middle) for c in counts]
+        near = slice(max(0, at - 1), at + 2)
+        quiet = [~_moving(np.stack(c[near])) | (at == middle) for c in counts]
         short = [sweep(scene.cameras, images, i, planes, m) for i, m in enumerate(moving)]
         clouds.append(_points(scene.cameras, short, images, [m & q for m, q in zip(moving, quiet, strict=True)]))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
@@ -83,18 +92,13 @@ def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
 
 
 def filled(scene: TrainingScene, cloud: Cloud, mean: Float32) -> Start:
-    """The start from a cloud, with points where it leaves the image empty, coloured by the clip's means [C, H, W]."""
+    """Return the start from a cloud, filled where the image is empty, with gray of the clip's means [C, H, W]."""
     cloud = fill(scene.cameras, mean, cloud)
     return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
 
 
-def rig_flat(scene: TrainingScene, seed: int) -> Start:
-    """`rig` on corrected images."""
-    return rig(scene, seed, flat_field=True)
-
-
 def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
-    """Mean radiance [C, H, W] of all views in a window."""
+    """Return the mean radiance [C, H, W] of all views in a window."""
     rates = np.stack([_rate(s, start, stop) for s in scene.streams])
     if flat_field and scene.calibrations:
         return np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
@@ -102,7 +106,7 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
-    """Mean spikes per tick [H, W]; clips of any length are counted in parts."""
+    """Return mean spikes per tick [H, W]; clips of any length are counted in parts."""
     parts = range(start, stop, 65535)
     total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
     return np.asarray(total / (stop - start), np.float32)
@@ -114,16 +118,15 @@ def _windows(n_ticks: int) -> list[tuple[int, int]]:
 
 
 def _moving(counts: NDArray[np.int64]) -> Mask:
-    """Pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
-    changed = (counts.max(axis=0) - counts.min(axis=0) >= CHANGE).astype(np.uint8)
-    opened = cv2.medianBlur(changed, 3)  # single pixels are noise
-    return cv2.dilate(opened, np.ones((3, 3), np.uint8)).astype(bool)
+    """Return the pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
+    changed = changing(torch.from_numpy(counts)[:, None], COUNTS)[0].numpy()
+    return cv2.dilate(without_specks(changed), np.ones((3, 3), np.uint8)).astype(bool)
 
 
 def _points(
     cameras: Sequence[Camera], maps: Sequence[DepthMap], images: Float32, pixels: Sequence[Mask]
 ) -> tuple[NDArray[np.float64], Float32]:
-    """World points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
+    """Return world points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
     points, values = [], []
     for i, camera in enumerate(cameras):
         chosen = agreed(cameras, maps, i) & pixels[i]
@@ -133,7 +136,7 @@ def _points(
 
 
 def middle_camera(cameras: Sequence[Camera]) -> Camera:
-    """A camera between all others: their mean centre and the rotation nearest to their mean rotation."""
+    """Return a camera between all others: their mean centre and the rotation nearest to their mean rotation."""
     u, _, vt = np.linalg.svd(np.mean([c.R for c in cameras], axis=0))
     R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     first = cameras[0]
@@ -142,7 +145,7 @@ def middle_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
-    """One point, the mean, per cell of `CELL_PX` px and about as many px of parallax, as the middle camera sees it."""
+    """Return one point, the mean, per cell of `CELL_PX` px and about as many px of parallax in the middle camera."""
     uv, z = middle_camera(cameras).project(cloud.points)
     step = inverse_depth_step(cameras) * 2  # 2 px of parallax in the widest pair
     keep = z > 0
@@ -159,7 +162,7 @@ def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
 
 
 def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
-    """Add points where the middle camera sees none, at the median inverse depth of the nearest points in its image.
+    """Return the cloud and points where the middle camera sees none, at the nearest points' median inverse depth.
 
     Fewer points than that are chance: all of the image is then laid far away.
     """
@@ -184,7 +187,7 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
 
 
 def _look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gray value [N] of the pixel that sees each point; NaN outside the image."""
+    """Return the gray value [N] of the pixel that sees each point; NaN outside the image."""
     uv, z = camera.project(points)
     inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
     u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T

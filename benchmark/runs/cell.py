@@ -15,7 +15,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.environment import (
     device_type,
     environment,
@@ -26,11 +25,12 @@ from spike4dgs.benchmark.environment import (
 )
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Progress, check_protocol
 from spike4dgs.benchmark.results.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.results.provenance import Provenance, Savable
-from spike4dgs.benchmark.method import Budget, Method, Model, Progress
-from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.results.record import PROTOCOL
+from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene
 
 
@@ -75,7 +75,7 @@ class Job:
 
 
 def is_done(job: Job, folder: Path) -> bool:
-    """Whether `folder` holds this job's predictions, whole and undamaged."""
+    """Return whether `folder` holds this job's predictions, whole and undamaged."""
     if not (folder / INFO).is_file():
         return False
     try:
@@ -100,7 +100,9 @@ def run_job(
     clock = FitClock(work / "fit_clock.json", checkpoint)
     if clock.before > 0:
         note(f"resuming after {clock.before:.0f} s of fitting")
-    model = job.method.fit(job.scene.training, job.budget, job.device, job.seed, progress, checkpoint)
+    check_protocol(job.method, type(job.method).__module__)
+    request = FitRequest(job.budget, job.device, job.seed, progress, checkpoint)
+    model = job.method.fit(job.scene.training, request)
     fit_seconds = clock.seconds()
     if isinstance(model, Savable):
         model.save(model_path, _provenance(job, fit_seconds))

@@ -5,13 +5,13 @@ import numpy as np
 
 
 def make_image(scene, index, first, last):
-    """Linear radiance [H, W] that a training camera saw in ticks [first, last)."""
+    """Return linear radiance [H, W] that a training camera saw in ticks [first, last)."""
     counts = scene.streams[index].counts(first, last)
     return counts.astype(np.float32) / np.float32((last - first) * scene.radiance_gain)
 
 
 def warp(image, source, camera, distance):
-    """The image of `source` as `camera` would see it, if all were on the plane z = `distance` before `camera`."""
+    """Return the image of `source` as `camera` would see it, if all were on the plane z = `distance` of `camera`."""
     R = source.R @ camera.R.T
     T = source.t - R @ camera.t
     H = source.K @ (R + np.outer(T, [0, 0, 1 / distance])) @ np.linalg.inv(camera.K)
@@ -24,13 +24,13 @@ def warp(image, source, camera, distance):
 
 
 class PlaneBlendModel:
-    """What the benchmark asks for the held-out views."""
+    """The fitted model: the benchmark asks it for the held-out views."""
 
     def __init__(self, scene, distance, half_window):
         self.scene, self.distance, self.half_window = scene, distance, half_window
 
     def render(self, camera, t_us):
-        """Linear radiance [H, W] float32 of `camera` at the time `t_us`."""
+        """Return linear radiance [H, W] float32 of `camera` at the time `t_us`."""
         tick, cameras = self.scene.tick(t_us), self.scene.cameras
         first, last = max(0, tick - self.half_window), min(self.scene.n_ticks, tick + self.half_window)
         away = np.array([np.linalg.norm(c.center - camera.center) for c in cameras])
@@ -46,8 +46,8 @@ class PlaneBlend:
     version = "0.1.0"
     params = {"planes": 24, "half_window_ticks": 20}  # recorded, and part of the key that a run resumes by
 
-    def fit(self, scene, budget, device, seed, progress, checkpoint=None):
-        """Sweep planes around the point that the cameras look at; the first camera is compared with all others."""
+    def fit(self, scene, request):
+        """Sweep planes around the cameras' common point, compare the first camera with all others, return the model."""
         across = [np.eye(3) - np.outer(c.R[2], c.R[2]) for c in scene.cameras]
         towards = [a @ c.center for a, c in zip(across, scene.cameras, strict=True)]
         meeting = np.linalg.lstsq(sum(across), sum(towards), rcond=None)[0]
@@ -58,7 +58,7 @@ class PlaneBlend:
         for distance in distances:
             seen = [warp(mean, camera, first, distance) for mean, camera in zip(means[1:], others, strict=True)]
             errors.append(np.mean(np.abs(np.array(seen) - means[0])))
-            progress(len(errors), len(distances), f"difference {errors[-1]:.4f}")
+            request.progress(len(errors), len(distances), f"difference {errors[-1]:.4f}")
         return PlaneBlendModel(scene, distances[int(np.argmin(errors))], self.params["half_window_ticks"])
 
 

@@ -9,20 +9,44 @@ import torch
 from torch import Tensor
 
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import RenderOutput
+
+
+@dataclass(frozen=True)
+class DensitySettings(Settings):
+    """When, where and how far Gaussians become denser (prefix `density`)."""
+
+    every: int = 100  # steps
+    until: float = 0.6  # share of a stage
+    grow_gradient: float = 2e-4  # mean screen-space gradient (half-image units) above which a Gaussian is densified
+    split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
+    min_opacity: float = 0.005  # fainter ones are removed
+    max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
+    max_moving_per_pixel: float = 0.4  # the same of those before a background, which is not counted
+    max_gaussians: int = 1_000_000  # whatever the images' size; half as many before a background
+
+    def due(self, done: int, steps: int) -> bool:
+        """Return whether the density changes after `done` of a stage's `steps`."""
+        return done % self.every == 0 and done <= self.until * steps
+
+    def limit(self, width: int, height: int, background: bool) -> int:
+        """Return the most Gaussians for views of a size, with a background behind them or not."""
+        if background:
+            return min(round(self.max_moving_per_pixel * width * height), self.max_gaussians // 2)
+        return min(round(self.max_per_pixel * width * height), self.max_gaussians)
 
 
 @dataclass(eq=False)
 class GradientStatistics:
-    """Screen-space gradients gathered since the last refinement: where the image asks for more Gaussians."""
+    """Screen-space gradients gathered since the last densification: where the image asks for more Gaussians."""
 
     gradient: Tensor  # [N] sum of |dLoss/dmeans2d| in half-image units, as if each view were a loss of its own
     seen: Tensor  # [N] number of views that saw the Gaussian
 
     @classmethod
     def zero(cls, n: int, device: torch.device) -> GradientStatistics:
-        """Nothing gathered yet for `n` Gaussians."""
+        """Return statistics of `n` Gaussians with nothing gathered yet."""
         return cls(torch.zeros(n, device=device), torch.zeros(n, device=device))
 
     def add(self, out: RenderOutput) -> None:
@@ -37,19 +61,19 @@ class GradientStatistics:
         self.seen += visible.sum(0)
 
     def mean(self) -> Tensor:
-        """Mean gradient [N] over the views that saw each Gaussian."""
+        """Return the mean gradient [N] over the views that saw each Gaussian."""
         return self.gradient / self.seen.clamp(min=1)
 
 
-def refine(
+def adapt_density(
     gaussians: Gaussians,
     statistics: GradientStatistics,
-    settings: TrainSettings,
+    settings: DensitySettings,
     scale: float,
     limit: int,
     rng: torch.Generator,
 ) -> list[Edit]:
-    """Edits, to be applied one after the other: move the dead, then densify where the gradient is high.
+    """Return edits to apply one after the other: move the dead, then densify where the gradient is high.
 
     Faint Gaussians are relocated instead of deleted while the number is at its `limit`, and deleted before.
     """

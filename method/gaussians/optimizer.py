@@ -21,7 +21,7 @@ class Decay:
     last: float
 
     def at(self, fraction: float) -> float:
-        """The rate after `fraction` in [0, 1] of the stage."""
+        """Return the learning rate after `fraction` in [0, 1] of the stage."""
         return math.exp((1 - fraction) * math.log(self.first) + fraction * math.log(self.last))
 
 
@@ -34,13 +34,13 @@ class WarmCosine:
     steps: int  # of the whole training
 
     def at(self, step: int) -> float:
-        """The rate of a step."""
+        """Return the learning rate of a step."""
         rise = min(1.0, (step + 1) / self.warm_up)
         return self.peak * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
 
 
 def make_adam(groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> torch.optim.Adam:
-    """Adam with one named group per entry; learning rates are set before each step (`set_rates`, `set_rate`).
+    """Return Adam with one named group per entry; learning rates are set before each step.
 
     eps is 1e-15 as in 3DGS: gradients of single Gaussians are far below Adam's usual 1e-8.
     """
@@ -48,13 +48,13 @@ def make_adam(groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> to
     return torch.optim.Adam(named, lr=0.0, betas=betas, eps=1e-15, fused=True)
 
 
-def set_rates(adam: torch.optim.Adam, rates: dict[str, Decay], fraction: float) -> None:
+def set_learning_rates(adam: torch.optim.Adam, rates: dict[str, Decay], fraction: float) -> None:
     """Set every group's learning rate for the point `fraction` in [0, 1] of a stage."""
     for group in adam.param_groups:
         group["lr"] = rates[group["name"]].at(fraction)
 
 
-def set_rate(adam: torch.optim.Adam, rate: float) -> None:
+def set_learning_rate(adam: torch.optim.Adam, rate: float) -> None:
     """Set one learning rate for all groups."""
     for group in adam.param_groups:
         group["lr"] = rate
@@ -81,7 +81,7 @@ def apply_edit(adam: torch.optim.Adam, edit: Edit) -> Gaussians:
 
 
 def export_state(adam: torch.optim.Adam) -> dict[str, Tensor]:
-    """Moments and step counts as `GROUP.INDEX.KEY` -> tensor."""
+    """Return moments and step counts as `GROUP.INDEX.KEY` -> tensor."""
     return {
         f"{group['name']}.{i}.{key}": value
         for group in adam.param_groups

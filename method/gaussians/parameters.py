@@ -40,7 +40,7 @@ class Gaussians:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
-        """What `tensors` gave."""
+        """Return the Gaussians whose `tensors` these are."""
         extra = {k: v for k, v in tensors.items() if k not in _COMMON}
         return cls(**{k: tensors[k] for k in _COMMON}, extra=extra)
 
@@ -48,24 +48,24 @@ class Gaussians:
         return self.means.shape[0]
 
     def tensors(self) -> dict[str, Tensor]:
-        """The parameters by name."""
+        """Return the parameters by name."""
         return {name: getattr(self, name) for name in _COMMON} | self.extra
 
     def rows(self, index: Tensor) -> Gaussians:
-        """The Gaussians of `index` (integers or a mask), detached."""
+        """Return the Gaussians of `index` (integers or a mask), detached."""
         return Gaussians.from_tensors({k: v.detach()[index] for k, v in self.tensors().items()})
 
     def detached(self) -> Gaussians:
-        """Copies that no gradient reaches and no optimiser changes."""
+        """Return copies that no gradient reaches and no optimiser changes."""
         return Gaussians.from_tensors({k: v.detach().clone() for k, v in self.tensors().items()})
 
     def trainable(self) -> Gaussians:
-        """Detached copies that require gradients."""
+        """Return detached copies that require gradients."""
         leaves = {k: v.detach().clone().contiguous().requires_grad_(True) for k, v in self.tensors().items()}
         return Gaussians.from_tensors(leaves)
 
     def splats(self) -> Splats:
-        """Activated values for the renderer."""
+        """Return activated values for the renderer."""
         return Splats(self.means, self.quats, self.log_scales.exp(), self.logits.sigmoid(), self.colors)
 
 
@@ -79,7 +79,7 @@ class Edit:
 
 
 def concatenate(parts: list[Gaussians]) -> Gaussians:
-    """Gaussians one after another; all have the same extra parameters."""
+    """Return Gaussians one after another; all have the same extra parameters."""
     tensors = [p.tensors() for p in parts]
     return Gaussians.from_tensors({name: torch.cat([t[name] for t in tensors]) for name in tensors[0]})
 
@@ -92,7 +92,7 @@ def from_points(
     scale: float = 1.0,
     device: str = "cpu",
 ) -> Gaussians:
-    """Round Gaussians at points [N, 3] with gray values [N], `scale` x the mean distance of a point's 3 nearest wide.
+    """Return round Gaussians at points [N, 3] with gray values [N]; width: `scale` x mean distance of the 3 nearest.
 
     Raises UserError for fewer than 4 points or values that are not finite.
     """
@@ -124,9 +124,9 @@ def prune(gaussians: Gaussians, keep: Tensor) -> Edit:
 
 
 def densify(gaussians: Gaussians, clone: Tensor, split: Tensor, generator: torch.Generator) -> Edit:
-    """Duplicate the Gaussians of the mask `clone` [N]; replace those of `split` [N] by two drawn from them.
+    """Duplicate the Gaussians of the mask `clone` [N]; replace those of `split` [N] by two samples of them.
 
-    Clones start at the same place and are driven apart by the optimiser; the halves of a split are samples of the
+    Clones start at the same position and are driven apart by the optimiser; the halves of a split are samples of the
     Gaussian with scales divided by 1.6 (3DGS). Old rows keep their order and moments, new rows follow.
     """
     keep, cloned, halved = (torch.nonzero(m)[:, 0] for m in (~split, clone & ~split, split))
@@ -141,9 +141,9 @@ def densify(gaussians: Gaussians, clone: Tensor, split: Tensor, generator: torch
 
 
 def relocate(gaussians: Gaussians, dead: Tensor, generator: torch.Generator) -> Edit:
-    """Move the Gaussians of the mask `dead` [N] onto living ones, drawn in proportion to their opacity.
+    """Move the Gaussians of the mask `dead` [N] onto living ones, sampled in proportion to their opacity.
 
-    A living Gaussian that receives copies shares its opacity and scale with them such that the sum looks as it did
+    A living Gaussian that receives copies shares its opacity and scale with them such that the sum renders as it did
     before (`share`). Its moments and theirs start afresh. The number of Gaussians does not change.
     """
     gone, living = torch.nonzero(dead)[:, 0], torch.nonzero(~dead)[:, 0]
@@ -152,22 +152,22 @@ def relocate(gaussians: Gaussians, dead: Tensor, generator: torch.Generator) -> 
     if not len(gone) or not len(living):
         return Edit(values, source)
     weights = values.logits[living].sigmoid().cpu()
-    drawn = living[torch.multinomial(weights, len(gone), replacement=True, generator=generator).to(living.device)]
-    copies = torch.bincount(drawn, minlength=len(gaussians)) + 1  # [N] Gaussians that now share each place
-    opacity, shrink = share(values.logits[drawn].sigmoid(), copies[drawn])
-    moved = values.rows(drawn)
+    chosen = living[torch.multinomial(weights, len(gone), replacement=True, generator=generator).to(living.device)]
+    copies = torch.bincount(chosen, minlength=len(gaussians)) + 1  # [N] Gaussians that now share each position
+    opacity, shrink = share(values.logits[chosen].sigmoid(), copies[chosen])
+    moved = values.rows(chosen)
     logits, log_scales = torch.logit(opacity), moved.log_scales + shrink.log()[:, None]
-    for index in (gone, drawn):
+    for index in (gone, chosen):
         values.logits[index], values.log_scales[index] = logits, log_scales
     for name, value in values.tensors().items():
         if name not in ("logits", "log_scales"):
             value[gone] = moved.tensors()[name]
-    source[gone], source[drawn] = -1, -1
+    source[gone], source[chosen] = -1, -1
     return Edit(values, source)
 
 
 def share(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity [K] and scale factor [K] of `copies` [K] coincident Gaussians that replace one of `opacity` [K].
+    """Return opacity [K] and scale factor [K] of `copies` [K] coincident Gaussians that replace one of `opacity` [K].
 
     With n copies (Kheradmand et al. 2024, eq. 9): o' = 1 - (1 - o)^(1/n) keeps the opacity at the centre, and
     s'/s = o / sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) keeps the integral along a line.

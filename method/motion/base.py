@@ -1,8 +1,11 @@
-"""What every motion model gives to the trainer."""
+"""The interface of motion models to the trainer."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -10,67 +13,76 @@ from torch import Tensor, nn
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats, Views
 
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What a motion model may know of a scene before it is fitted."""
+    """All that a motion model may know of a scene before it is fitted."""
 
     low: Tensor  # [3] m, corners of the box that holds the points, outliers left out
     high: Tensor  # [3]
     scale: float  # m, the scene's size as the trainer's learning rates see it
     n_ticks: int
     width: int  # px of a view
+    images: float = math.inf  # of a view over the clip, about; a saved model has no use for it
 
 
 class Motion(nn.Module):
     """How Gaussians move. A model says where they are at a time; the rest has defaults that cost nothing.
 
-    What it needs to draw is in its state dict and in `Gaussians.extra`, or follows from the extent and the settings
-    that it was made from: a saved model is built again from these.
+    All that it needs to render is in its state dict and in `Gaussians.extra`, or follows from the extent and the
+    settings that it was made from: a saved model is built again from these.
     """
 
-    moves = True  # False: all times look the same, and only the static stage is trained
-    rests_first = True  # a static stage comes before the moving one
+    defaults: ClassVar[Settings] = Settings()  # of the model's own settings
+    published: ClassVar[Mapping[str, Any]] = {}  # overrides that give the step counts of the publication
+    moves: ClassVar[bool] = True  # False: all times look the same, and only the static stage is trained
+    rests_first: ClassVar[bool] = True  # a static stage comes before the moving one
 
     @property
     def pieces(self) -> int:
         """Parts of the clip, of one length, that have Gaussians of their own; odd."""
         return 1
 
+    @property
+    def guided_rounds(self) -> int:
+        """How many times in a fit the trainer asks for `guide`."""
+        return 0
+
     def splats(self, gaussians: Gaussians, t: float) -> Splats:
-        """What is drawn at t in [0, 1] of the clip, or a piece; differentiable in Gaussians and own parameters."""
+        """Return the splats at t in [0, 1] of the clip, or a piece; differentiable in Gaussians and parameters."""
         raise NotImplementedError
 
     def image(self, image: Tensor, views: Views) -> Tensor:
-        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
         return image[..., 0]
 
-    def attach(self, gaussians: Gaussians, footage: TrainingImages) -> Gaussians:
-        """The first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
+    def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+        """Return the first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
         return gaussians
 
     def born(self, edit: Edit, generator: torch.Generator) -> Edit:
-        """The same edit after a change of the Gaussians that densification added."""
+        """Return the edit after a change of the Gaussians that densification added."""
         return edit
 
     def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
-        """The Gaussians of a piece as those with which the next one begins, or, not forward, the one before it."""
+        """Return the Gaussians with which the next piece begins, or, not forward, the one before."""
         raise NotImplementedError
 
-    def guide(self, gaussians: Gaussians, footage: TrainingImages, generator: torch.Generator) -> Gaussians:
-        """The Gaussians followed by new ones where images are bad; asked for `guided_rounds` times in a fit."""
+    def guide(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
+        """Return the Gaussians followed by new ones where renders are bad."""
         return gaussians
 
-    def rates(self) -> dict[str, Decay]:
-        """Learning rates of the parameters in `Gaussians.extra`, by name."""
+    def learning_rates(self) -> dict[str, Decay]:
+        """Return the learning rates of the parameters in `Gaussians.extra`, by name."""
         return {}
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
-        """The model's own parameters and their learning rates, by group."""
+        """Return the model's own parameters and their learning rates, by group."""
         return {}
 
     def regularizer(self) -> Tensor:
-        """What is added to the loss."""
+        """Return the term that is added to the loss."""
         return torch.zeros(())

@@ -20,10 +20,9 @@ from torch import Tensor
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.spacetime_decoder import rays
-from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.observations.training_images import TrainingImages, known
 from spike4dgs.method.splat import RenderOutput, Views, render
 from spike4dgs.method.splat.ssim import ssim
-from spike4dgs.method.supervision.base import known
 
 VIEWS, TIMES = 2, 5
 PATCH, BAD_PIXELS, BAD_SHARE = 16, 0.6, 0.85
@@ -33,23 +32,23 @@ OPACITY = 0.1
 
 @torch.no_grad()
 def guide(
-    motion: Motion, gaussians: Gaussians, footage: TrainingImages, rng: torch.Generator
+    motion: Motion, gaussians: Gaussians, images: TrainingImages, rng: torch.Generator
 ) -> list[tuple[Gaussians, float]]:
-    """New Gaussians and the time in [0, 1] of the image that asked for them, for each of the two worst views."""
-    indices = np.unique(np.linspace(0, len(footage.ticks) - 1, TIMES).astype(int)).tolist()
+    """Return new Gaussians and the time in [0, 1] of the image that asked for them, for each of the two worst views."""
+    indices = np.unique(np.linspace(0, len(images.ticks) - 1, TIMES).astype(int)).tolist()
     found: list[tuple[float, int, int]] = []  # SSIM, view, time
-    for view in range(len(footage.views)):
-        scores = [(_score(motion, gaussians, footage, view, i), view, i) for i in indices]
+    for view in range(len(images.views)):
+        scores = [(_score(motion, gaussians, images, view, i), view, i) for i in indices]
         found.append(min(scores))
     new = []
     for _, view, index in sorted(found)[:VIEWS]:
-        t = footage.ticks[index] / footage.n_ticks
-        out, image = _draw(motion, gaussians, footage, view, t)
-        picture, camera = known(footage.images[index, view], image), _one(footage.views, view)
-        pixels = bad_pixels(image, picture)
+        t = images.ticks[index] / images.n_ticks
+        out, image = _render(motion, gaussians, images, view, t)
+        target, camera = known(images.images[index, view], image), _one(images.views, view)
+        pixels = bad_pixels(image, target)
         if len(pixels) >= 2:  # four points at least
             points = along_rays(camera, pixels, out, rng)
-            values = picture.flatten()[pixels].repeat(2)
+            values = target.flatten()[pixels].repeat(2)
             new.append(
                 (from_points(points.cpu().numpy(), values.cpu().numpy(), opacity=OPACITY, device=str(points.device)), t)
             )
@@ -60,24 +59,24 @@ def _one(views: Views, view: int) -> Views:
     return Views(views.w2c[[view]], views.K[[view]], views.width, views.height)
 
 
-def _draw(
-    motion: Motion, gaussians: Gaussians, footage: TrainingImages, view: int, t: float
+def _render(
+    motion: Motion, gaussians: Gaussians, images: TrainingImages, view: int, t: float
 ) -> tuple[RenderOutput, Tensor]:
-    """One view at t: everything, and the gray image [H, W]."""
-    camera = _one(footage.views, view)
+    """Return the render of one view at t, and its gray image [H, W]."""
+    camera = _one(images.views, view)
     out = render(motion.splats(gaussians, t), camera, depth=True)
     return out, motion.image(out.image, camera)[0]
 
 
-def _score(motion: Motion, gaussians: Gaussians, footage: TrainingImages, view: int, index: int) -> float:
-    _, image = _draw(motion, gaussians, footage, view, footage.ticks[index] / footage.n_ticks)
-    return float(ssim(image[None], known(footage.images[index, view], image)[None]))
+def _score(motion: Motion, gaussians: Gaussians, images: TrainingImages, view: int, index: int) -> float:
+    _, image = _render(motion, gaussians, images, view, images.ticks[index] / images.n_ticks)
+    return float(ssim(image[None], known(images.images[index, view], image)[None]))
 
 
-def bad_pixels(image: Tensor, picture: Tensor) -> Tensor:
-    """Indices into H * W of the pixels to sample, for a render and its image [H, W]."""
-    height, width = picture.shape
-    error = (image / image.mean() - picture / picture.mean()).abs()
+def bad_pixels(rendered: Tensor, image: Tensor) -> Tensor:
+    """Return indices into H * W of the pixels to sample, for a render and its training image [H, W]."""
+    height, width = image.shape
+    error = (rendered / rendered.mean() - image / image.mean()).abs()
     rows, columns = height // PATCH, width // PATCH
     error = error[: rows * PATCH, : columns * PATCH]
     worst = torch.quantile(error, BAD_PIXELS)
@@ -92,8 +91,8 @@ def bad_pixels(image: Tensor, picture: Tensor) -> Tensor:
 
 
 def along_rays(camera: Views, pixels: Tensor, out: RenderOutput, rng: torch.Generator) -> Tensor:
-    """Two points [2 P, 3] float32 on the rays of one view's pixels [P], at the ends of the depths rendered in `out`."""
-    assert out.depth is not None  # `_draw` asks for it
+    """Return two points [2 P, 3] float32 on the rays of one view's pixels [P], at the ends of the rendered depths."""
+    assert out.depth is not None  # `_render` asks for it
     opaque = out.alpha[0] > 0.5
     depth = out.depth[0][opaque] / out.alpha[0][opaque] if opaque.any() else out.depth.new_ones(1)
     z = torch.quantile(depth, depth.new_tensor([0.05, 0.95])).double()[:, None]  # [2, 1]

@@ -22,11 +22,33 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.mlp import perceptron
+from spike4dgs.method.settings import Settings
+from spike4dgs.method.splat import Splats
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # the planes xy, xz, yz
 _CHANGES = {"means": 3, "log_scales": 3, "quats": 4, "logits": 1, "colors": 1}
+
+
+@dataclass(frozen=True)
+class HexPlaneSettings(Settings):
+    """Sizes, learning rates and regularisers of the motion `hexplane` (prefix `motion`)."""
+
+    cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
+    levels: int = 2  # multires 1, 2
+    cell_ticks: float = 16.0  # time cell
+    features: int = 16  # per plane and level, 4DGS's dynerf preset
+    mlp_width: int = 32  # 4DGS: 128; 32 takes 0.4 of the time of 64
+    lr_grid: float = 1e-2
+    lr_grid_last: float = 1e-3
+    lr_deformation: float = 1e-3
+    lr_deformation_last: float = 1e-4
+    tv_weight: float = 2e-4  # the three weights of 4DGS's dynerf preset
+    smooth_weight: float = 1e-3
+    sparse_weight: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -57,7 +79,7 @@ class HexPlane(nn.Module):
         self.time = nn.ParameterList([nn.Parameter(torch.ones(3, shape.times, r, f)) for r in shape.spatial])
 
     def forward(self, means: Tensor, t: float) -> Tensor:
-        """Features [N, levels * F] of points [N, 3] at the time t in [0, 1]. Points outside the box take its border."""
+        """Return features [N, levels * F] of points [N, 3] at the time t in [0, 1]. Points outside take the border."""
         unit = (means - self.low) / (self.high - self.low)  # [N, 3], the box is [0, 1]^3
         if means.device.type == "cpu":
             from spike4dgs.method.motion.hexplane_cpu import sample_levels
@@ -68,7 +90,7 @@ class HexPlane(nn.Module):
 
     @staticmethod
     def rows_at(plane: Tensor, t: float) -> Tensor:
-        """A time plane [3, T, R, F] at t in [0, 1] -> [3, R, F]; 0 is the first row and 1 the last."""
+        """Return rows [3, R, F] of a time plane [3, T, R, F] at t in [0, 1]; 0 is the first row and 1 the last."""
         position = min(max(t, 0.0), 1.0) * (plane.shape[1] - 1)
         row = min(int(position), max(plane.shape[1] - 2, 0))
         if plane.shape[1] == 1:
@@ -95,8 +117,16 @@ def _bilinear(plane: Tensor, grid: Tensor) -> Tensor:
     return out[0, :, :, 0].T
 
 
-class HexPlaneMotion(nn.Module):
-    """The motion part `hexplane`: features, one linear layer, five heads. Means move in units of `scale` metres."""
+def hexplane_shape(extent: Extent, settings: HexPlaneSettings) -> HexPlaneShape:
+    """Return a shape as fine as images and clip ask: spatial cells by the view's width, time cells by the length."""
+    finest = max(2, round(extent.width / settings.cell_px))
+    spatial = tuple(max(2, finest >> (settings.levels - 1 - level)) for level in range(settings.levels))
+    times = max(4, round(extent.n_ticks / settings.cell_ticks) + 1)
+    return HexPlaneShape(spatial, times, settings.features, settings.mlp_width)
+
+
+class HexPlaneDeformation(nn.Module):
+    """Features, one linear layer, five heads. Means move in units of `scale` metres."""
 
     def __init__(
         self, shape: HexPlaneShape, low: Tensor, high: Tensor, scale: float, generator: torch.Generator
@@ -115,7 +145,7 @@ class HexPlaneMotion(nn.Module):
             nn.init.zeros_(parameter)
 
     def changes(self, means: Tensor, t: float) -> dict[str, Tensor]:
-        """What the field adds to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
+        """Return what is added to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
         final: list[Tensor] = list(self.last.parameters())  # weight, bias, weight, bias, ...
         last = torch.block_diag(*final[0::2]), torch.cat(final[1::2])
         layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
@@ -124,13 +154,43 @@ class HexPlaneMotion(nn.Module):
         return {**parts, "means": parts["means"] * self.scale, "logits": parts["logits"][:, 0]}
 
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
-        """The Gaussians at the time t in [0, 1]."""
+        """Return the Gaussians at the time t in [0, 1]."""
         added = self.changes(gaussians.means, t)
         return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
 
     def mlp(self) -> list[nn.Parameter]:
-        """Parameters of the linear layers."""
+        """Return the parameters of the linear layers."""
         return [*self.trunk.parameters(), *self.hidden.parameters(), *self.last.parameters()]
+
+
+class HexPlaneMotion(HexPlaneDeformation, Motion):
+    """The motion `hexplane`: the deformation with 4DGS's learning rates and regularisers."""
+
+    defaults = HexPlaneSettings()
+    # 4DGS's preset for several views sees 3,000 and 15,000 single images: steps of four here.
+    published = {"trainer.coarse_steps": 750, "trainer.fine_steps": 3750}
+
+    def __init__(self, extent: Extent, settings: HexPlaneSettings, generator: torch.Generator) -> None:
+        super().__init__(hexplane_shape(extent, settings), extent.low, extent.high, extent.scale, generator)
+        self.settings = settings
+
+    def splats(self, gaussians: Gaussians, t: float) -> Splats:
+        """Return the deformed Gaussians."""
+        return self.deform(gaussians, t).splats()
+
+    def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
+        """Return planes and MLP with their learning rates."""
+        s = self.settings
+        return {
+            "grid": (list(self.planes.parameters()), Decay(s.lr_grid, s.lr_grid_last)),
+            "deformation": (self.mlp(), Decay(s.lr_deformation, s.lr_deformation_last)),
+        }
+
+    def regularizer(self) -> Tensor:
+        """Return w_tv * plane TV + w_smooth * time smoothness + w_sparse * time sparsity."""
+        s, space, time = self.settings, list(self.planes.space), list(self.planes.time)
+        smooth = s.smooth_weight * time_smoothness(time) + s.sparse_weight * time_sparsity(time)
+        return s.tv_weight * plane_tv(space) + smooth
 
 
 def plane_tv(space: Sequence[Tensor]) -> Tensor:

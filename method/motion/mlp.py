@@ -1,7 +1,7 @@
 """A three-layer perceptron; on the CPU in blocks of rows that stay in the cache, on two threads of our own.
 
 Torch's layers write every activation to memory and back, and torch's threads cannot be used beside the rasteriser's
-(see `trainer.one_torch_thread`): 34 against 42 CPU-ms for 13,000 rows of width 64, value and gradients, and on both
+(see `torch_state.one_torch_thread`): 34 against 42 CPU-ms for 13,000 rows of width 64, value and gradients, and on both
 cores. The twin is the same three layers in plain torch.
 """
 
@@ -73,7 +73,7 @@ class _Perceptron(torch.autograd.Function):
 
 
 def perceptron(x: Tensor, layers: list[Tensor]) -> Tensor:
-    """W3 relu(W2 relu(W1 x + b1) + b2) + b3 for rows x [N, D]; `layers` is [W1, b1, W2, b2, W3, b3]."""
+    """Return W3 relu(W2 relu(W1 x + b1) + b2) + b3 for rows x [N, D]; `layers` is [W1, b1, W2, b2, W3, b3]."""
     if x.device.type != "cpu" or x.dtype != torch.float32:
         return perceptron_reference(x, layers)
     out: Tensor = _Perceptron.apply(x, *layers)
@@ -81,6 +81,6 @@ def perceptron(x: Tensor, layers: list[Tensor]) -> Tensor:
 
 
 def perceptron_reference(x: Tensor, layers: list[Tensor]) -> Tensor:
-    """The same in plain torch, on any device."""
+    """Return the same in plain torch, on any device."""
     w1, b1, w2, b2, w3, b3 = layers
     return (((x @ w1.T + b1).relu() @ w2.T + b2).relu()) @ w3.T + b3

@@ -33,7 +33,7 @@ class Decoder(nn.Module):
         self.second = nn.Parameter(torch.zeros(1, HIDDEN))
 
     def forward(self, channels: Tensor, views: Views) -> Tensor:
-        """Splatted channels [V, H, W, 3] -> gray radiance [V, H, W]."""
+        """Return gray radiance [V, H, W] of splatted channels [V, H, W, 3]."""
         planes = channels.permute(0, 3, 1, 2).flatten(2)  # [V, 3, H * W], which is how the CPU rasteriser keeps them
         rays = self._from_rays(views).to(planes.dtype)  # [V, 6, H * W]
         hidden = torch.baddbmm(rays, self.first[:, :2].expand(len(planes), -1, -1), planes[:, 1:]).relu()
@@ -41,7 +41,7 @@ class Decoder(nn.Module):
         return gray.view(channels.shape[:3])
 
     def _from_rays(self, views: Views) -> Tensor:
-        """The first layer's sums over ray origin and direction: [V, 6, H * W]."""
+        """Return the first layer's sums over ray origin and direction: [V, 6, H * W]."""
         origin, direction = rays(views)
         o = (origin.float() - self.center) / self.scale  # [V, 3]
         by_origin = o @ self.first[:, 2:5].T  # [V, 6]
@@ -49,7 +49,7 @@ class Decoder(nn.Module):
 
 
 def rays(views: Views) -> tuple[Tensor, Tensor]:
-    """Camera centres [V, 3] and float32 unit directions [V, 3, H * W] of the pixels' rays, in world coordinates.
+    """Return camera centres [V, 3] and float32 unit directions [V, 3, H * W] of the pixels' rays, in world coordinates.
 
     Directions are sums of a row's and a column's vector: a seventh of the time of a product with all pixels in float64.
     """

@@ -1,9 +1,10 @@
-"""What a fit looks at."""
+"""The images that a fit compares with."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from spike4dgs.method.splat import Views
@@ -17,3 +18,8 @@ class TrainingImages:
     ticks: tuple[int, ...]  # ascending
     images: Tensor  # [T, C, H, W] linear radiance
     n_ticks: int  # length of the clip
+
+
+def known(image: Tensor, rendered: Tensor) -> Tensor:
+    """Return `image`, with the values of `rendered` of the same shape, without gradient, where it is no number."""
+    return torch.where(image.isfinite(), image, rendered.detach())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from spike4dgs.method.radiance_field.fit import PUBLISHED, RADIANCE_FIELD, RadianceFieldSettings, fit_radiance_field
+from spike4dgs.method.radiance_field.fit import RADIANCE_FIELD, fit_radiance_field
+from spike4dgs.method.radiance_field.settings import PUBLISHED, FieldSpikeSettings, RadianceFieldSettings
 
-__all__ = ["PUBLISHED", "RADIANCE_FIELD", "RadianceFieldSettings", "fit_radiance_field"]
+__all__ = ["PUBLISHED", "RADIANCE_FIELD", "FieldSpikeSettings", "RadianceFieldSettings", "fit_radiance_field"]

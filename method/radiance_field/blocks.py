@@ -1,8 +1,8 @@
 """A function of rows, evaluated in blocks on two threads of our own, forwards and backwards.
 
 A block's activations stay near the cache, and each thread walks its own blocks' graphs: torch's threads would share
-one large layer at a time, and cannot be used beside the HexPlane kernels (`trainer.one_torch_thread`). The twin is the
-same function called on all rows.
+one large layer at a time, and cannot be used beside the HexPlane kernels (`torch_state.one_torch_thread`). The twin is
+the same function called on all rows.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _cuts(rows: int) -> list[slice]:
-    """Blocks of equal size, as many for each part."""
+    """Return blocks of equal size, as many for each part."""
     count = PARTS * -(-rows // (PARTS * BLOCK))
     edges = [rows * i // count for i in range(count + 1)]
     return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
@@ -73,7 +73,7 @@ class _Blocks(torch.autograd.Function):
 
 
 def in_blocks(function: Rows, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    """function(*inputs), whose rows do not depend on each other, by blocks; gradients go to `inputs` and `parameters`.
+    """Return function(*inputs), whose rows are independent, by blocks; gradients go to `inputs` and `parameters`.
 
     `parameters` are all leaves that the function uses, and it must use each of them.
     """

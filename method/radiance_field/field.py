@@ -15,14 +15,14 @@ THIN = 3.0  # at first a path of one unit is 5 % opaque
 
 
 def encode_position(x: Tensor, frequencies: int) -> Tensor:
-    """gamma(x) = (x, sin(2^k pi x), cos(2^k pi x) for k < frequencies) for x [N, D] -> [N, D (1 + 2 frequencies)]."""
+    """Return (x, sin(2^k pi x), cos(2^k pi x) for k < frequencies) [N, D (1 + 2 frequencies)] for x [N, D]."""
     scale = math.pi * 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
     angle = (x[:, None, :] * scale[:, None]).flatten(1)  # [N, frequencies * D]
     return torch.cat([x, angle.sin(), angle.cos()], -1)
 
 
 def encoded_size(dimensions: int, frequencies: int) -> int:
-    """Length of an encoded position."""
+    """Return the length of an encoded position."""
     return dimensions * (1 + 2 * frequencies)
 
 
@@ -68,11 +68,11 @@ class Field(nn.Module):
         return h
 
     def density_rows(self, x: Tensor) -> Tensor:
-        """Density [N, 1] at points [N, 3]."""
+        """Return density [N, 1] at points [N, 3]."""
         return functional.softplus(self.density(self._trunk(x)) - THIN)
 
     def rows(self, x: Tensor, view: Tensor) -> Tensor:
-        """Density and value [N, 2] at points [N, 3] seen along encoded directions `view` [N, E]."""
+        """Return density and value [N, 2] at points [N, 3] seen along encoded directions `view` [N, E]."""
         h = self._trunk(x)
         density = functional.softplus(self.density(h) - THIN)
         seen = self.branch(torch.cat([self.feature(h), view], -1)).relu()
@@ -80,7 +80,7 @@ class Field(nn.Module):
 
 
 class Deformation(nn.Module):
-    """Where a point seen at time t is in the canonical field: x + D(H(x, t)), as 4DGS moves Gaussians.
+    """The canonical point of a point seen at time t: x + D(H(x, t)), as 4DGS moves Gaussians.
 
     H is the HexPlane of x and t over a box, D a linear layer and one head (ReLU, linear, ReLU, linear), whose last
     layer starts at zero: nothing moves at first. Points move in units of `scale` metres.
@@ -102,9 +102,9 @@ class Deformation(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, points: Tensor, t: float) -> Tensor:
-        """Canonical points [N, 3] m of points [N, 3] m seen at t in [0, 1]."""
+        """Return canonical points [N, 3] m of points [N, 3] m seen at t in [0, 1]."""
         return points + self.scale * perceptron(self.planes(points, t), self.mlp())
 
     def mlp(self) -> list[Tensor]:
-        """Weights and biases of the linear layers."""
+        """Return weights and biases of the linear layers."""
         return [*self.first.parameters(), *self.hidden.parameters(), *self.last.parameters()]

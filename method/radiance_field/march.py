@@ -1,4 +1,4 @@
-"""Ray marching: where a ray is sampled, and what its samples add up to (Max 1995; Mildenhall et al. 2020).
+"""Ray marching: sampling of rays, and sums of their samples (Max 1995; Mildenhall et al. 2020).
 
 A sample's place on its ray is a depth z along the camera's axis between two planes, which hold the scene. The far
 plane is opaque: whatever light is left there sees the field's value on it.
@@ -29,7 +29,7 @@ class Rays:
         return Rays(self.origins[index], self.directions[index])
 
     def at(self, z: Tensor) -> Tensor:
-        """Points [R, n, 3] m at depths z [R, n]."""
+        """Return points [R, n, 3] m at depths z [R, n]."""
         return self.origins[:, None] + z[..., None] * self.directions[:, None]
 
     @property
@@ -39,22 +39,22 @@ class Rays:
 
 
 def camera_rays(camera: Camera, device: str = "cpu") -> Rays:
-    """The rays of all pixels of a camera, row by row, through the pixels' centres."""
+    """Return the rays of all pixels of a camera, row by row, through the pixels' centres."""
     v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    looks = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
-    directions = torch.as_tensor(looks, dtype=torch.float32, device=device)
+    towards = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+    directions = torch.as_tensor(towards, dtype=torch.float32, device=device)
     origin = torch.as_tensor(camera.center, dtype=torch.float32, device=device)
     return Rays(origin.expand(len(directions), 3), directions)
 
 
 def spread(rays: int, count: int, generator: torch.Generator | None) -> Tensor:
-    """Places [rays, count] in [0, 1]: one in each of `count` bins, at random, or in its middle without generator."""
+    """Return places [rays, count] in [0, 1]: one in each of `count` bins, random, or its middle without generator."""
     within = torch.rand(rays, count, generator=generator) if generator else torch.full((rays, count), 0.5)
     return (torch.arange(count) + within) / count
 
 
 def resample(places: Tensor, weights: Tensor, u: Tensor) -> Tensor:
-    """Places [R, m] distributed as the weights along the rays: the inverse of their piecewise linear CDF at u [R, m].
+    """Return places [R, m] distributed as the weights along the rays: their inverse piecewise linear CDF at u [R, m].
 
     `places` [R, n] ascend, `weights` [R, n] are their samples' shares of the image. A sample's weight is spread
     evenly over the stretch between the middles of its neighbours, so that the ends' weights are not used (as
@@ -71,7 +71,7 @@ def resample(places: Tensor, weights: Tensor, u: Tensor) -> Tensor:
 
 
 def weigh(density: Tensor, z: Tensor, lengths: Tensor) -> Tensor:
-    """Share [R, n] of each sample in its ray's image; the last one takes what is left, so that they sum to 1.
+    """Return each sample's share [R, n] in its ray's image; the last one takes the rest, so that they sum to 1.
 
     w_i = T_i (1 - exp(-density_i delta_i)), T_i = exp(-sum_{j<i} density_j delta_j), where delta_i is the distance to
     the next sample: `density` [R, n] in 1/m, depths z [R, n] ascending, `lengths` [R] metres per metre of depth.

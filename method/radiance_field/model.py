@@ -1,4 +1,4 @@
-"""Everything that is learned, and how a ray's two images come out of it: hierarchical sampling with skipping."""
+"""The dynamic field and its rendering: hierarchical sampling that skips empty space."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from spike4dgs.method.radiance_field.blocks import in_blocks
 from spike4dgs.method.radiance_field.field import Deformation, Field, encode_position
 from spike4dgs.method.radiance_field.march import Rays, camera_rays, resample, spread, weigh
 from spike4dgs.method.radiance_field.occupancy import Occupancy
-from spike4dgs.method.trainer import one_torch_thread
+from spike4dgs.method.torch_state import one_torch_thread
 
 RAYS_AT_ONCE = 2048  # in a render: bounds memory at about 100 MB
 
@@ -46,7 +46,7 @@ class FieldShape:
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Where things are: depths between which rays are sampled, the box of all samples, and the box of the points."""
+    """The extent of a scene: depths between which rays are sampled, the box of all samples, the box of the points."""
 
     near: float  # m along the cameras' axes
     far: float
@@ -59,14 +59,14 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """K samples of R rays: row and column in a table [R, n], and where they are in the canonical field."""
+    """K samples of R rays: row and column in a table [R, n], and their canonical points."""
 
     ray: Tensor  # [K] int64
     column: Tensor  # [K] int64
     points: Tensor  # [K, 3] in [-1, 1]
 
     def and_also(self, others: Samples) -> Samples:
-        """These samples and others of the same rays."""
+        """Return these samples and others of the same rays."""
         pairs = zip((self.ray, self.column, self.points), (others.ray, others.column, others.points), strict=True)
         return Samples(*(torch.cat(pair) for pair in pairs))
 
@@ -85,12 +85,12 @@ class DynamicField(nn.Module):
         self.occupancy = Occupancy(bounds.low, bounds.high, shape.occupancy_cells, shape.occupancy_least)
 
     def parameter_groups(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-        """Parameters of both fields, of the deformation's planes, and of its layers."""
+        """Return the parameters of both fields, of the deformation's planes, and of its layers."""
         fields: list[Tensor] = [*self.coarse.parameters(), *self.fine.parameters()]
         return fields, list(self.deformation.planes.parameters()), self.deformation.mlp()
 
     def trace(self, rays: Rays, t: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """The coarse and the fine field's radiance [R] along rays at t in [0, 1].
+        """Return the coarse and the fine field's radiance [R] along rays at t in [0, 1].
 
         Samples are random with a generator, and in the middles of their bins without.
         """
@@ -113,26 +113,26 @@ class DynamicField(nn.Module):
         return coarse, (weights * value).sum(-1)
 
     def depth(self, places: Tensor) -> Tensor:
-        """Depths in metres of places in [0, 1] between the near and the far plane."""
+        """Return depths in metres of places in [0, 1] between the near and the far plane."""
         return self.bounds.near + (self.bounds.far - self.bounds.near) * places
 
-    def look(self, t: float, share: float, generator: torch.Generator) -> None:
-        """Let the occupancy grid look at a share of its cells at t in [0, 1]."""
+    def update_occupancy(self, t: float, share: float, generator: torch.Generator) -> None:
+        """Evaluate a share of the occupancy grid's cells at t in [0, 1]."""
 
         def density(points: Tensor) -> Tensor:
             return in_blocks(self.fine.density_rows, [self._canonical(points, t)], [])[:, 0] / self.bounds.scale
 
-        self.occupancy.look(density, share, generator)
+        self.occupancy.update(density, share, generator)
 
     def _samples(self, rays: Rays, places: Tensor, t: float, first: int) -> Samples:
-        """The samples at `places` [R, n] that need a network, as columns `first` and following."""
+        """Return the samples at `places` [R, n] that need a network, as columns `first` and following."""
         points = rays.at(self.depth(places))
         kept = self.occupancy(points) | (places == 1)  # the far plane is no empty space
         ray, column = torch.nonzero(kept, as_tuple=True)
         return Samples(ray, first + column, self._canonical(points[kept], t))
 
     def _canonical(self, points: Tensor, t: float) -> Tensor:
-        """Canonical points [K, 3] in [-1, 1] of points [K, 3] m at t; where nothing moves they stay."""
+        """Return canonical points [K, 3] in [-1, 1] of points [K, 3] m at t; where nothing moves they stay."""
         index = torch.nonzero(self.occupancy.moves(points))[:, 0]
         moved = points.index_copy(0, index, self.deformation(points[index], t))
         return 2 * (moved - self.occupancy.low) / (self.occupancy.high - self.occupancy.low) - 1
@@ -143,14 +143,14 @@ def _unit(directions: Tensor) -> Tensor:
 
 
 def _evaluate(field: Field, samples: Samples, view: Tensor, columns: int) -> tuple[Tensor, Tensor]:
-    """Density and value, each [R, columns], of a field at the samples, for encoded views [R, E]; 0 elsewhere."""
+    """Return density and value, each [R, columns], of a field at the samples, for encoded views [R, E]; 0 elsewhere."""
     out = in_blocks(field.rows, [samples.points, view[samples.ray]], list(field.parameters()))  # [K, 2]
     full = out.new_zeros(len(view), columns, 2).index_put((samples.ray, samples.column), out)
     return full[..., 0], full[..., 1]
 
 
 def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Tensor, scale: float) -> Bounds:
-    """Near and far from the depths of the points [N, 3] that the cameras see, outliers left out, with a margin.
+    """Return near and far from the depths of the points [N, 3] in view, outliers left out, with a margin, and boxes.
 
     0.5 % of the points at either end are left out, as a plane sweep has outliers; the margin is a twentieth of the
     range. `low`, `high` and `scale` are the extent's.
@@ -190,7 +190,7 @@ class RadianceModel:
 
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
-        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         t = min(max(t_us / self.duration_us, 0.0), 1.0)
         rays = camera_rays(camera, self.device)
         with one_torch_thread():
@@ -209,7 +209,7 @@ class RadianceModel:
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> RadianceModel:
-        """What `save` wrote. Raises KeyError, TypeError or RuntimeError for another version's."""
+        """Return the model that `save` wrote. Raises KeyError, TypeError or RuntimeError for another version's."""
         config: dict[str, Any] = dict(file.config)
         planes = {**config["shape"]["deformation"], "spatial": tuple(config["shape"]["deformation"]["spatial"])}
         shape = FieldShape(**{**config["shape"], "deformation": HexPlaneShape(**planes)})

@@ -1,8 +1,9 @@
-"""Which parts of space are empty at all times, so that samples there need no network (Mueller et al. 2022)."""
+"""A grid of the space that is empty at all times, where samples need no network (Mueller et al. 2022)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,8 +12,20 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.settings import Settings
 
-DECAY = 0.8  # of the remembered density at each look at a cell: matter that has gone is forgotten after a few looks
+DECAY = 0.8  # of the remembered density at each update of a cell: matter that has gone is forgotten after a few updates
+
+
+@dataclass(frozen=True)
+class OccupancySettings(Settings):
+    """Size and updates of the grid (prefix `occupancy`)."""
+
+    cells: int = 48
+    begin: float = 0.2  # share of the steps before the first update: the field knows nothing yet
+    every: int = 16  # steps between two updates
+    share: float = 0.15  # of the cells in one update
+    least: float = 0.02  # opacity of a cell below which it counts as empty
 
 
 class Occupancy(nn.Module):
@@ -35,28 +48,28 @@ class Occupancy(nn.Module):
         self.cells, self.least = cells, least
         self.register_buffer("low", low.float().clone())
         self.register_buffer("high", high.float().clone())
-        self.register_buffer("density", torch.full((cells**3,), torch.inf))  # 1/m; inf: not looked at yet
+        self.register_buffer("density", torch.full((cells**3,), torch.inf))  # 1/m; inf: not evaluated yet
         for mask in ("occupied", "candidates", "movable"):
             self.register_buffer(mask, torch.ones(cells**3, dtype=torch.bool))
 
     def forward(self, points: Tensor) -> Tensor:
-        """Whether there may be something at points [..., 3] m."""
+        """Return whether there may be something at points [..., 3] m."""
         inside, index = self.cell_of(points)
         return ~inside | self.occupied[index]
 
     def moves(self, points: Tensor) -> Tensor:
-        """Whether something at points [..., 3] m may be moving."""
+        """Return whether something at points [..., 3] m may be moving."""
         inside, index = self.cell_of(points)
         return inside & self.movable[index]
 
     def cell_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Whether points [..., 3] m are inside the box, and the flat index of the nearest cell."""
+        """Return whether points [..., 3] m are inside the box, and the flat index of the nearest cell."""
         unit = (points - self.low) / (self.high - self.low)
         x, y, z = (unit * self.cells).long().clamp(0, self.cells - 1).unbind(-1)
         return ((unit >= 0) & (unit <= 1)).all(-1), (x * self.cells + y) * self.cells + z
 
-    def places(self, index: Tensor, within: Tensor | float = 0.5) -> Tensor:
-        """Points [N, 3] m in the cells of flat `index` [N]; `within` [N, 3] in [0, 1] is the place in the cell."""
+    def positions(self, index: Tensor, within: Tensor | float = 0.5) -> Tensor:
+        """Return points [N, 3] m in the cells of flat `index` [N], at `within` [N, 3] in [0, 1] of each cell."""
         n = self.cells
         corner = torch.stack([index // n**2, index // n % n, index % n], -1)
         return self.low + (corner + within) / n * (self.high - self.low)
@@ -71,35 +84,35 @@ class Occupancy(nn.Module):
         self.occupied.copy_(self.candidates)
 
     @torch.no_grad()
-    def look(self, density: Callable[[Tensor], Tensor], share: float, generator: torch.Generator) -> None:
-        """Look at a random place in each of a random `share` of the candidates.
+    def update(self, density: Callable[[Tensor], Tensor], share: float, generator: torch.Generator) -> None:
+        """Evaluate a random point in each of a random `share` of the candidates.
 
         `density` gives 1/m [N] at points [N, 3] m.
         """
         cells = torch.nonzero(self.candidates)[:, 0]
         count = round(share * len(cells))
         index = cells[torch.randperm(len(cells), generator=generator)[:count].to(cells.device)]
-        found = density(self.places(index, torch.rand(len(index), 3, generator=generator).to(self.low)))
+        found = density(self.positions(index, torch.rand(len(index), 3, generator=generator).to(self.low)))
         old = self.density[index]
         self.density[index] = torch.where(old.isinf(), found, torch.maximum(DECAY * old, found))
         diagonal = float((self.high - self.low).norm()) / self.cells
         self.occupied.copy_(self.candidates & self._grown(-torch.expm1(-self.density * diagonal) > self.least))
 
     def _grown(self, mask: Tensor) -> Tensor:
-        """A mask [cells^3] and the neighbours of its cells."""
+        """Return a mask [cells^3] and the neighbours of its cells."""
         cube = mask.view(1, 1, *[self.cells] * 3)
         return functional.max_pool3d(cube.float(), 3, 1, 1).flatten() > 0
 
 
 def may_move(grid: Occupancy, cameras: Sequence[Camera], moving: NDArray[np.bool_]) -> Tensor:
-    """Cells [cells^3] whose centres lie on changing pixels `moving` [C, H, W] in all views that see them."""
-    centers = grid.places(torch.arange(grid.cells**3, device=grid.low.device)).double().cpu().numpy()
-    seen, still = np.zeros(len(centers), bool), np.zeros(len(centers), bool)
+    """Return the cells [cells^3] whose centres lie on changing pixels `moving` [C, H, W] in all views that see them."""
+    centers = grid.positions(torch.arange(grid.cells**3, device=grid.low.device)).double().cpu().numpy()
+    seen, static = np.zeros(len(centers), bool), np.zeros(len(centers), bool)
     for camera, mask in zip(cameras, moving, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             uv, z = camera.project(centers)
             inside = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
         u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
         seen |= inside
-        still |= inside & ~mask[v, u]
-    return torch.from_numpy(seen & ~still).to(grid.low.device)
+        static |= inside & ~mask[v, u]
+    return torch.from_numpy(seen & ~static).to(grid.low.device)

@@ -1,14 +1,16 @@
-"""What every supervision gives to the trainer."""
+"""The interface of supervisions to the trainer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
+from spike4dgs.method.observations.training_images import known
+from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.ssim import ssim
 
 
@@ -27,27 +29,24 @@ Render = Callable[[float], Tensor]  # t in [0, 1] -> the sample's views at that 
 
 
 class Supervision(nn.Module):
-    """A loss, with parameters of its own where it needs some."""
+    """A loss, with parameters of its own where it needs some. It is made from (settings, scene)."""
+
+    defaults: ClassVar[Settings] = Settings()  # of the supervision's own settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
-        """The scalar loss of a training step."""
+        """Return the scalar loss of a training step."""
         raise NotImplementedError
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
-        """The parameters that are trained beside the Gaussians, and their learning rates, by group."""
+        """Return the parameters that are trained beside the Gaussians, and their learning rates, by group."""
         return {}
 
 
-def known(picture: Tensor, image: Tensor) -> Tensor:
-    """The image, and the rendered `image` of the same shape, without its gradient, where the image is no number."""
-    return torch.where(picture.isfinite(), picture, image.detach())
-
-
-def difference(image: Tensor, picture: Tensor, w: float) -> Tensor:
-    """(1 - w) mean |image - image| + w (1 - SSIM) of batches [V, H, W].
+def difference(rendered: Tensor, image: Tensor, w: float) -> Tensor:
+    """Return (1 - w) mean |rendered - image| + w (1 - SSIM) of batches [V, H, W].
 
     A pixel of `image` that is no number counts as met.
     """
-    picture = known(picture, image)
-    absolute = (image - picture).abs().mean()
-    return (1 - w) * absolute + w * (1 - ssim(image, picture)) if w else absolute
+    image = known(image, rendered)
+    absolute = (rendered - image).abs().mean()
+    return (1 - w) * absolute + w * (1 - ssim(rendered, image)) if w else absolute

@@ -1,4 +1,4 @@
-"""What the losses on spikes share: recorded spikes around a tick, the neuron, and what each camera does to light."""
+"""Parts that the losses on spikes share: recorded spikes around a tick, the neuron, and each camera's response."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class SpikeCameras(nn.Module):
         self.register_buffer("dark", torch.from_numpy(dark), persistent=False)
 
     def rate(self, image: Tensor, views: tuple[int, ...]) -> Tensor:
-        """Charge per tick [V, H, W] of the cameras `views` that see the radiance `image` [V, H, W]."""
+        """Return the charge per tick [V, H, W] of the cameras `views` that see the radiance `image` [V, H, W]."""
         chosen = list(views)
         return image * self.white[chosen] + self.dark[chosen]
 
 
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:
-    """Spikes [V, H, W] float32 that the sample's views recorded in `ticks` ticks around its tick, and their number.
+    """Return spikes [V, H, W] float32 that the sample's views recorded in `ticks` ticks around its tick, and the ticks.
 
     At the clip's ends the window is what is left of it: at least the tick itself.
     """
@@ -56,20 +56,20 @@ def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, 
 
 
 def random_charge(like: Tensor, step: int) -> Tensor:
-    """Charges in [0, 1) of neurons before their first tick, of the shape of `like`, a function of the step.
+    """Return charges in [0, 1) of neurons before their first tick, of the shape of `like`, a function of the step.
 
-    A camera's charge at a window's start is anything from 0 to 1. Drawn anew for each step, it makes the expected loss
+    A camera's charge at a window's start is anything from 0 to 1. Random anew for each step, it makes the expected loss
     least at the right rate; a fixed one would leave rates free within a spike per window.
     """
     return torch.rand(like.shape, generator=torch.Generator().manual_seed(step)).to(like)
 
 
 def fire(rate: Tensor, charge: Tensor, ticks: int) -> Tensor:
-    """Spikes in `ticks` ticks of neurons that gather `rate` per tick from `charge` in [0, 1); threshold 1.
+    """Return the spikes in `ticks` ticks of neurons that gather `rate` per tick from `charge` in [0, 1); threshold 1.
 
     A neuron that loses 1 with each spike fires floor(charge + ticks rate) times while the rate lies in [0, 1], never
     below, at every tick above. The gradient is straight through, ticks per unit of rate: exactly that of the count's
-    mean over all charges where the rate lies in (0, 1); beyond, it still draws the rate back.
+    mean over all charges where the rate lies in (0, 1); beyond, it still pulls the rate back.
     """
     spikes: Tensor = _Fire.apply(rate, charge, ticks)
     return spikes

@@ -11,7 +11,7 @@ steps up to the last spike: d mean(S) / dI = t_last / (M theta), and 0 where it 
 
 Both are in closed form here, O(1) for any M, because I is constant; `unrolled` in the tests is the loop.
 
-What to know of it:
+Properties:
 
 - The reset. A hard reset loses the charge above the threshold, so that only rates 1/n exist: 1/n < I < 1/(n-1) gives
   1/n. The error is up to half of I (just below 1) and 12 % on average for I in (0, 0.5], with a slope of 0 between the
@@ -60,7 +60,7 @@ class _FiringRate(torch.autograd.Function):
 
 
 def firing_rate(current: Tensor, start: Tensor, steps: int, reset: Reset = "subtract") -> Tensor:
-    """Mean spikes per step of neurons that gather `current` (any shape, charge per step) for `steps` steps.
+    """Return the mean spikes per step of neurons that gather `current` (any shape, charge per step) for `steps` steps.
 
     `start` is the charge before the first step, in [0, 1), of the same shape. The gradient is the surrogate's. A neuron
     fires at most once a step: currents above the threshold give 1, and still pass the gradient on.
@@ -70,10 +70,10 @@ def firing_rate(current: Tensor, start: Tensor, steps: int, reset: Reset = "subt
 
 
 def encode(rate: Tensor) -> Tensor:
-    """(rate + FLOOR)^(1/2.2), the scale on which the publication compares rates."""
+    """Return (rate + FLOOR)^(1/2.2), the scale on which the publication compares rates."""
     return (rate + FLOOR) ** GAMMA
 
 
 def spike_loss(rate: Tensor, recorded: Tensor) -> Tensor:
-    """Mean squared error of simulated and recorded mean spikes per step, after the published gamma."""
+    """Return the mean squared error of simulated and recorded mean spikes per step, after the published gamma."""
     return (encode(rate) - encode(recorded)).square().mean()

@@ -16,27 +16,41 @@ that a(x) alone could explain what it sees.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
 from spike4dgs.method.supervision.spike_cameras import fire, random_charge, recorded
+
+
+@dataclass(frozen=True)
+class SpikeRenderSettings(Settings):
+    """Numbers of the supervision `spike-render` (prefix `supervision`)."""
+
+    spike_ticks: int = 40  # ticks of a recorded window, as many as TFP's has
+    ssim_weight: float = 0.2  # 3DGS's lambda
+    lr_noise: float = 1e-3
+    noise_weight: float = 30.0  # of the noise embedding's mean square; with 0.1 it takes the images' edges: 7 dB lost
 
 
 class SpikeRender(Supervision):
     """The loss of the module's text, for the training views of one scene."""
 
-    def __init__(self, settings: TrainSettings, scene: TrainingScene) -> None:
+    defaults = SpikeRenderSettings()
+
+    def __init__(self, settings: SpikeRenderSettings, scene: TrainingScene) -> None:
         super().__init__()
         self.settings, self.scene = settings, scene
         first = scene.streams[0]
         self.noise = nn.Parameter(torch.zeros(len(scene.streams), 2, first.height, first.width))  # a and b
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
-        """The loss of one rendered sample."""
+        """Return the loss of one rendered sample."""
         s, gain = self.settings, self.scene.radiance_gain
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         image = render(sample.t)
@@ -48,6 +62,6 @@ class SpikeRender(Supervision):
         return loss + s.noise_weight * noise.square().mean()
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
-        """The noise embedding."""
-        rate = self.settings.noise_rate
+        """Return the noise embedding and its learning rate."""
+        rate = self.settings.lr_noise
         return {"noise": ([self.noise], Decay(rate, rate))}

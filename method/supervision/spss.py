@@ -4,7 +4,7 @@
     S(window) = phi_s(S(t)),   phi_s: (H, W, 1) -> (H, W, Gamma)     eq. 16, "a one-layer MLP"
     L = |avg S(window) - avg R(window)| + |std S(window) - std R(window)|     eq. 17, means over pixels; R: recorded
 
-What is public is the text of these equations. What it leaves open, and how it is read here:
+Public is the text of these equations. It leaves open, and is read here as follows:
 
 - The neuron: subtractive reset, random charge at the start of each step (`spike_cameras.fire`).
 - "A single spike", the value (H, W, 1) that the neuron gives for one rendered image, is its mean spikes over
@@ -18,7 +18,7 @@ What is public is the text of these equations. What it leaves open, and how it i
   variance is 0, so FLOOR is added to both variances.
 - Gamma = `spike_ticks`. At the clip's ends R's window is shorter; averages and deviations are compared all the same.
 
-What to know of it. Spikes are 0 or 1, so that std R = sqrt(a (1 - a)) with a = avg R, exactly: the second term of eq.
+Properties. Spikes are 0 or 1, so that std R = sqrt(a (1 - a)) with a = avg R, exactly: the second term of eq.
 17 holds nothing that the first does not. It weights it, most where pixels are dark and nothing at a = 1/2.
 
 phi_s sees one number per pixel, and that number has neuron_ticks + 1 values. It is evaluated once for each of them, not
@@ -27,13 +27,15 @@ for each pixel: 257 rows instead of 100,000 for 4 views of 200x125, with the sam
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
+from spike4dgs.method.supervision.spike import SpikeSettings
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, fire, random_charge, recorded
 
 FLOOR = 1e-6  # of variances: a deviation of 1/1000, where one spike in 40 ticks makes 0.16
@@ -42,17 +44,26 @@ FLOOR = 1e-6  # of variances: a deviation of 1/1000, where one spike in 40 ticks
 STEEPNESS = 8.0
 
 
+@dataclass(frozen=True)
+class SpikeVariationSettings(SpikeSettings):
+    """Windows as those of `spike`, and phi_s (prefix `supervision`)."""
+
+    lr_phi: float = 1e-2
+
+
 class SpikeVariation(Supervision):
     """The loss of the module's text, for the training views of one scene."""
 
-    def __init__(self, settings: TrainSettings, scene: TrainingScene) -> None:
+    defaults = SpikeVariationSettings()
+
+    def __init__(self, settings: SpikeVariationSettings, scene: TrainingScene) -> None:
         super().__init__()
         self.settings, self.scene, self.cameras = settings, scene, SpikeCameras(scene)
         self.phi = nn.Linear(1, settings.spike_ticks)
         first_sequence(self.phi)
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
-        """The loss of one rendered sample."""
+        """Return the loss of one rendered sample."""
         s = self.settings
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         rate = self.cameras.rate(render(sample.t), sample.views)
@@ -63,8 +74,8 @@ class SpikeVariation(Supervision):
         return (average - seen).abs().mean() + (deviation - spread).abs().mean()
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
-        """phi_s."""
-        return {"phi": (list(self.phi.parameters()), Decay(self.settings.phi_rate, self.settings.phi_rate))}
+        """Return phi_s and its learning rate."""
+        return {"phi": (list(self.phi.parameters()), Decay(self.settings.lr_phi, self.settings.lr_phi))}
 
 
 @torch.no_grad()
@@ -76,7 +87,7 @@ def first_sequence(phi: nn.Linear) -> None:
 
 
 def window_moments(phi: nn.Linear, spike: Tensor, levels: int) -> tuple[Tensor, Tensor]:
-    """Average and standard deviation over the window sigmoid(phi(spike)) of every pixel.
+    """Return average and standard deviation over the window sigmoid(phi(spike)) of every pixel.
 
     `spike` holds multiples of 1 / levels in [0, 1]. Values and gradients, in `spike` and in phi's parameters, are those
     of phi applied to each pixel: they are taken from a table of levels + 1 rows.

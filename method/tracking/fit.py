@@ -1,19 +1,19 @@
 """Dynamic 3D Gaussians (Luiten et al. 2024), the motion `tracking`: one time after another, each from the last.
 
-At the first time all Gaussians are optimised and densified by the one trainer. Then their sizes and opacities stand.
+At the first time all Gaussians are optimised and densified by the one trainer. Then sizes and opacities are fixed.
 At each further time the moving ones go on with the velocity that they had, x + (x - x') and likewise the rotations,
 and are optimised against that time's images for a few steps of a fresh Adam, with the terms of `tracking_losses`:
 
     1.0 image + 3.0 silhouette + 4.0 rigidity + 4.0 rotation + 2.0 isometry + 20 background + 0.01 colour,
     image = 0.8 mean |I - P| + 0.2 (1 - SSIM(I, P))
 
-What differs from the publication, and why:
+Differences from the publication, and why:
 
 - The first time is the middle of the clip and tracking goes outward both ways (`start` 0 is the published order): the
   initialisation knows moving things best there, and half as many steps add up their errors.
-- Its masks are silhouettes of each instant, ours hold all places that a thing passes (`foreground`). So the silhouette
+- Its masks are silhouettes of each instant, ours hold every pixel that a thing passes (`foreground`). So the silhouette
   term only forbids moving Gaussians to be seen where nothing ever moves.
-- Gaussians of the background stand still, the limit of an infinite background weight, and only the part of the
+- Gaussians of the background are fixed, the limit of an infinite background weight, and only the part of the
   images in which something moves is rendered again. `freeze_background` False gives the published soft term.
 - A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
   stays where it was at the time before.
@@ -32,14 +32,16 @@ from torch import Tensor
 
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
-from spike4dgs.method.gaussians.optimizer import Decay, make_adam, set_rates
+from spike4dgs.method.gaussians.density import DensitySettings
+from spike4dgs.method.gaussians.optimizer import Decay, make_adam, set_learning_rates
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
-from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.images import ImageSettings
+from spike4dgs.method.motion.static import Static
 from spike4dgs.method.observations.foreground import foreground_masks, foreground_points, moving_window, stray_points
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision.base import difference
-from spike4dgs.method.supervision.table import SUPERVISIONS
+from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
+from spike4dgs.method.torch_state import one_torch_thread, seeded
 from spike4dgs.method.tracking.losses import (
     background_term,
     color_term,
@@ -49,58 +51,9 @@ from spike4dgs.method.tracking.losses import (
     unit_quaternions,
 )
 from spike4dgs.method.tracking.model import TrackedModel, Tracks
-from spike4dgs.method.trainer import Trainer, one_torch_thread, seeded
-
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """Hyper-parameters. One step renders several views at one time, where the publication takes one image.
-
-    The published 10,000 and 2,000 steps are 200,000 images for a clip of 100 times. Here a fit has the time of 4DGS:
-    things move by about a pixel between two times, and a few steps follow that.
-    """
-
-    first_steps: int = 400
-    later_steps: int = 40  # at each further time
-    first_move: float = 3.0  # x later_steps at the second time, whose velocity is not known yet
-    views_per_step: int = 4
-
-    time_spacing_ticks: int = 16  # 0.8 ms at 20 kHz; between times everything is interpolated
-    edge_ticks: int = 10  # windows nearer to the clip's ends are cut
-    max_times: int = 40  # bounds the time of a fit
-    flat_field: bool = False  # correct the images by each camera's calibration, if known
-    start: float = 0.5  # where in the clip the first time is: 0 at its beginning, as published, 1 at its end
-    clean_background: bool = True  # pixels that never change show their mean over the clip, without the spikes' noise
-    margin_px: int = 8  # around what moves, more than half a window of SSIM
-
-    # Loss; the weights are the publication's.
-    image_weight: float = 1.0
-    silhouette_weight: float = 3.0
-    rigidity_weight: float = 4.0
-    rotation_weight: float = 4.0
-    isometry_weight: float = 2.0
-    background_weight: float = 20.0
-    color_weight: float = 0.01
-    ssim_weight: float = 0.2
-    neighbours: int = 20
-    freeze_background: bool = True
-
-    # Adam at the further times, from the first to the last step of each; the publication's are constant.
-    means_rate: float = 1.2e-3  # x scene scale (1.6e-4 in 2,000 steps)
-    means_rate_last: float = 4e-5
-    quats_rate: float = 2e-3  # (1e-3)
-    colors_rate: float = 2.5e-3  # as published; slower, colours follow wheels and highlights too late
-    colors_rate_last: float = 5e-4
-    beta1: float = 0.9
-    beta2: float = 0.99  # (0.999, which would average over far more steps than a time has)
-
-    def scaled(self, scale: float) -> TrackingSettings:
-        """The same settings with the step counts multiplied by a budget's scale."""
-        first, later = (max(1, round(steps * scale)) for steps in (self.first_steps, self.later_steps))
-        return replace(self, first_steps=first, later_steps=later)
-
-
-PUBLISHED = {"first_steps": 2500, "later_steps": 500}  # 10,000 and 2,000 single images in steps of four
+from spike4dgs.method.tracking.settings import PUBLISHED, TrackingSettings
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
 
 @dataclass(frozen=True)
@@ -113,7 +66,7 @@ class Visit:
 
 
 def visits(first: int, times: int) -> list[Visit]:
-    """From `first` to the last time, then from `first` back to time 0."""
+    """Return the visits from `first` to the last time, then from `first` back to time 0."""
     forward = [Visit(i, i - 1, i - 2 if i - 2 >= first else None) for i in range(first + 1, times)]
     backward = [Visit(i, i + 1, i + 2 if i + 2 < times else None) for i in range(first - 1, -1, -1)]
     return forward + backward
@@ -125,14 +78,15 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
     A killed fit goes on from the last time in the checkpoint and gives the bits of one that never stopped (on the CPU).
     Raises UserError for a damaged checkpoint or one of another fit.
     """
-    saved = load_checkpoint(job.checkpoint, job.key) if job.checkpoint else None
+    checkpoint, device = job.request.checkpoint, job.request.device
+    saved = load_checkpoint(checkpoint, job.key) if checkpoint else None
     masks = foreground_masks(job.training_images.images)
-    if job.settings.clean_background:
+    if job.settings["motion"].clean_background:
         images = job.training_images.images
         clean = torch.where(masks, images, images.mean(0))
         job = replace(job, training_images=replace(job.training_images, images=clean))
     if saved:
-        gaussians = Gaussians.from_tensors({k: v.to(job.device) for k, v in saved.part("gaussians").items()})
+        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in saved.part("gaussians").items()})
     else:
         gaussians = fit_first(job)
     tracker = Tracker(job, gaussians, masks)
@@ -144,40 +98,41 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
 
 
 def first_index(job: FitJob) -> int:
-    """Index of the time that everything starts from."""
+    """Return the index of the time that everything starts from."""
     last = len(job.training_images.ticks) - 1
-    return min(max(round(job.settings.start * last), 0), last)
+    return min(max(round(job.settings["motion"].start * last), 0), last)
 
 
 def later_total(job: FitJob) -> int:
-    """Steps of all further times."""
-    return sum(step_count(job.settings, v) for v in visits(first_index(job), len(job.training_images.ticks)))
+    """Return the steps of all further times."""
+    return sum(step_count(job.settings["motion"], v) for v in visits(first_index(job), len(job.training_images.ticks)))
 
 
 def step_count(settings: TrackingSettings, visit: Visit) -> int:
-    """Steps of one further time."""
+    """Return the steps of one further time."""
     return round(settings.later_steps * (settings.first_move if visit.earlier is None else 1))
 
 
 def fit_first(job: FitJob) -> Gaussians:
-    """Optimise and densify Gaussians at the first time, with the one trainer as for a static scene."""
-    s, training_images, i = job.settings, job.training_images, first_index(job)
-    still = replace(training_images, ticks=training_images.ticks[i : i + 1], images=training_images.images[i : i + 1])
-    settings = TrainSettings(coarse_steps=s.first_steps, views_per_step=s.views_per_step, ssim_weight=s.ssim_weight)
-    motion = MOTIONS["static"](job.extent, settings, seeded(job.seed, -1))
-    supervision = SUPERVISIONS["pixel"](settings, job.scene)
-    start = from_points(job.start.points, job.start.values, opacity=settings.initial_opacity, device=job.device)
-    trainer = Trainer(still, start, motion, supervision, settings, scale=job.extent.scale, seed=job.seed)
+    """Optimise and densify Gaussians at the first time, with the one trainer as for a static scene; return them."""
+    s, images, i, request = job.settings["motion"], job.training_images, first_index(job), job.request
+    one_time = replace(images, ticks=images.ticks[i : i + 1], images=images.images[i : i + 1])
+    settings = TrainerSettings(coarse_steps=s.first_steps, views_per_step=s.views_per_step)
+    motion = Static(job.extent, Static.defaults, seeded(request.seed, -1))
+    loss = Pixel(job.settings["supervision"], job.scene)
+    start = from_points(job.start.points, job.start.values, opacity=settings.initial_opacity, device=request.device)
+    scale = job.extent.scale
+    trainer = Trainer(one_time, start, motion, loss, settings, DensitySettings(), scale=scale, seed=request.seed)
     total = s.first_steps + later_total(job)
-    trainer.run(lambda done, _, note="": job.progress(done, total, note))
+    trainer.run(lambda done, _, note="": request.progress(done, total, note))
     return trainer.gaussians.detached()
 
 
 class Tracker:
-    """The further times. Everything random is drawn from (seed, time, step), as in the trainer."""
+    """The further times. Everything random follows from (seed, time, step), as in the trainer."""
 
     def __init__(self, job: FitJob, gaussians: Gaussians, masks: Tensor) -> None:
-        self.job, self.gaussians, self.settings = job, gaussians, job.settings
+        self.job, self.gaussians, self.settings = job, gaussians, job.settings["motion"]
         training_images = job.training_images
         self.window = moving_window(training_images.views, masks, self.settings.margin_px)
         self.masks = masks
@@ -193,31 +148,31 @@ class Tracker:
         self.plan = visits(first_index(job), len(training_images.ticks)) if self.count > 1 else []
         self.done = 0
         self.local = gaussians.rows(self.rows)
-        self.flag = torch.zeros(len(self.rows), 1, device=job.device)
+        self.flag = torch.zeros(len(self.rows), 1, device=job.request.device)
         self.flag[: self.count] = 1
         area = self.window.views.width * self.window.views.height
         self.share = area / (training_images.views.width * training_images.views.height)
 
     def run(self, checkpoint_s: float) -> None:
         """Track the times that are left."""
-        job, steps = self.job, [step_count(self.settings, v) for v in self.plan]
+        job, request, steps = self.job, self.job.request, [step_count(self.settings, v) for v in self.plan]
         total, written = self.settings.first_steps + sum(steps), time.monotonic()
         if self.plan:
             self.graph = find_neighbours(self.local.means[: self.count], self.settings.neighbours)
         while True:
             due = time.monotonic() - written >= checkpoint_s or self.done in (0, len(self.plan))
-            if job.checkpoint and due:
-                save_checkpoint(job.checkpoint, self.state(), job.key)
+            if request.checkpoint and due:
+                save_checkpoint(request.checkpoint, self.state(), job.key)
                 written = time.monotonic()
             if self.done == len(self.plan):
                 return
             loss = self.track(self.plan[self.done])
             self.done += 1
             note = f"time {self.done + 1} of {len(self.plan) + 1}, loss {loss:.4f}, {self.count} moving Gaussians"
-            job.progress(self.settings.first_steps + sum(steps[: self.done]), total, note)
+            request.progress(self.settings.first_steps + sum(steps[: self.done]), total, note)
 
     def track(self, visit: Visit) -> float:
-        """Optimise one time; returns the last loss."""
+        """Optimise one time; return the last loss."""
         s, tracks, index = self.settings, self.tracks, visit.index
         old = tracks.at(visit.before)
         leaves = {name: value.clone() for name, value in old.items()}
@@ -231,16 +186,16 @@ class Tracker:
         adam = make_adam({name: [leaf] for name, leaf in leaves.items()}, (s.beta1, s.beta2))
         scale = self.job.extent.scale
         rates = {
-            "means": Decay(s.means_rate * scale, s.means_rate_last * scale),
-            "quats": Decay(s.quats_rate, s.quats_rate),
-            "colors": Decay(s.colors_rate, s.colors_rate_last),
+            "means": Decay(s.lr_means * scale, s.lr_means_last * scale),
+            "quats": Decay(s.lr_quats, s.lr_quats),
+            "colors": Decay(s.lr_colors, s.lr_colors_last),
         }
         steps = step_count(s, visit)
         for step in range(steps):
-            set_rates(adam, rates, step / steps)
+            set_learning_rates(adam, rates, step / steps)
             adam.zero_grad(set_to_none=True)
             order = torch.randperm(
-                len(self.window.views), generator=seeded(self.job.seed, (index + 1) * 1_000_000 + step)
+                len(self.window.views), generator=seeded(self.job.request.seed, (index + 1) * 1_000_000 + step)
             )
             loss = loss_of(leaves, order[: s.views_per_step].sort().values.tolist())
             loss.backward()
@@ -253,10 +208,11 @@ class Tracker:
         return float(loss.detach())
 
     def loss(self, index: int, old: dict[str, Tensor]) -> Callable[[dict[str, Tensor], list[int]], Tensor]:
-        """The loss at a time, of the free parameters and the views to draw; `old` are those of the time before."""
+        """Return the loss at a time, of free parameters and views to render; `old` are those of the time before."""
         s, n, local, every = self.settings, self.count, self.local, self.window.views
         before = remember(self.graph, old["means"][:n], old["quats"][:n])
         scales, opacities = local.log_scales.exp(), local.logits.sigmoid()
+        ssim_weight = self.job.settings["supervision"].ssim_weight
         weights = (s.rigidity_weight, s.rotation_weight, s.isometry_weight)
         free = len(old["means"])
 
@@ -266,7 +222,7 @@ class Tracker:
             splats = Splats(*everything, scales, opacities, torch.cat([leaves["colors"], self.flag], 1))
             views = Views(every.w2c[chosen], every.K[chosen], every.width, every.height)
             image, silhouette = render(splats, views).image.unbind(-1)
-            total = s.image_weight * difference(image, self.images[index][chosen], s.ssim_weight)
+            total = s.image_weight * difference(image, self.images[index][chosen], ssim_weight)
             total = total + s.silhouette_weight * (silhouette * self.quiet[chosen]).mean()
             # A mean over whole images, as published: outside of the window nothing changes.
             total = self.share * total + physical_loss(self.graph, before, means[:n], quats[:n], weights)
@@ -278,7 +234,7 @@ class Tracker:
         return loss
 
     def state(self) -> Checkpoint:
-        """Everything that later times depend on."""
+        """Return everything that later times depend on."""
         parts = {"gaussians": self.gaussians.tensors(), "tracks": self.tracks.tensors()}
         return Checkpoint(self.done, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
 
@@ -288,4 +244,10 @@ class Tracker:
         self.tracks.load(saved.part("tracks"))
 
 
-TRACKING = Algorithm(TrackingSettings(), fit_tracking, PUBLISHED, ("pixel",))
+SETTINGS = {
+    # Every 0.8 ms at 20 kHz; between times everything is interpolated. The most times bound the time of a fit.
+    "images": ImageSettings(time_spacing_ticks=16, max_times=40),
+    "motion": TrackingSettings(),
+    "supervision": PixelSettings(),
+}
+TRACKING = Algorithm(SETTINGS, fit_tracking, PUBLISHED, ("pixel",))

@@ -1,4 +1,4 @@
-"""What keeps tracked Gaussians together: the terms of Dynamic 3D Gaussians (Luiten et al. 2024) beside its image loss.
+"""Terms that keep tracked Gaussians together: those of Dynamic 3D Gaussians (Luiten et al. 2024) beside its image loss.
 
 With x_i, q_i the centres and unit quaternions at the tracked time, x'_i, q'_i those at the time before, R_i the
 rotation of r_i = q_i q'_i^-1, j over the k nearest neighbours of i at the first time, and lengths in `unit`:
@@ -40,7 +40,7 @@ class Neighbours:
 
 
 def find_neighbours(points: Tensor, k: int) -> Neighbours:
-    """The graph of points [N, 3] m with `k` neighbours each, or all others where there are fewer.
+    """Return the graph of points [N, 3] m with `k` neighbours each, or all others where there are fewer.
 
     Raises UserError for fewer than two points, and where most neighbours coincide.
     """
@@ -48,9 +48,9 @@ def find_neighbours(points: Tensor, k: int) -> Neighbours:
 
     if len(points) < 2:
         raise problem("tracking", "at least 2 moving Gaussians", str(len(points)), "use a recipe for static scenes")
-    places = points.detach().cpu().double().numpy()
+    at = points.detach().cpu().double().numpy()
     k = min(k, len(points) - 1)
-    distance, index = cKDTree(places).query(places, k=k + 1)
+    distance, index = cKDTree(at).query(at, k=k + 1)
     # A point is not always its own first neighbour: coincident points come in any order.
     itself = torch.as_tensor(index) == torch.arange(len(points))[:, None]  # [N, k + 1]
     itself[:, -1] |= ~itself.any(dim=1)
@@ -58,13 +58,13 @@ def find_neighbours(points: Tensor, k: int) -> Neighbours:
     lengths = torch.as_tensor(distance)[~itself].view(-1, k)
     unit = float(lengths.median()) * math.sqrt(SHARPNESS)
     if unit == 0:
-        raise problem("tracking", "Gaussians at different places", "coincident ones", "correct the initialization")
+        raise problem("tracking", "Gaussians at different positions", "coincident ones", "correct the initialization")
     rest = (lengths / unit).to(points)
     return Neighbours(order.to(points.device), torch.exp(-0.5 * SHARPNESS * rest**2), rest, unit)
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """The quaternion product a b, wxyz, [..., 4]."""
+    """Return the quaternion product a b, wxyz, [..., 4]."""
     w, x, y, z = a.unbind(-1)
     s, t, u, v = b.unbind(-1)
     return torch.stack(
@@ -79,31 +79,31 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The inverse of unit quaternions [..., 4]."""
+    """Return the inverse of unit quaternions [..., 4]."""
     return q * q.new_tensor([1.0, -1.0, -1.0, -1.0])
 
 
 def unit_quaternions(q: Tensor) -> Tensor:
-    """Quaternions [..., 4] of length 1."""
+    """Return quaternions [..., 4] of length 1."""
     return torch.nn.functional.normalize(q, dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Before:
-    """What the terms compare with of the time before, computed once for all steps of a time."""
+    """The state of the time before, as the terms need it, computed once for all steps of a time."""
 
     offsets: Tensor  # [N, k, 3] x'_j - x'_i in units
     inverse: Tensor  # [N, 4] conjugate of q'
 
 
 def remember(graph: Neighbours, means: Tensor, quats: Tensor) -> Before:
-    """The state [N, 3] m and [N, 4] of the time before, detached."""
+    """Return the state of the time before from means [N, 3] m and quats [N, 4], detached."""
     means, quats = means.detach(), quats.detach()
     return Before(_offsets(graph, means), conjugate(unit_quaternions(quats)))
 
 
 def physical_terms(graph: Neighbours, before: Before, means: Tensor, quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(rigidity, rotation, isometry) of means [N, 3] m and quats [N, 4] of any length; see the module."""
+    """Return (rigidity, rotation, isometry) of means [N, 3] m and quats [N, 4] of any length; see the module."""
     offsets = _offsets(graph, means)  # [N, k, 3]
     turn = multiply(unit_quaternions(quats), before.inverse)  # [N, 4] r
     back = offsets @ rotation_matrices(turn)  # rows o^T R = (R^T o)^T
@@ -116,7 +116,7 @@ def physical_terms(graph: Neighbours, before: Before, means: Tensor, quats: Tens
 def physical_loss(
     graph: Neighbours, before: Before, means: Tensor, quats: Tensor, weights: tuple[float, float, float]
 ) -> Tensor:
-    """weights . `physical_terms`. float32 tensors on the CPU go through `tracking_cpu`, others through plain torch."""
+    """Return weights . `physical_terms`; float32 on the CPU goes through `losses_cpu`, all else through plain torch."""
     if means.device.type != "cpu" or means.dtype != torch.float32:
         terms = physical_terms(graph, before, means, quats)
         return torch.stack([w * term for w, term in zip(weights, terms, strict=True)]).sum()
@@ -130,7 +130,7 @@ def _offsets(graph: Neighbours, means: Tensor) -> Tensor:
 
 
 def background_term(means: Tensor, quats: Tensor, means_0: Tensor, quats_0: Tensor, unit: float) -> Tensor:
-    """mean_i |x_i - x_i(0)|_1 / unit + mean_i |q_i - q_i(0)|_1 of what should stand still; 0 for nothing [0, 3]."""
+    """Return mean_i |x_i - x_i(0)|_1 / unit + mean_i |q_i - q_i(0)|_1 of the background; 0 for nothing [0, 3]."""
     if not len(means):
         return means.sum()
     moved = (means - means_0).abs().sum(-1).mean() / unit
@@ -138,5 +138,5 @@ def background_term(means: Tensor, quats: Tensor, means_0: Tensor, quats_0: Tens
 
 
 def color_term(colors: Tensor, before: Tensor) -> Tensor:
-    """mean_i |c_i - c'_i|_1: colours [N, F] change slowly."""
+    """Return mean_i |c_i - c'_i|_1: colours [N, F] change slowly."""
     return (colors - before).abs().sum(-1).mean()

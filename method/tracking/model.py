@@ -1,4 +1,4 @@
-"""Gaussians with a place, a rotation and a colour at each of some times: what tracking gives."""
+"""The model that tracking fits: Gaussians with a position, a rotation and a colour at each of some times."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spike4dgs.method.splat import Splats, Views, render
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """What changes, at T times."""
+    """The values that change, at T times."""
 
     times_us: Tensor  # [T] float64, ascending
     free: Tensor  # [M] which Gaussians move
@@ -32,23 +32,23 @@ class Tracks:
 
     @classmethod
     def start(cls, gaussians: Gaussians, free: Tensor, rows: Tensor, ticks: tuple[int, ...], rate_hz: float) -> Tracks:
-        """Tracks on which all times are as the Gaussians are, until `put` says otherwise."""
+        """Return tracks on which all times are as the Gaussians are, until `put` changes them."""
         times = torch.tensor(ticks, dtype=torch.float64) * (1e6 / rate_hz)
         quats = torch.nn.functional.normalize(gaussians.quats[free], dim=-1)
         values = (gaussians.means[free], quats, gaussians.colors[rows])
         return cls(times, free, rows, *(v.repeat(len(ticks), 1, 1) for v in values))
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is found by tracking, by name."""
+        """Return the tracked values, by name."""
         return {"means": self.means, "quats": self.quats, "colors": self.colors}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Take over what `tensors` gave."""
+        """Copy the values that `tensors` gave."""
         for name, value in self.tensors().items():
             value.copy_(tensors[name])
 
     def at(self, index: int) -> dict[str, Tensor]:
-        """Values at one of the times."""
+        """Return the values at one of the times."""
         return {name: value[index] for name, value in self.tensors().items()}
 
     def put(self, index: int, values: dict[str, Tensor]) -> None:
@@ -57,7 +57,7 @@ class Tracks:
         self.quats[index] = torch.nn.functional.normalize(values["quats"], dim=-1)
 
     def between(self, t_us: float) -> dict[str, Tensor]:
-        """Values at any time: places and rotations linearly between the times and beyond them, colours between them.
+        """Return values at any time: positions and rotations linear between and beyond the times, colours between them.
 
         Two times are so near to each other that a normalised linear quaternion is the spherical one for all purposes:
         at 5 degrees a time the angle is wrong by less than 0.001 degrees.
@@ -88,7 +88,7 @@ class TrackedModel:
 
     @property
     def device(self) -> str:
-        """Where the model lies."""
+        """The device of the model's tensors."""
         return str(self.gaussians.means.device)
 
     @property
@@ -97,7 +97,7 @@ class TrackedModel:
         return count_bytes([*self.gaussians.tensors().values(), *self.tracks.tensors().values()])
 
     def at(self, t_us: float) -> Gaussians:
-        """The Gaussians at a time of the clip; times outside of it take its ends."""
+        """Return the Gaussians at a time of the clip; times outside of it take its ends."""
         values = self.tracks.between(min(max(t_us, 0.0), self.duration_us))
         g = self.gaussians
         means, quats, colors = g.means.clone(), g.quats.clone(), g.colors.clone()
@@ -107,17 +107,17 @@ class TrackedModel:
 
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """Gray linear radiance [H, W] float32 that `camera` sees at `t_us`; times outside the clip take its ends."""
+        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
         image = render(self.splats(t_us), views).image
         return self.image(image, views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
-        """What is drawn at `t_us`."""
+        """Return what is rendered at `t_us`."""
         return self.at(t_us).splats()
 
     def image(self, image: Tensor, views: Views) -> Tensor:
-        """The drawn channel [V, H, W, 1] -> gray radiance [V, H, W]."""
+        """Return gray radiance [V, H, W] of the rendered channel [V, H, W, 1]."""
         return image[..., 0]
 
     def save(self, path: Path, provenance: Provenance) -> None:
@@ -129,7 +129,7 @@ class TrackedModel:
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> TrackedModel:
-        """What `save` wrote. Raises KeyError or TypeError for another version's."""
+        """Return the model that `save` wrote. Raises KeyError or TypeError for another version's."""
         gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
         tracks = {k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()}
         return cls(gaussians, Tracks(**tracks), file.provenance.duration_us)

@@ -14,18 +14,21 @@ from hypothesis import strategies as st
 from small_scenes import GAIN, TICKS
 from splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from torch import Tensor
+from toy_world import ToyWorld
 
 from spike4dgs.baselines.held_out_pose import PosedRecipe, RefinableModel, Refinement, refine_pose
 from spike4dgs.baselines.initialization.rig import rig
+from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.results.record import read_record
 from spike4dgs.benchmark.results.refinement import MAX_TICKS, free_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import read_exr
-from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Parts
+from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.splat import Splats, Views, render
@@ -40,7 +43,7 @@ def frozen() -> Splats:
     return Splats(*(t.float() for t in (s.means, s.quats, s.scales, s.opacities * 0.9, s.colors)))
 
 
-def draw(views: Views) -> Tensor:
+def render_view(views: Views) -> Tensor:
     return render(SPLATS, views).image[..., 0]
 
 
@@ -61,28 +64,30 @@ def off(a: Camera, b: Camera) -> float:
     return float(np.linalg.norm(a.project(points)[0] - b.project(points)[0], axis=1).mean())
 
 
-def test_refinement_finds_the_pose_from_still_pixels_alone() -> None:
-    picture = draw(Views.from_cameras([TRUE]))[0].numpy()
-    noisy = picture + 0.02 * np.random.default_rng(0).standard_normal(picture.shape).astype(np.float32)
-    still = np.ones(picture.shape, bool)
-    still[20:50, 30:65] = False
-    noisy[~still] = 5.0  # what moves is somewhere else by now
+def test_refinement_finds_the_pose_from_background_pixels_alone() -> None:
+    image = render_view(Views.from_cameras([TRUE]))[0].numpy()
+    noisy = image + 0.02 * np.random.default_rng(0).standard_normal(image.shape).astype(np.float32)
+    background = np.ones(image.shape, bool)
+    background[20:50, 30:65] = False
+    noisy[~background] = 5.0  # what moves is somewhere else by now
     wrong = moved(TRUE, 1.0, -0.03)
-    found = refine_pose(draw, wrong, noisy, still, DEPTH_M, Refinement())
+    found = refine_pose(render_view, wrong, noisy, background, DEPTH_M, Refinement())
     assert off(wrong, TRUE) > 0.8 and off(found, TRUE) < 0.1
     assert np.allclose(found.R @ found.R.T, np.eye(3), atol=1e-9)
     assert (found.id, found.fx, found.width) == (TRUE.id, TRUE.fx, TRUE.width)
 
 
 def test_refinement_never_ends_worse_than_it_began() -> None:
-    picture, still = draw(Views.from_cameras([TRUE]))[0].numpy(), np.ones((HEIGHT, WIDTH), bool)
-    kept = refine_pose(draw, TRUE, picture, still, DEPTH_M, Refinement(steps=5, rate=0.3, rate_last=0.3))
+    image, everywhere = render_view(Views.from_cameras([TRUE]))[0].numpy(), np.ones((HEIGHT, WIDTH), bool)
+    kept = refine_pose(render_view, TRUE, image, everywhere, DEPTH_M, Refinement(steps=5, lr=0.3, lr_last=0.3))
     assert np.array_equal(kept.w2c, TRUE.w2c)
 
 
-def test_refinement_without_still_pixels_is_refused() -> None:
-    with pytest.raises(UserError, match="0 still pixels"):
-        refine_pose(draw, TRUE, np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool), 1, Refinement())
+def test_refinement_without_background_pixels_is_refused() -> None:
+    with pytest.raises(UserError, match="0 background pixels"):
+        refine_pose(
+            render_view, TRUE, np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool), 1, Refinement()
+        )
 
 
 @given(st.sets(st.integers(0, 59), max_size=30), st.integers(60, 400))
@@ -99,7 +104,7 @@ def test_a_clip_of_targets_alone_is_refused() -> None:
 
 
 class SeenFrom(CountModel):
-    """Shows the camera's place as a gray value; refinement moves it, and keeps what it was given."""
+    """Renders the camera's position as a gray value; refinement moves it, and keeps its arguments."""
 
     def __init__(self, given: list[Any]) -> None:
         self.given = given
@@ -107,8 +112,8 @@ class SeenFrom(CountModel):
     def render(self, camera: Camera, t_us: float) -> np.ndarray:
         return np.full((camera.height, camera.width), camera.t[0], np.float32)
 
-    def refine(self, camera: Camera, picture: np.ndarray, still: np.ndarray, t_us: float) -> Camera:
-        self.given.append((camera, picture, still, t_us))
+    def refine(self, camera: Camera, image: np.ndarray, background: np.ndarray, t_us: float) -> Camera:
+        self.given.append((camera, image, background, t_us))
         return replace(camera, t=camera.t + [0.5, 0, 0])
 
 
@@ -139,15 +144,15 @@ def test_a_run_publishes_unrefined_and_refined_scores(small_scene: Path, tmp_pat
     assert run(tmp_path, [small_scene], again)[1]["scenes"] == refined["scenes"] and again.fits == 0
 
 
-def test_the_image_for_refinement_is_unscored_and_still(small_scene: Path, tmp_path: Path) -> None:
+def test_the_image_for_refinement_is_unscored_and_of_the_background(small_scene: Path, tmp_path: Path) -> None:
     method, scene = Posed(), open_scene(small_scene)
     run(tmp_path, [small_scene], method)
-    camera, picture, still, t_us = method.given[0]
+    camera, image, background, t_us = method.given[0]
     assert camera.id == "cam_03" and TICKS == 80  # targets at 20, 40 and 60
     counts = scene.stream("cam_03").counts(0, 20) / (20 * GAIN)  # the longest time between them, by one tick
-    assert np.allclose(picture, counts, atol=1e-6) and picture.dtype == np.float32
+    assert np.allclose(image, counts, atol=1e-6) and image.dtype == np.float32
     assert t_us == pytest.approx(50 * 10)
-    assert np.array_equal(still, ~scene.moving(scene.targets[0]))
+    assert np.array_equal(background, ~scene.moving(scene.targets[0]))
 
 
 def test_a_failure_fails_both_records_and_absent_weights_skip_them(small_scene: Path, tmp_path: Path) -> None:
@@ -164,24 +169,18 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
     """All training poses are shifted by the same: at the calibrated held-out pose the image is off, refined not."""
     shift = np.array([0.02, 0.0, 0.0])
 
-    def shifted(scene: TrainingScene, seed: int) -> Any:
-        cameras = tuple(replace(c, t=c.t - c.R @ shift) for c in scene.cameras)
-        return rig(replace(scene, cameras=cameras), seed)
+    def shifted(request: StartRequest) -> Start:
+        cameras = tuple(replace(c, t=c.t - c.R @ shift) for c in request.scene.cameras)
+        return rig(replace(request.scene, cameras=cameras))
 
-    from spike4dgs.baselines.spike_to_image.table import IMAGES
-
-    parts = Parts(IMAGES, {"shifted": shifted}, MOTIONS, SUPERVISIONS, {"tracking": TRACKING})
-    steps = {"coarse_steps": 60} if motion == "static" else {"first_steps": 60, "later_steps": 2}
+    parts = Parts(IMAGES, {"shifted": Initialization(shifted)}, MOTIONS, SUPERVISIONS, {"tracking": TRACKING})
+    steps = {"trainer.coarse_steps": 60} if motion == "static" else {"motion.first_steps": 60, "motion.later_steps": 2}
     recipe = Recipe("posed", "tfp", "shifted", motion, "pixel", steps)
     method = PosedRecipe(recipe, parts)
     assert method.refines_views and method.params["refinement"]["steps"] == 100
 
-    from toy_world import ToyWorld
-
-    from spike4dgs.benchmark.method import Budget
-
     world = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1)
-    model = method.fit(world.training, Budget(), "cpu", 0, lambda *a: None)
+    model = method.fit(world.training, FitRequest())
     truth = world.look(world.held_out, 0.5)[0].astype(np.float32)
     assert isinstance(model, RefinableModel)
     found = model.refine(world.held_out, truth, np.ones_like(truth, bool), 3000.0)

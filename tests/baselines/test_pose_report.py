@@ -29,7 +29,7 @@ def test_failures_are_rows_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None
     assert "SPIKE4DGS_DUST3R not set" in str(row["error"])
     dark = 0 * clip_means(WORLD.training)
     (row,) = measure_poses(WORLD.training, dark, "colmap", 0, calibrated=True)
-    assert row["registered"] == "0 of 8" and row["error"] == "fewer than two views are placed"
+    assert row["registered"] == "0 of 8" and row["error"] == "fewer than two views have poses"
 
 
 def test_command_prints_and_writes_the_table(
@@ -45,8 +45,8 @@ def test_command_prints_and_writes_the_table(
 
 
 def test_refined_poses_are_a_row_of_their_own() -> None:
-    pictures = clip_means(WORLD.training)
-    before, after = measure_poses(WORLD.training, pictures, "colmap", 0, calibrated=True, refine=Budget(0.05))
+    images = clip_means(WORLD.training)
+    before, after = measure_poses(WORLD.training, images, "colmap", 0, calibrated=True, refine=Budget(0.05))
     assert (before["initialization"], after["initialization"]) == ("colmap", "colmap, refined")
     assert before["registered"] == after["registered"] == "8 of 8" and before["points"] == after["points"]
     assert 0 < float(before["rotation_deg"] or 0) < 1 and 0 < float(after["rotation_deg"] or 0) < 1

@@ -11,7 +11,7 @@ import pytest
 from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS, POSED, RECIPES, SPIKE4DGS, SUPERVISED
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, Recipe, find_methods, get_method
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods, get_method
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
@@ -30,10 +30,6 @@ FITTED = [
     "spike4dgs",
     "spike4dgs-x",
 ]
-
-
-def quiet(done: int, total: int, note: str = "") -> None:
-    """A progress that nobody watches."""
 
 
 @pytest.fixture
@@ -60,11 +56,39 @@ def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
         images, *middle = recipe.name.split("+")
         at = next(i for i, part in enumerate(middle) if part in motions)
         assert (recipe.images, recipe.motion) == (images, motions[middle[at]])
-        assert recipe.initialization == ("+".join(middle[:at]) or ("msdi" if images == "msdi" else "rig"))
+        expected = ("+".join(middle[:at]) or ("msdi" if images == "msdi" else "rig")).removesuffix("-flat")
+        assert recipe.initialization == expected
         assert recipe.supervision == ("+".join(middle[at + 1 :]) or "pixel")
-    assert (recipe.initialization not in ("rig", "rig-flat", "msdi")) == (recipe in POSED)
+    assert (recipe.initialization not in ("rig", "msdi")) == (recipe in POSED)
     assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
     assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_images_and_first_points_are_corrected_as_the_recipe_says(name: str) -> None:
+    """One fact, `images.flat_field`, but for the row whose COLMAP saw raw images."""
+    if not isinstance(method := METHODS[name], RecipeMethod):
+        return
+    settings = method.params["settings"]
+    corrected = name.startswith(("spike4dgs", "msdi")) or "rig-flat" in name
+    assert settings["images"]["flat_field"] == corrected
+    first = settings["initialization"].get("flat_field", corrected)
+    assert first == (corrected and name != "msdi+colmap+4dgs")
+
+
+def test_a_recipe_holds_settings_of_its_own_parts_only() -> None:
+    trained = {"images", "initialization", "motion", "supervision", "trainer", "density"}
+    looped = {"images", "initialization", "motion", "supervision"}
+    for name, parts in {
+        "tfp+static": trained,
+        "spike4dgs-x": trained,
+        "tfp+d3dgs": looped,
+        "dy-spikenerf": looped | {"occupancy"},
+    }.items():
+        settings = METHODS[name].params["settings"]
+        assert set(settings) == parts
+        assert max(len(values) for values in settings.values()) <= 25
+    assert METHODS["tfp+static"].params["settings"]["motion"] == {}
 
 
 def test_the_entry_point_finds_them() -> None:
@@ -82,7 +106,7 @@ def test_params_survive_json(name: str) -> None:
 
 def test_params_tell_recipes_and_settings_apart() -> None:
     texts = {json.dumps(m.params, sort_keys=True) for m in METHODS.values()}
-    changed = RecipeMethod(dataclasses.replace(METHODS["tfi+4dgs"].recipe, settings={"levels": 1}), PARTS)
+    changed = RecipeMethod(dataclasses.replace(METHODS["tfi+4dgs"].recipe, settings={"motion.levels": 1}), PARTS)
     texts.add(json.dumps(changed.params, sort_keys=True))
     assert len(texts) == len(METHODS) + 1
 
@@ -90,9 +114,8 @@ def test_params_tell_recipes_and_settings_apart() -> None:
 @pytest.mark.parametrize("name", FITTED)
 def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
     reports: list[tuple[int, int]] = []
-    model = METHODS[name].fit(
-        scene.training, TINY, "cpu", 0, lambda done, total, note="": reports.append((done, total))
-    )
+    request = FitRequest(TINY, progress=lambda done, total, note="": reports.append((done, total)))
+    model = METHODS[name].fit(scene.training, request)
     target = scene.targets[1]
     camera = scene.cameras[target.camera]
     image = model.render(camera, scene.t_us(target.tick))
@@ -105,7 +128,7 @@ def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, sce
 
 
 def test_nearest_view_is_the_nearest_training_cameras_tfp(scene: Scene) -> None:
-    model = METHODS["nearest-view"].fit(scene.training, TINY, "cpu", 0, quiet)
+    model = METHODS["nearest-view"].fit(scene.training, FitRequest(TINY))
     for tick in (0, 20, 60, scene.n_ticks - 1):
         # The cameras stand in a row and cam_03 is held out, next to cam_02.
         expected = tfp_image(scene.stream("cam_02"), tick) / scene.radiance_gain
@@ -120,34 +143,39 @@ def test_nearest_view_does_not_depend_on_the_order_of_far_cameras(scene: Scene) 
     mixed = dataclasses.replace(
         training, cameras=tuple(training.cameras[i] for i in order), streams=tuple(training.streams[i] for i in order)
     )
-    pictures = [
-        METHODS["nearest-view"].fit(s, TINY, "cpu", 0, quiet).render(scene.cameras["cam_03"], 2000.0)
+    images = [
+        METHODS["nearest-view"].fit(s, FitRequest(TINY)).render(scene.cameras["cam_03"], 2000.0)
         for s in (training, mixed)
     ]
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(*images)
 
 
 @pytest.mark.parametrize("part", ["images", "initialization", "motion", "supervision"])
-def test_an_unknown_part_is_named(part: str, scene: Scene) -> None:
+def test_an_unknown_part_is_named(part: str) -> None:
     parts: dict[str, Any] = {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"}
-    method = RecipeMethod(Recipe("mine", **{**parts, part: "nothing"}), PARTS)
     with pytest.raises(UserError, match=f"recipe mine: expected {part} among .*found 'nothing'"):
-        method.fit(scene.training, TINY, "cpu", 0, quiet)
+        RecipeMethod(Recipe("mine", **{**parts, part: "nothing"}), PARTS)
 
 
 @pytest.mark.parametrize(
     ("overrides", "found"),
-    [({"levle": 2}, "'levle'"), ({"levels": 2.5}, "2.5"), ({"ramp": "0.5"}, "'0.5'"), ({"levels": True}, "True")],
+    [
+        ({"motion.levle": 2}, "'motion.levle'"),
+        ({"motion.levels": 2.5}, "2.5"),
+        ({"trainer.ramp": "0.5"}, "'0.5'"),
+        ({"motion.levels": True}, "True"),
+        ({"levels": 2}, "'levels'"),
+    ],
 )
 def test_an_unknown_or_mistyped_setting_is_named(overrides: dict[str, Any], found: str) -> None:
-    recipe = Recipe("mine", "tfp", "rig", "static", "pixel", settings=overrides)
+    recipe = Recipe("mine", "tfp", "rig", "hexplane", "pixel", settings=overrides)
     with pytest.raises(UserError, match=f"recipe mine: expected .*found {found}"):
         RecipeMethod(recipe, PARTS)
 
 
 def test_a_device_that_is_not_there_is_a_user_error(scene: Scene) -> None:
     with pytest.raises(UserError, match="device: expected cpu, or a CUDA device.*--device cpu"):
-        METHODS["tfp+static"].fit(scene.training, TINY, "cuda:99", 0, quiet)
+        METHODS["tfp+static"].fit(scene.training, FitRequest(TINY, "cuda:99"))
 
 
 def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path) -> None:
@@ -155,7 +183,7 @@ def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path
     camera = scene.cameras["cam_03"]
 
     def fit(training: TrainingScene = scene.training, budget: Budget = TINY, seed: int = 0) -> np.ndarray:
-        return method.fit(training, budget, "cpu", seed, quiet, path).render(camera, 2000.0)
+        return method.fit(training, FitRequest(budget, seed=seed, checkpoint=path)).render(camera, 2000.0)
 
     first = fit()
     np.testing.assert_array_equal(fit(), first)
@@ -192,5 +220,5 @@ def test_recipes_that_are_compared_differ_in_one_part() -> None:
         assert differ(name.replace("+colmap", "").replace("-uncalibrated", ""), name) == {"initialization"}
     assert differ("tfp+4dgs", "tfp+dust3r+4dgs") == {"initialization"}
     assert differ("tfp+4dgs", "tfp+static") == {"motion", "settings"}
-    static, moving = (METHODS[name].settings for name in ("tfp+static", "tfp+4dgs"))
+    static, moving = (METHODS[name].settings["trainer"] for name in ("tfp+static", "tfp+4dgs"))
     assert static.coarse_steps == moving.coarse_steps + moving.fine_steps, "the floor has as many steps"

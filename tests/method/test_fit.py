@@ -8,17 +8,13 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import Budget, Model
+from spike4dgs.benchmark.method import Budget, FitRequest, Model
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.splat import set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.4)  # 10 px in 12 ms
 SHORT = Budget(scale=0.005)
-
-
-def quiet(done: int, total: int, note: str = "") -> None:
-    pass
 
 
 @cache
@@ -30,7 +26,7 @@ def fitted(name: str) -> tuple[Model, tuple[float, ...]]:
         if note.startswith("loss "):
             losses.append(float(note.split()[1].rstrip(",")))
 
-    return METHODS[name].fit(WORLD.training, Budget(scale=0.2), "cpu", 0, note), tuple(losses)
+    return METHODS[name].fit(WORLD.training, FitRequest(Budget(scale=0.2), progress=note)), tuple(losses)
 
 
 @cache
@@ -66,7 +62,7 @@ def test_a_model_renders_the_same_bits_again_and_stops_at_the_ends_of_the_clip()
 
 
 def bits(seed: int = 0, name: str = "tfp+4dgs") -> dict[str, torch.Tensor]:
-    model = METHODS[name].fit(WORLD.training, SHORT, "cpu", seed, quiet)
+    model = METHODS[name].fit(WORLD.training, FitRequest(SHORT, seed=seed))
     assert isinstance(model, FittedModel)
     (gaussians,) = model.pieces
     return {**gaussians.tensors(), **model.motion.state_dict()}

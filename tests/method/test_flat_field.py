@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras
 
-from spike4dgs.baselines.initialization.rig import rig, rig_flat
+from spike4dgs.baselines.initialization.rig import rig
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
-from spike4dgs.method.fit import make_training_images
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.images import ImageSettings, make_training_images
 
 GAIN, TICKS = 0.6, 200
 
@@ -29,7 +28,7 @@ def record(camera, sensor, light, n_ticks, seed):
 
 @pytest.fixture(scope="module")
 def scene() -> TrainingScene:
-    """Cameras of uneven pixels before a soft gradient of light."""
+    """Cameras of uneven pixels in front of a soft gradient of light."""
     cameras, streams, recordings = array_cameras(), [], []
     for i, camera in enumerate(cameras):
         pixels = camera.height, camera.width, 0, camera.id
@@ -46,7 +45,7 @@ def light(camera):
 
 def error(scene, **settings):
     images = make_training_images(
-        scene, scene.cameras, IMAGES["adaptive"], TrainSettings(**settings), "cpu"
+        scene, scene.cameras, IMAGES["adaptive"], ImageSettings(**settings), "cpu"
     ).images.numpy()
     truth = np.stack([light(c) for c in scene.cameras])
     return float(np.sqrt(np.mean((images - truth) ** 2)))
@@ -64,6 +63,6 @@ def test_without_recordings_images_stay_as_they_are(scene):
 
 def test_first_points_take_the_corrected_gray(scene):
     """The gradient is one surface at no definite depth: what counts is that no point is brighter than the light."""
-    plain, flat = rig(scene, 0).values, rig_flat(scene, 0).values
+    plain, flat = rig(scene).values, rig(scene, flat_field=True).values
     assert plain.max() > 0.85 and flat.max() < 0.82
-    np.testing.assert_array_equal(rig_flat(replace(scene, recordings=()), 0).values, plain)
+    np.testing.assert_array_equal(rig(replace(scene, recordings=()), flat_field=True).values, plain)

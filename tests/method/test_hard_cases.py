@@ -15,16 +15,19 @@ from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import make_training_images, measure
+from spike4dgs.method.fit import measure
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.images import ImageSettings, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
-SETTINGS = TrainSettings(
-    coarse_steps=3, fine_steps=9, views_per_step=3, mlp_width=8, features=4, refine_every=3, flat_field=True
-)
+SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, views_per_step=3)
+SMALL = {"hexplane": {"mlp_width": 8, "features": 4}}  # of the motion
+FEW = ImageSettings(time_spacing_ticks=20, max_times=4, flat_field=True)
 HEIGHT, WIDTH, TICKS = 40, 64, 120
 
 
@@ -92,25 +95,29 @@ CASES = [
     "one tick", "100,000 ticks", "NaN gain", "NaN dark rate", "dead pixels",
 ]  # fmt: skip
 FITS = [
-    ("adaptive", "paths", "pixel", {"freeze_still": True}),
-    ("tfp", "hexplane", "spss", {}),
-    ("tfi", "spacetime", "pixel+spike", {}),
-    ("tfp", "static", "spike", {"spike_ticks": 1}),
-    ("tfstp", "spacetime-lite", "spike-render", {}),
+    ("adaptive", "paths", "pixel", {"freeze_background": True}, {}),
+    ("tfp", "hexplane", "spss", {}, {}),
+    ("tfi", "spacetime", "pixel+spike", {}, {}),
+    ("tfp", "static", "spike", {}, {"spike_ticks": 1}),
+    ("tfstp", "spacetime-lite", "spike-render", {}, {}),
 ]
 
 
-@pytest.mark.parametrize("images, motion, supervision, extra", FITS, ids=["+".join(f[:3]) for f in FITS])
+@pytest.mark.parametrize("images, motion, supervision, extra, loss", FITS, ids=["+".join(f[:3]) for f in FITS])
 @pytest.mark.parametrize("name", CASES)
-def test_losses_gradients_and_parameters_are_numbers(name, images, motion, supervision, extra) -> None:
+def test_losses_gradients_and_parameters_are_numbers(name, images, motion, supervision, extra, loss) -> None:
     if name == "100,000 ticks" and images == "tfstp":
-        pytest.skip("TFSTP looks at every tick before the image's: minutes")
-    scene, s = case(name), replace(SETTINGS, time_spacing_ticks=20, max_times=4, **extra)
+        pytest.skip("TFSTP reads every tick before the image's: minutes")
+    scene, s = case(name), replace(SETTINGS, **extra)
     start = surfaces(usual(), 0)
-    training_images = make_training_images(scene, start.cameras, IMAGES[images], s, "cpu")
-    model = MOTIONS[motion](measure(start, scene), s, seeded(0, -1))
+    training_images = make_training_images(scene, start.cameras, IMAGES[images], FEW, "cpu")
+    kind, comparison = MOTIONS[motion], SUPERVISIONS[supervision]
+    sizes = replace(kind.defaults, **SMALL.get(motion, {}))
+    model = kind(measure(start, scene), sizes, seeded(0, -1))
     gaussians = model.attach(from_points(start.points[::8], start.values[::8], opacity=0.5), training_images)
-    fit = Trainer(training_images, gaussians, model, SUPERVISIONS[supervision](s, scene), s, scale=1.0, seed=0)
+    compare = comparison(replace(comparison.defaults, **loss), scene)
+    density = DensitySettings(every=3)
+    fit = Trainer(training_images, gaussians, model, compare, s, density, scale=1.0, seed=0)
     while fit.step < fit.total:
         assert fit.train_step().isfinite()
         leaves = [*fit.gaussians.tensors().values(), *model.parameters(), *fit.supervision.parameters()]

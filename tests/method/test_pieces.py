@@ -10,19 +10,25 @@ from gaussian_clouds import cloud
 from saved_models import DURATION_US, gaussian_model, provenance
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Parts, RecipeMethod, Start, at_most, make_training_images, measure
+from spike4dgs.method.fit import Parts, RecipeMethod, at_most, measure
 from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.motion import spacetime
+from spike4dgs.method.images import ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.initialization import Initialization, Start
+from spike4dgs.method.motion import paths as paths_module
+from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS, Extent
 from spike4dgs.method.saved_model import load_model
 from spike4dgs.method.schedule import choose_time, stages
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
 
@@ -38,10 +44,12 @@ def surfaces(scene: TrainingScene, seed: int) -> Start:
     return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
-def paths(n_ticks: int) -> spacetime.Paths:
-    made = MOTIONS["paths"](Extent(torch.zeros(3), torch.ones(3), 1.0, n_ticks, 64), TrainSettings(), seeded(0, 0))
-    assert isinstance(made, spacetime.Paths)
-    return made
+TRUE = Initialization(lambda request: surfaces(request.scene, request.seed))
+
+
+def paths(n_ticks: int) -> Paths:
+    extent = Extent(torch.zeros(3), torch.ones(3), 1.0, n_ticks, 64, wanted_images(n_ticks, ImageSettings()))
+    return Paths(extent, PathSettings(), seeded(0, 0))
 
 
 @pytest.mark.parametrize(
@@ -49,11 +57,12 @@ def paths(n_ticks: int) -> spacetime.Paths:
 )
 def test_pieces_are_about_20_ms_long_and_odd(n_ticks: int, pieces: int) -> None:
     assert paths(n_ticks).pieces == pieces
-    assert MOTIONS["hexplane"](paths(n_ticks).extent, TrainSettings(), seeded(0, 0)).pieces == 1
+    hexplane = MOTIONS["hexplane"]
+    assert hexplane(paths(n_ticks).extent, hexplane.defaults, seeded(0, 0)).pieces == 1
 
 
 def test_stages_go_outwards_and_each_begins_where_its_neighbour_ends() -> None:
-    s = TrainSettings(coarse_steps=100, fine_steps=200, piece_steps=150, ramp=0.5)
+    s = TrainerSettings(coarse_steps=100, fine_steps=200, piece_steps=150, ramp=0.5)
     rest, *moving = stages(s, moves=True, pieces=5)
     assert not rest.deforms and [m.piece for m in moving] == [2, 1, 3, 0, 4]
     assert [m.neighbour for m in moving] == [None, 2, 2, 1, 3] and [m.steps for m in moving] == [200, *[150] * 4]
@@ -73,14 +82,16 @@ def test_stages_go_outwards_and_each_begins_where_its_neighbour_ends() -> None:
 
 @pytest.mark.parametrize("forward", [True, False])
 def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
-    """Place, orientation, opacity and velocity at the border are the same on both sides."""
+    """Position, orientation, opacity and velocity at the border are the same on both sides."""
     g, motion, h = cloud(seed=4, dtype=torch.float64), paths(1200), 1e-6
     before, after = (1.0, 0.0) if forward else (0.0, 1.0)
     follower = motion.continued(g, forward)
     old, new = motion.splats(g, before), motion.splats(follower, after)
     torch.testing.assert_close(new.means, old.means, rtol=0, atol=1e-12)
     torch.testing.assert_close(rotation_matrices(new.quats), rotation_matrices(old.quats), rtol=0, atol=1e-12)
-    fade = torch.exp(torch.tensor(-((0.5 / TrainSettings().static_life) ** 2)))  # of a new life, at a piece's end
+    fade = torch.exp(
+        torch.tensor(-((0.5 / PathSettings().static_temporal_scale) ** 2))
+    )  # of a new one, at a piece's end
     torch.testing.assert_close(new.opacities, old.opacities.clamp(1e-6) * fade.double(), rtol=1e-6, atol=1e-12)
 
     def speed(x, t):  # type: ignore[no-untyped-def]
@@ -91,17 +102,19 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     torch.testing.assert_close(speed(follower, 0.5), speed(follower, after), rtol=0, atol=1e-6)
 
 
-def trainer(**settings: float) -> Trainer:
+OFTEN = DensitySettings(every=2)
+
+
+def trainer(density: DensitySettings = OFTEN, **settings: int) -> Trainer:
     scene, start = WORLD.training, surfaces(WORLD.training, 0)
-    s = replace(
-        TrainSettings(coarse_steps=6, fine_steps=8, piece_steps=8, refine_every=2, views_per_step=3), **settings
-    )
-    s = replace(s, time_spacing_ticks=20, freeze_still=True)
-    extent = measure(start, scene)
-    motion = MOTIONS["paths"](extent, s, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
+    s = TrainerSettings(coarse_steps=6, fine_steps=8, piece_steps=8, views_per_step=3, freeze_background=True)
+    s, spaced = replace(s, **settings), ImageSettings(time_spacing_ticks=20)
+    extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
+    motion = Paths(extent, PathSettings(), seeded(0, -1))
+    training_images = make_training_images(scene, start.cameras, images, spaced, "cpu")
     first = motion.attach(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
-    return Trainer(training_images, first, motion, SUPERVISIONS["pixel"](s, scene), s, scale=extent.scale, seed=3)
+    loss = Pixel(Pixel.defaults, scene)
+    return Trainer(training_images, first, motion, loss, s, density, scale=extent.scale, seed=3)
 
 
 def quiet(done: int, total: int, note: str = "") -> None:
@@ -132,11 +145,12 @@ def test_a_piece_that_has_ended_stays_as_it_is() -> None:
 
 
 def test_a_cap_holds_whatever_the_images_size() -> None:
-    fit = trainer(fine_steps=30, coarse_steps=20, max_gaussians=1500, grow_gradient=0.0)
+    density = DensitySettings(every=2, max_gaussians=1500, grow_gradient=0.0)
+    fit = trainer(density, fine_steps=30, coarse_steps=20)
     start = len(fit.gaussians)
     fit.run(quiet)
-    assert start < 1500 and len(fit.still) + 750 <= 2250
-    assert all(len(g) <= max(750, start - len(fit.still)) for g in fit.pieces())
+    assert start < 1500 and len(fit.background) + 750 <= 2250
+    assert all(len(g) <= max(750, start - len(fit.background)) for g in fit.pieces())
 
 
 def test_a_start_with_more_points_than_the_cap_is_thinned() -> None:
@@ -150,9 +164,9 @@ def test_a_start_with_more_points_than_the_cap_is_thinned() -> None:
     assert not np.array_equal(points, at_most(500, start, 8)[0]) and at_most(10**6, start, 7)[0] is start.points
 
 
-def test_a_time_is_drawn_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
+def test_a_time_is_rendered_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
     """Also at the borders, at the ends, and by a model that was saved and loaded."""
-    models = [gaussian_model("paths", still=40) for _ in range(3)]
+    models = [gaussian_model("paths", background=40) for _ in range(3)]
     grays = (0.2, 0.5, 0.8)
     (first,) = models[0].pieces
     pieces = tuple(replace(first, colors=torch.full_like(first.colors, gray)) for gray in grays)
@@ -178,15 +192,16 @@ def test_a_time_is_drawn_by_the_piece_that_it_lies_in(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = Parts({"short": images}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
-    steps = {"coarse_steps": 100, "fine_steps": 250, "piece_steps": 200, "time_spacing_ticks": 20}
+    parts = Parts({"short": images}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
+    steps = {"trainer.coarse_steps": 100, "trainer.piece_steps": 200, "images.time_spacing_ticks": 20}
 
-    def fitted(**settings: float) -> FittedModel:
-        recipe = Recipe("test", "short", "true", "paths", "pixel", {**steps, "freeze_still": True, **settings})
-        return RecipeMethod(recipe, parts).fit(WORLD.training, Budget(), "cpu", 0, quiet)  # type: ignore[return-value]
+    def fitted(fine_steps: int) -> FittedModel:
+        settings = {**steps, "trainer.fine_steps": fine_steps, "trainer.freeze_background": True}
+        recipe = Recipe("test", "short", "true", "paths", "pixel", settings)
+        return RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest())  # type: ignore[return-value]
 
-    pieces = fitted()
-    monkeypatch.setattr(spacetime, "PIECE_TICKS", 10_000)
-    whole = fitted(fine_steps=650)
+    pieces = fitted(250)
+    monkeypatch.setattr(paths_module, "PIECE_TICKS", 10_000)
+    whole = fitted(650)
     assert (len(pieces.pieces), len(whole.pieces)) == (3, 1)
     assert WORLD.psnr(pieces, moving=True) > WORLD.psnr(whole, moving=True) + 2

@@ -12,12 +12,13 @@ from scipy.linalg import expm
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Parts, RecipeMethod, Start
+from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.pose_refinement import Poses, rigid_motion
 from spike4dgs.method.splat import Views
@@ -58,7 +59,7 @@ def truth(stream: object, ticks: list[int], gain: float) -> np.ndarray:
 
 
 def off(camera: Camera, seed: int) -> Camera:
-    """A camera that stands 2 cm and looks 0.6 degrees aside."""
+    """A camera that is off by 2 cm and 0.6 degrees."""
     rng = np.random.default_rng(seed)
     turn, shift = (size * x / np.linalg.norm(x) for size, x in zip((0.01, 0.02), rng.normal(size=(2, 3)), strict=True))
     R = rigid_motion(torch.tensor(np.concatenate([turn, np.zeros(3)]))).numpy()[:3, :3] @ camera.R
@@ -71,16 +72,14 @@ def wrong(scene: TrainingScene, seed: int) -> Start:
     return Start(cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
-PARTS = Parts({"truth": truth}, {"wrong": wrong}, MOTIONS, SUPERVISIONS)
+WRONG = Initialization(lambda request: wrong(request.scene, request.seed))
+PARTS = Parts({"truth": truth}, {"wrong": WRONG}, MOTIONS, SUPERVISIONS)
 
 
 def method(**settings: object) -> RecipeMethod:
     steps = {"coarse_steps": 400, "views_per_step": 4, "refine_poses": True}
-    return RecipeMethod(Recipe("test", "truth", "wrong", "static", "pixel", {**steps, **settings}), PARTS)
-
-
-def quiet(done: int, total: int, note: str = "") -> None:
-    """A progress that nobody watches."""
+    of_trainer = {f"trainer.{name}": value for name, value in {**steps, **settings}.items()}
+    return RecipeMethod(Recipe("test", "truth", "wrong", "static", "pixel", of_trainer), PARTS)
 
 
 def errors(cameras: tuple[Camera, ...]) -> tuple[float, float]:
@@ -92,7 +91,7 @@ def errors(cameras: tuple[Camera, ...]) -> tuple[float, float]:
 @pytest.mark.slow
 def test_wrong_poses_become_better_and_the_image_sharp() -> None:
     before = errors(wrong(SCENE, 0).cameras)
-    refined, kept = (method(refine_poses=r).fit(SCENE, Budget(), "cpu", 0, quiet) for r in (True, False))
+    refined, kept = (method(refine_poses=r).fit(SCENE, FitRequest()) for r in (True, False))
     assert isinstance(refined, FittedModel) and isinstance(kept, FittedModel)
     assert errors(kept.cameras) == before
     after = errors(refined.cameras)
@@ -109,16 +108,16 @@ def test_a_resumed_fit_has_the_same_poses(tmp_path: Path) -> None:
             raise Killed
 
     short = method(coarse_steps=30)
-    whole = short.fit(SCENE, Budget(), "cpu", 0, quiet)
+    whole = short.fit(SCENE, FitRequest())
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         patch.setattr("spike4dgs.method.trainer.Trainer.run.__defaults__", (None, "", 0.0))
-        short.fit(SCENE, Budget(), "cpu", 0, kill, tmp_path / "c.safetensors")
-    again = short.fit(SCENE, Budget(), "cpu", 0, quiet, tmp_path / "c.safetensors")
+        short.fit(SCENE, FitRequest(progress=kill, checkpoint=tmp_path / "c.safetensors"))
+    again = short.fit(SCENE, FitRequest(checkpoint=tmp_path / "c.safetensors"))
     for a, b, start in zip(whole.cameras, again.cameras, wrong(SCENE, 0).cameras, strict=True):
         np.testing.assert_array_equal(a.w2c, b.w2c)
         assert a.id == "cam_00" or not np.array_equal(a.w2c, start.w2c)
 
 
 def test_a_background_has_fixed_poses() -> None:
-    with pytest.raises(UserError, match="expected refine_poses or freeze_still, found both"):
-        method(freeze_still=True).fit(SCENE, Budget(), "cpu", 0, quiet)
+    with pytest.raises(UserError, match="expected trainer.refine_poses or trainer.freeze_background, found both"):
+        method(freeze_background=True).fit(SCENE, FitRequest())

@@ -1,5 +1,6 @@
 """Models on disk: the same images, one clear error for anything else, and what a run writes."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from spike4dgs.baselines.held_out_pose import RefinableModel, Refinement
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.results.provenance import Savable
 from spike4dgs.method.model_files.model_file import ModelFile, read_model, write_model
+from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.saved_model import load_model
 
+FLAT = Path(__file__).parent / "flat_settings_models"  # of a version with one flat list of settings
 MOVING = [name for name in MODELS if name != "static"]
 
 
@@ -33,6 +36,25 @@ def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path) -> None
         assert image.std() > 0.01, "a test of nothing"
         np.testing.assert_array_equal(loaded.model.render(camera, t_us), image)
     assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
+
+
+@pytest.mark.parametrize("name", ["hexplane", "paths", "spacetime"])
+def test_a_model_of_the_version_with_flat_settings_renders_as_then(name: str, tmp_path: Path) -> None:
+    """The same tensors by the same names, other settings; to the bit here, and elsewhere within the processor's."""
+    loaded = load_model(FLAT / f"{name}.safetensors")
+    frames = np.load(FLAT / "frames.npz")
+    loaded.model.save(tmp_path / "m", loaded.provenance)
+    again = load_model(tmp_path / "m").model
+    for share in (0.1, 0.9):
+        image = loaded.model.render(WORLD.held_out, share * DURATION_US)
+        np.testing.assert_allclose(image, frames[f"{name}_{share}"], rtol=0, atol=1e-5)
+        np.testing.assert_array_equal(again.render(WORLD.held_out, share * DURATION_US), image)
+    old, new = (safetensors.torch.load_file(p) for p in (FLAT / f"{name}.safetensors", tmp_path / "m"))
+    assert old.keys() == new.keys() and all(torch.equal(v, new[k]) for k, v in old.items())
+    settings = read_model(tmp_path / "m").config["motion"]["settings"]
+    assert settings == dataclasses.asdict(MOTIONS[name].defaults) | (
+        {"features": 4, "mlp_width": 8} if name == "hexplane" else {}
+    )
 
 
 @pytest.mark.parametrize("name", MOVING)

@@ -1,33 +1,36 @@
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from toy_fits import PARTS, WORLD, images, method, silent, surfaces
+from toy_fits import PARTS, SMALL_PLANES, WORLD, images, method, request, silent, surfaces
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget
-from spike4dgs.method.fit import RecipeMethod, choose_ticks, make_training_images, measure
+from spike4dgs.method.fit import RecipeMethod, measure
 from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.gaussians.density import GradientStatistics, refine
+from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.images import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.observations.lookup import moving
+from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.schedule import choose_time, stages
-from spike4dgs.method.settings import TrainSettings, make_settings
+from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
 
 @cache
 def fitted(motion: str) -> FittedModel:
-    extra = {"coarse_steps": 160} if motion == "static" else {}
-    return method(motion, **extra).fit(WORLD.training, Budget(), "cpu", 0, silent)
+    extra = {"trainer.coarse_steps": 160} if motion == "static" else {}
+    return method(motion, extra).fit(WORLD.training, request())
 
 
 @pytest.mark.slow
-def test_a_moving_board_is_seen_from_a_new_place():
+def test_a_moving_board_is_seen_from_a_new_viewpoint():
     assert WORLD.psnr(fitted("hexplane"), moving=False) > 25
 
 
@@ -41,49 +44,46 @@ def test_deformation_beats_a_static_scene_where_things_move():
     assert WORLD.psnr(fitted("hexplane"), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
 
 
-def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", **settings: float) -> Trainer:
+def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", **settings: Any) -> Trainer:
     scene = WORLD.training
-    s = replace(
-        TrainSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, mlp_width=16, views_per_step=3),
-        refine_every=2,
-        time_spacing_ticks=40,
-        **settings,
-    )
+    s = TrainerSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, views_per_step=3, **settings)
     start = surfaces(scene, 0)
     extent = measure(start, scene)
     first = from_points(start.points[::3], start.values[::3], opacity=0.5)
-    model = MOTIONS[motion](extent, s, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
-    loss = SUPERVISIONS[supervision](s, scene)
-    return Trainer(training_images, model.attach(first, training_images), model, loss, s, scale=extent.scale, seed=3)
+    sizes = {"mlp_width": 16} if motion == "hexplane" else {}
+    model = MOTIONS[motion](extent, replace(MOTIONS[motion].defaults, **sizes), seeded(0, -1))
+    training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
+    loss = SUPERVISIONS[supervision](SUPERVISIONS[supervision].defaults, scene)
+    gaussians, density = model.attach(first, training_images), DensitySettings(every=2)
+    return Trainer(training_images, gaussians, model, loss, s, density, scale=extent.scale, seed=3)
 
 
 @pytest.mark.parametrize("motion", ["paths", "hexplane"])
 def test_what_never_changes_is_frozen_after_the_static_stage(motion: str) -> None:
     """Frozen Gaussians lie where the views see no change, and nothing touches them again."""
-    fit = trainer(24, motion=motion, freeze_still=True)
+    fit = trainer(24, motion=motion, freeze_background=True)
     while fit.step < 8:
         fit.train_step()
-    assert len(fit.still) == 0
+    assert len(fit.background) == 0
     fit.train_step()
-    frozen = {k: v.clone() for k, v in fit.still.tensors().items()}
-    assert len(fit.still) > 50 and len(fit.gaussians) > 50
+    frozen = {k: v.clone() for k, v in fit.background.tensors().items()}
+    assert len(fit.background) > 50 and len(fit.gaussians) > 50
     limit = fit.settings.moving_change
     assert (
-        moving(fit.still.means, fit.training_images).max()
+        variation_at(fit.background.means, fit.training_images).max()
         <= limit
-        < moving(fit.gaussians.means.detach(), fit.training_images).max()
+        < variation_at(fit.gaussians.means.detach(), fit.training_images).max()
     )
     before = fit.gaussians.colors.detach().clone()
     while fit.step < 10:
         fit.train_step()
     assert not torch.equal(before, fit.gaussians.colors)
-    assert all(torch.equal(v, fit.still.tensors()[k]) for k, v in frozen.items())
+    assert all(torch.equal(v, fit.background.tensors()[k]) for k, v in frozen.items())
 
 
-def test_paths_lay_nothing_down_where_the_background_is_not_drawn() -> None:
+def test_paths_lay_nothing_down_where_the_background_is_not_rendered() -> None:
     """Guided sampling would take what is frozen for missing."""
-    fit = trainer(24, motion="paths", freeze_still=True)
+    fit = trainer(24, motion="paths", freeze_background=True)
     while fit.step < 12:
         fit.train_step()
     assert fit.motion.guide(fit.gaussians, fit.training_images, seeded(0, 0)) is fit.gaussians
@@ -102,7 +102,7 @@ PARTS_WITH_STATE = {
     "hexplane": {},
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
-    "paths": {"motion": "paths", "freeze_still": True, "steps": 24},  # a background from step 8 on
+    "paths": {"motion": "paths", "freeze_background": True, "steps": 24},  # a background from step 8 on
 }
 
 
@@ -152,28 +152,28 @@ def test_one_seed_one_result_and_another_seed_another():
     assert not torch.equal(tensors(other)["gaussians.means"][:50], uninterrupted()["gaussians.means"][:50])
 
 
-def test_refinement_changed_the_number_of_gaussians():
+def test_densification_changed_the_number_of_gaussians():
     assert len(uninterrupted()["gaussians.means"]) != len(trainer().gaussians)
 
 
 def test_finished_fit_is_read_back_from_its_checkpoint(tmp_path):
     path = tmp_path / "fit.safetensors"
-    small = method("hexplane", coarse_steps=2, fine_steps=3)
-    one = small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
-    two = small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+    small = method("hexplane", {"trainer.coarse_steps": 2, "trainer.fine_steps": 3})
+    one = small.fit(WORLD.training, request(checkpoint=path))
+    two = small.fit(WORLD.training, request(checkpoint=path))
     images = [m.render(WORLD.held_out, 3000.0) for m in (one, two)]
     assert images[0].dtype == np.float32 and np.array_equal(*images) and path.is_file()
 
 
 def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
     path = tmp_path / "fit.safetensors"
-    small = method("static", coarse_steps=1)
-    small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+    small = method("static", {"trainer.coarse_steps": 1})
+    small.fit(WORLD.training, request(checkpoint=path))
     with pytest.raises(UserError, match="another fit's; delete it"):
-        small.fit(WORLD.training, Budget(), "cpu", 1, silent, path)
+        small.fit(WORLD.training, request(seed=1, checkpoint=path))
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(UserError, match=r"fit.safetensors: expected a checkpoint, found damaged data"):
-        small.fit(WORLD.training, Budget(), "cpu", 0, silent, path)
+        small.fit(WORLD.training, request(checkpoint=path))
 
 
 @pytest.mark.parametrize(
@@ -188,22 +188,49 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
 def test_unknown_part_is_named(change, message):
     recipe = replace(method("static").recipe, **change)
     with pytest.raises(UserError, match=message):
-        RecipeMethod(recipe, PARTS).fit(WORLD.training, Budget(), "cpu", 0, silent)
+        RecipeMethod(recipe, PARTS)
 
 
-@pytest.mark.parametrize(("name", "value"), [("steps", 3), ("coarse_steps", 2.5), ("ramp", "slow"), ("levels", True)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("steps", 3), ("coarse_steps", 2.5), ("ramp", "slow"), ("refine_poses", 1)]
+)
 def test_unknown_setting_or_wrong_type_is_refused(name, value):
     with pytest.raises(UserError, match=name):
-        make_settings({name: value}, "recipe x", TrainSettings())
+        make_settings({name: value}, "recipe x", TrainerSettings())
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("motion.lr_gird", "expected settings among motion.cell_px, .*motion.tv_weight, found 'motion.lr_gird'"),
+        ("density.refine", "expected settings among density.every, density.grow_gradient, .* found 'density.refine'"),
+        ("lr_grid", "PART.NAME, PART among density, images, initialization, motion, supervision, trainer, found 'lr_g"),
+        ("optimizer.lr", "PART among density, .*, found 'optimizer.lr'; correct the name"),
+        ("initialization.seed", "expected no settings of initialization, found 'initialization.seed'"),
+    ],
+)
+def test_an_unknown_name_lists_the_parts_names_and_an_unknown_part_the_parts(name, message):
+    with pytest.raises(UserError, match=f"recipe test: .*{message}"):
+        method("hexplane", {name: 1.0})
+
+
+def test_settings_are_overridden_and_recorded_by_part():
+    made = method("hexplane", {"motion.lr_grid": 5e-3, "images.time_spacing_ticks": 20})
+    settings = made.params["settings"]
+    assert settings["motion"]["lr_grid"] == 5e-3 and settings["images"]["time_spacing_ticks"] == 20
+    assert settings["motion"]["features"] == SMALL_PLANES["motion.features"] and settings["initialization"] == {}
+    assert set(settings) == {"images", "initialization", "motion", "supervision", "trainer", "density"}
+    found = override({"images": ImageSettings()}, {"images.max_times": 9}, "here")
+    assert found == {"images": ImageSettings(max_times=9)}
 
 
 def test_device_that_is_not_there_is_refused():
     with pytest.raises(UserError, match="device"):
-        method("static").fit(WORLD.training, Budget(), "cuda:63", 0, silent)
+        method("static").fit(WORLD.training, request(device="cuda:63"))
 
 
 def test_budget_scales_steps_only():
-    s = TrainSettings()
+    s = TrainerSettings()
     half = s.scaled(0.5)
     steps = ("coarse_steps", "fine_steps", "piece_steps")
     assert all(getattr(half, name) == getattr(s, name) // 2 for name in steps)
@@ -211,7 +238,7 @@ def test_budget_scales_steps_only():
 
 
 def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
-    s = TrainSettings(coarse_steps=200, fine_steps=400, ramp=0.5, coarse_share=0.2)
+    s = TrainerSettings(coarse_steps=200, fine_steps=400, ramp=0.5, coarse_share=0.2)
     coarse, fine = stages(s, moves=True)
     first = {choose_time(s, coarse, step, 100) for step in range(200)}
     assert min(first) >= 39 and max(first) <= 60 and len(first) > 15
@@ -228,7 +255,7 @@ def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
 
 @pytest.mark.parametrize("n_ticks", [1, 5, 80, 400, 10000])
 def test_training_ticks_lie_inside_the_clip_and_are_bounded(n_ticks):
-    ticks = choose_ticks(n_ticks, TrainSettings())
+    ticks = choose_ticks(n_ticks, ImageSettings())
     assert 0 <= ticks[0] and ticks[-1] < n_ticks and len(ticks) <= 256 and list(ticks) == sorted(set(ticks))
 
 
@@ -242,15 +269,15 @@ def test_extent_comes_from_the_points_and_not_only_from_the_array():
 
 
 def test_full_scene_relocates_and_open_scene_prunes_and_grows():
-    s = TrainSettings()
+    s = DensitySettings()
     g = from_points(
         np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32), np.ones(20, np.float32), opacity=0.5
     )
     g.logits[:5] = -10.0
     statistics = GradientStatistics(torch.full((20,), 1.0), torch.ones(20))
-    (moved,) = refine(g, statistics, s, 1.0, 15, torch.Generator())
+    (moved,) = adapt_density(g, statistics, s, 1.0, 15, torch.Generator())
     assert len(moved.gaussians) == 20 and (moved.gaussians.logits > -6).all()
-    (grown,) = refine(g, statistics, s, 1.0, 40, torch.Generator())
+    (grown,) = adapt_density(g, statistics, s, 1.0, 40, torch.Generator())
     assert len(grown.gaussians) == 30 and (grown.source[:5] < 15).sum() >= 0
-    (calm,) = refine(g, GradientStatistics.zero(20, g.means.device), s, 1.0, 40, torch.Generator())
+    (calm,) = adapt_density(g, GradientStatistics.zero(20, g.means.device), s, 1.0, 40, torch.Generator())
     assert len(calm.gaussians) == 15 and (calm.source >= 5).all()

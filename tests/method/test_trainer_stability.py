@@ -7,20 +7,22 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from toy_fits import WORLD, images, method, silent, surfaces
+from toy_fits import WORLD, images, method, request, silent, surfaces
 
-from spike4dgs.benchmark.method import Budget
-from spike4dgs.method.fit import make_training_images, measure
+from spike4dgs.method.fit import measure
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
+from spike4dgs.method.images import ImageSettings, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference
 from spike4dgs.method.supervision.base import Render, Sample
-from spike4dgs.method.supervision.table import Pixel
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.supervision.pixel import Pixel
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
-SETTINGS = TrainSettings(coarse_steps=15, fine_steps=35, views_per_step=2, mlp_width=16, features=8)
+SETTINGS = TrainerSettings(coarse_steps=15, fine_steps=35, views_per_step=2)
 
 
 class PixelTwin(Pixel):
@@ -32,7 +34,7 @@ class PixelTwin(Pixel):
 
 
 class TrainerTwin(Trainer):
-    """Draws with the slow renderer, which is float64 throughout."""
+    """Renders with the slow renderer, which is float64 throughout."""
 
     def _render(self, splats: Splats, views: Views) -> RenderOutput:
         return render(splats, views, backend="reference")
@@ -43,10 +45,9 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     scene = WORLD.training
     start = surfaces(scene, 0)
     extent = measure(start, scene)
-    s = replace(SETTINGS, time_spacing_ticks=40)
     first = from_points(start.points[::9], start.values[::9], opacity=0.5)
-    model = MOTIONS[motion](extent, s, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
+    model = MOTIONS[motion](extent, MOTIONS[motion].defaults, seeded(0, -1))
+    training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
     gaussians = model.attach(first, training_images)
     twin = dtype == torch.float64
     if twin:
@@ -56,18 +57,19 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         )
         training_images = replace(training_images, views=views, images=training_images.images.double())
         model = model.double()
-    loss = (PixelTwin if twin else Pixel)(s, scene)
-    fit = (TrainerTwin if twin else Trainer)(training_images, gaussians, model, loss, s, scale=extent.scale, seed=3)
+    loss, density = (PixelTwin if twin else Pixel)(Pixel.defaults, scene), DensitySettings()
+    kind, size = TrainerTwin if twin else Trainer, {"scale": extent.scale, "seed": 3}
+    fit = kind(training_images, gaussians, model, loss, SETTINGS, density, **size)
     assert fit.gaussians.means.dtype == dtype
 
-    def drawn() -> Tensor:
+    def rendered() -> Tensor:
         with torch.no_grad():
             splats = [model.splats(fit.gaussians, t) for t in (0.1, 0.5, 0.9)]
             return torch.stack([fit._render(g, training_images.views).image[..., 0] for g in splats])
 
-    before = drawn()
+    before = rendered()
     fit.run(silent)
-    return before, drawn()
+    return before, rendered()
 
 
 @pytest.mark.slow
@@ -83,6 +85,7 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 @pytest.mark.slow
 def test_three_seeds_agree() -> None:
     """With as many steps as a fit has: after a quarter of them they are 0.3 dB apart."""
-    fits = [method("paths", fine_steps=900).fit(WORLD.training, Budget(), "cpu", seed, silent) for seed in range(3)]
+    long = method("paths", {"trainer.fine_steps": 900})
+    fits = [long.fit(WORLD.training, request(seed)) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
     assert max(scores) - min(scores) < 0.3

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from spike4dgs.benchmark.method import Budget, Progress
+from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
@@ -39,28 +39,21 @@ class CountMethod:
         self._die_at = die_at
         self.fits = 0
 
-    def fit(
-        self,
-        scene: TrainingScene,
-        budget: Budget,
-        device: str,
-        seed: int,
-        progress: Progress,
-        checkpoint: Path | None = None,
-    ) -> CountModel:
+    def fit(self, scene: TrainingScene, request: FitRequest) -> CountModel:
         self.fits += 1
+        checkpoint = request.checkpoint
         rates = np.stack([s.counts(0, s.n_ticks) / s.n_ticks / scene.radiance_gain for s in scene.streams])
-        weights, first = np.random.default_rng(seed).random(len(rates)), 0
+        weights, first = np.random.default_rng(request.seed).random(len(rates)), 0
         if checkpoint and checkpoint.exists():
             state = json.loads(checkpoint.read_text())
             weights, first = np.array(state["weights"]), state["step"]
         for step in range(first, self.params["steps"]):
             if step == self._die_at:
                 os.kill(os.getpid(), signal.SIGKILL)
-            weights = weights + 0.5 * budget.scale * (1 / len(rates) - weights)
+            weights = weights + 0.5 * request.budget.scale * (1 / len(rates) - weights)
             if checkpoint:
                 checkpoint.write_text(json.dumps({"weights": weights.tolist(), "step": step + 1}))
-            progress(step + 1, self.params["steps"], f"step {step}")
+            request.progress(step + 1, self.params["steps"], f"step {step}")
         return CountModel(weights, rates)
 
 

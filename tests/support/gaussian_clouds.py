@@ -17,9 +17,9 @@ def cloud(n: int = 12, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gau
 
     extra = {
         "times": torch.rand(n, generator=rng, dtype=dtype),
-        "lives": 0.5 * normal(n) - 1,
-        "paths": 0.3 * normal(n, 9),
-        "spins": 0.3 * normal(n, 4),
+        "log_temporal_scales": 0.5 * normal(n) - 1,
+        "coefficients": 0.3 * normal(n, 9),
+        "angular_velocities": 0.3 * normal(n, 4),
         "features": normal(n, 2),
     }
     return Gaussians(normal(n, 3), normal(n, 3) - 3, normal(n, 4), normal(n), normal(n, 1).abs(), extra)

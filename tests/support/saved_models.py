@@ -14,18 +14,16 @@ from toy_world import GAIN, RATE_HZ, ToyWorld
 from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
-from spike4dgs.method.motion.hexplane import HexPlaneShape
+from spike4dgs.method.motion.hexplane import HexPlaneSettings, HexPlaneShape
 from spike4dgs.method.motion.table import MOTIONS, Extent
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.radiance_field.model import Bounds, DynamicField, FieldShape, RadianceModel
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views
+from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.tracking.model import TrackedModel, Tracks
-from spike4dgs.method.trainer import seeded
 
 WORLD = ToyWorld(width=40, height=24, side=2, n_ticks=100)
 DURATION_US = WORLD.n_ticks * 1e6 / RATE_HZ
-SETTINGS = TrainSettings(features=4, mlp_width=8)
 LOW, HIGH = torch.tensor([-1.5, -0.5, 0.0]), torch.tensor([1.5, 1.0, 1.5])
 
 
@@ -59,22 +57,23 @@ def shaken(module: nn.Module, size: float) -> nn.Module:
 
 
 def points(n: int = 120) -> Gaussians:
-    """Gaussians of many grays before the cameras."""
+    """Gaussians of many grays in front of the cameras."""
     rng = np.random.default_rng(2)
-    places = rng.uniform(LOW.numpy(), HIGH.numpy(), (n, 3)).astype(np.float32)
-    return from_points(places, rng.uniform(0.2, 1, n).astype(np.float32), opacity=0.8)
+    at = rng.uniform(LOW.numpy(), HIGH.numpy(), (n, 3)).astype(np.float32)
+    return from_points(at, rng.uniform(0.2, 1, n).astype(np.float32), opacity=0.8)
 
 
-def gaussian_model(motion: str, still: int = 0) -> FittedModel:
-    """A model of the trainer with any motion; some of its Gaussians stand still beside it."""
-    spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), SETTINGS)
+def gaussian_model(motion: str, background: int = 0) -> FittedModel:
+    """A model of the trainer with any motion, and some static Gaussians behind it."""
+    settings = HexPlaneSettings(features=4, mlp_width=8) if motion == "hexplane" else MOTIONS[motion].defaults
+    spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), settings)
     made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.2)
-    footage = TrainingImages(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
-    gaussians = made.attach(points(), footage)
+    images = TrainingImages(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
+    gaussians = made.attach(points(), images)
     rng = seeded(4, 0)
     extra = {k: v + 0.1 * torch.randn(v.shape, generator=rng) for k, v in gaussians.extra.items()}
     moved = Gaussians.from_tensors({**gaussians.tensors(), **extra})
-    return FittedModel((moved,), points().rows(torch.arange(still)), made, DURATION_US, "cpu", spec)
+    return FittedModel((moved,), points().rows(torch.arange(background)), made, DURATION_US, "cpu", spec)
 
 
 def tracked_model() -> TrackedModel:
@@ -96,7 +95,7 @@ def field_model() -> RadianceModel:
 
 MODELS: dict[str, Callable[[], Any]] = {
     **{name: (lambda name=name: gaussian_model(name)) for name in MOTIONS},
-    "hexplane, some still": lambda: gaussian_model("hexplane", still=40),
+    "hexplane, background": lambda: gaussian_model("hexplane", background=40),
     "tracking": tracked_model,
     "radiance-field": field_model,
 }

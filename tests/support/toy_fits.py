@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.fit import Parts, RecipeMethod, Start
+from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
@@ -32,9 +34,17 @@ def surfaces(scene: TrainingScene, seed: int) -> Start:
     return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
-PARTS = Parts({"short": images}, {"true": surfaces}, MOTIONS, SUPERVISIONS)
-QUICK = {"coarse_steps": 60, "fine_steps": 300, "mlp_width": 16, "features": 8, "views_per_step": 4}
+TRUE = Initialization(lambda request: surfaces(request.scene, request.seed))
+PARTS = Parts({"short": images}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
+QUICK = {"trainer.coarse_steps": 60, "trainer.fine_steps": 300, "trainer.views_per_step": 4}
+SMALL_PLANES = {"motion.mlp_width": 16, "motion.features": 8}
 
 
-def method(motion: str, **settings: float) -> RecipeMethod:
-    return RecipeMethod(Recipe("test", "short", "true", motion, "pixel", {**QUICK, **settings}), PARTS)
+def method(motion: str, settings: Mapping[str, Any] | None = None) -> RecipeMethod:
+    quick = {**QUICK, **(SMALL_PLANES if motion == "hexplane" else {})}
+    return RecipeMethod(Recipe("test", "short", "true", motion, "pixel", {**quick, **(settings or {})}), PARTS)
+
+
+def request(seed: int = 0, **changes: Any) -> FitRequest:
+    """A request for the quick budget on the CPU."""
+    return FitRequest(seed=seed, progress=silent, **changes)

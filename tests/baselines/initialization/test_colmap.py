@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.initialization import colmap as module
-from spike4dgs.baselines.initialization.colmap import Mapping, clip_means, colmap, colmap_flat, map_views
-from spike4dgs.baselines.initialization.rig import rig_flat
+from spike4dgs.baselines.initialization.colmap import Mapping, clip_means, colmap, map_views
+from spike4dgs.baselines.initialization.rig import rig
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.calibration import Recordings
@@ -91,10 +91,10 @@ def test_few_points_are_replaced_by_a_plane_sweep_with_the_estimated_cameras(mon
 
 def test_points_of_corrected_images_come_from_a_plane_sweep_at_the_estimated_poses() -> None:
     scene = WORLD.training
-    start = colmap_flat(scene, 0)
+    start = colmap(scene, 0, flat_field=True)
     summary = pose_errors(start.cameras, scene.cameras).summary()
     assert 0 < summary["rotation_max_deg"] < 0.5 and summary["translation_of_array"] < 0.05, summary
-    given = rig_flat(scene, 0)
+    given = rig(scene, flat_field=True)
     assert len(start.points) > 0.8 * len(given.points) > 500
     assert not np.array_equal(start.points[:100], given.points[:100])
 
@@ -130,7 +130,7 @@ def test_features_are_sought_in_images_without_the_pixels_pattern(monkeypatch: p
         return map_views(scene, images, seed, calibrated=calibrated)
 
     monkeypatch.setattr(module, "map_views", watched)
-    assert len(colmap_flat(scene, 0).cameras) == 8
+    assert len(colmap(scene, 0, flat_field=True).cameras) == 8
     truth = np.stack([even.look(camera, 0.5)[0] for camera in scene.cameras])
     corrected, plain = (np.sqrt(np.mean((p - truth) ** 2)) for p in (seen[0], clip_means(scene)))
     assert corrected < 0.012 < 0.03 < plain

@@ -13,7 +13,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines.initialization import dust3r as module
 from spike4dgs.baselines.initialization.colmap import clip_means
-from spike4dgs.baselines.initialization.dust3r import Pair, dust3r, place, predictor, resized
+from spike4dgs.baselines.initialization.dust3r import Pair, dust3r, predictor, resized, solve
 from spike4dgs.baselines.initialization.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
@@ -206,7 +206,7 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(
         points = [scale * (seen(i) + 1e-3 * rng.normal(size=seen(i).shape)) for i in (0, other)]
         return Pair((points[0], points[1]), (sure, sure))
 
-    start = place(predict, views, shown, scene, 0, calibrated=calibrated)
+    start = solve(predict, views, shown, scene, 0, calibrated=calibrated)
     summary = pose_errors(start.cameras, scene.cameras).summary()
     assert summary["rotation_max_deg"] < 0.1 and summary["translation_of_array"] < 0.01
     assert start.cameras[4].fx == pytest.approx(scene.cameras[4].fx, rel=1e-9 if calibrated else 2e-3)

@@ -37,7 +37,7 @@ def guess(error: float) -> NDArray[np.float64]:
     return points
 
 
-def place(error: float = 0.1) -> Mapping:
+def solve(error: float = 0.1) -> Mapping:
     return bundle(SCENE, guess(error), FACTOR, clip_means(SCENE), 0)
 
 
@@ -48,7 +48,7 @@ def errors(found: Mapping) -> PoseErrors:
 
 @pytest.fixture(scope="module")
 def found() -> Mapping:
-    return place()
+    return solve()
 
 
 def test_a_guess_wrong_by_a_tenth_gives_good_poses(found: Mapping) -> None:
@@ -66,7 +66,7 @@ def test_points_lie_on_the_surfaces(found: Mapping) -> None:
 
 
 def test_how_wrong_the_guess_was_does_not_matter_in_the_end(found: Mapping) -> None:
-    a, b = errors(found), errors(place(0.2))
+    a, b = errors(found), errors(solve(0.2))
     assert np.abs(a.rotation_deg - b.rotation_deg).max() < 0.02
 
 
@@ -82,14 +82,14 @@ def test_a_view_that_begins_at_a_wrong_place_is_placed_again(found: Mapping, mon
         return poses
 
     monkeypatch.setattr(module, "_first_poses", one_wrong)
-    assert np.abs(errors(place()).rotation_deg - errors(found).rotation_deg).max() < 0.05
+    assert np.abs(errors(solve()).rotation_deg - errors(found).rotation_deg).max() < 0.05
 
 
 def test_the_same_seed_gives_the_same_poses_and_nothing_stays_behind(
     found: Mapping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    for a, b in zip(place().cameras, found.cameras, strict=True):
+    for a, b in zip(solve().cameras, found.cameras, strict=True):
         assert np.array_equal(a.w2c, b.w2c)
     assert not os.listdir(tmp_path)
     printed = capfd.readouterr()

@@ -13,24 +13,24 @@ from hypothesis import strategies as st
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.initialization.msdi import (
-    Glance,
+    Estimate,
     block_means,
     completed,
+    infer,
     inverse_depth_line,
-    look,
     msdi,
     msdi_matched,
     shrunk,
     unposed,
 )
-from spike4dgs.baselines.initialization.rig import Cloud, matched, rig_flat
+from spike4dgs.baselines.initialization.rig import Cloud, matched, rig
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.method.fit import Start
+from spike4dgs.method.initialization import Start
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.training.data import points_of
@@ -43,17 +43,17 @@ OFF = slice(10, 16)  # rows of which the perfect network says that it is not sur
 
 
 @pytest.fixture(scope="module")
-def perfect() -> Glance:
+def perfect() -> Estimate:
     """The truth at half the size and another scale; some rows are far off, and known to be."""
     cameras = tuple(shrunk(c, 2) for c in SCENE.cameras)
-    looks = [WORLD.look(c, 0.5) for c in cameras]
+    frames = [WORLD.look(c, 0.5) for c in cameras]
     relative = np.stack([c.w2c @ np.linalg.inv(cameras[0].w2c) for c in cameras])
-    depth = np.array([x[1] for x in looks], np.float32)
+    depth = np.array([x[1] for x in frames], np.float32)
     points = points_of(depth, np.stack([c.K for c in cameras]), relative).astype(np.float64) / SCALE
     confidence = np.full(depth.shape, 9.0)
     points[:, OFF] *= 5
     confidence[:, OFF] = 1.1
-    return Glance(2, cameras, np.array([x[0] for x in looks], np.float32), points, confidence)
+    return Estimate(2, cameras, np.array([x[0] for x in frames], np.float32), points, confidence)
 
 
 def depth_errors(start: Start, camera: Camera) -> np.ndarray:
@@ -73,7 +73,7 @@ def near_edge(board: np.ndarray) -> np.ndarray:
     return found
 
 
-def test_holes_of_the_matched_points_take_the_networks(perfect: Glance) -> None:
+def test_holes_of_the_matched_points_take_the_networks(perfect: Estimate) -> None:
     """A network that is right but for a line through its inverse depths, and matches of one half of the image."""
     camera = SCENE.cameras[0]
     _, truth, board = WORLD.look(camera, 0.5)
@@ -110,7 +110,7 @@ def test_a_line_is_found_through_outliers(a: float, b: float, seed: int) -> None
     np.testing.assert_allclose(found, (a, b), atol=0.01 * a)
 
 
-def test_without_a_rising_line_the_matched_points_are_all(perfect: Glance) -> None:
+def test_without_a_rising_line_the_matched_points_are_all(perfect: Estimate) -> None:
     camera = SCENE.cameras[0]
     v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
     depth = WORLD.look(camera, 0.5)[1][v, u]
@@ -120,14 +120,14 @@ def test_without_a_rising_line_the_matched_points_are_all(perfect: Glance) -> No
         assert completed(cloud, perfect) is cloud
 
 
-def test_the_start_is_rig_flats_where_views_match(drawn: Path) -> None:
-    start, flat = msdi(SCENE, 0), rig_flat(SCENE, 0)
+def test_the_start_is_that_of_corrected_images_where_views_match(drawn: Path) -> None:
+    start, flat = msdi(SCENE), rig(SCENE, flat_field=True)
     assert start.cameras is SCENE.cameras
     n = len(matched(SCENE, flat_field=True)[0].points)
     np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 
-def test_without_poses_the_rig_is_found_again(perfect: Glance) -> None:
+def test_without_poses_the_rig_is_found_again(perfect: Estimate) -> None:
     start = unposed(SCENE, perfect, seed=0, calibrated=False)
     for found, true in zip(start.cameras, SCENE.cameras, strict=True):
         assert angle_deg(found.R @ true.R.T) < 0.1
@@ -142,8 +142,8 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     scene, camera = world.training, world.training.cameras[0]
     truth, depth, _ = world.look(camera, 0.5)
     seen = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None]).astype(np.float64) / SCALE
-    glance = Glance(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
-    monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.look", lambda scene, calibrated: glance)
+    estimate = Estimate(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
+    monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.infer", lambda scene, calibrated: estimate)
     start = msdi_matched(scene, 0)
     for found, true in zip(start.cameras, scene.cameras, strict=True):
         assert angle_deg(found.R @ true.R.T) < 0.3 and found.fx == true.fx
@@ -154,7 +154,7 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     assert inside.sum() > 2000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
 
 
-def test_a_view_without_a_pose_is_named(perfect: Glance) -> None:
+def test_a_view_without_a_pose_is_named(perfect: Estimate) -> None:
     points = perfect.points.copy()
     points[2] = np.random.default_rng(0).normal(size=points[2].shape)
     with pytest.raises(UserError, match=f"a pose for each view, found none for {SCENE.cameras[2].id}"):
@@ -187,9 +187,9 @@ def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_network_in_use_looks_at_the_middle_of_the_clip(drawn: Path) -> None:
-    glance = look(SCENE, calibrated=True)
-    assert glance.factor == 1 and glance.points.shape == (8, 61, 96, 3) and glance.images.shape == (8, 61, 96)
-    assert np.isfinite(glance.points).all() and (glance.confidence > 1).all()
+    estimate = infer(SCENE, calibrated=True)
+    assert estimate.factor == 1 and estimate.points.shape == (8, 61, 96, 3) and estimate.images.shape == (8, 61, 96)
+    assert np.isfinite(estimate.points).all() and (estimate.confidence > 1).all()
 
 
 def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path) -> None:
@@ -198,7 +198,7 @@ def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path)
     torch.nn.init.normal_(network.encoder.ray_embed.weight, std=0.1)
     longer = replace(SCENE, cameras=tuple(replace(c, fx=1.3 * c.fx, fy=1.3 * c.fy) for c in SCENE.cameras))
     for calibrated in (True, False):
-        a, b = (look(s, calibrated=calibrated).points for s in (SCENE, longer))
+        a, b = (infer(s, calibrated=calibrated).points for s in (SCENE, longer))
         assert np.array_equal(a, b) != calibrated
 
 
@@ -219,5 +219,5 @@ def test_images_are_the_networks_and_know_the_camera(drawn: Path) -> None:
 def test_without_weights_it_is_said_how_to_train_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "absent.safetensors"))
     with pytest.raises(WeightsError, match="train it with `spike4dgs train-msdi`"):
-        msdi(SCENE, 0)
+        msdi(SCENE)
     assert IMAGES["msdi"].learned() is None

@@ -86,11 +86,11 @@ def test_views_agree_on_true_depths_and_not_on_chance():
 
 @pytest.fixture(scope="module")
 def start():
-    return rig(WORLD.training, 0)
+    return rig(WORLD.training)
 
 
 def test_rig_keeps_the_calibrated_poses_and_is_deterministic(start):
-    again = rig(WORLD.training, 1)
+    again = rig(WORLD.training)
     assert start.cameras == WORLD.training.cameras
     assert np.array_equal(again.points, start.points) and np.array_equal(again.values, start.values)
 
@@ -125,5 +125,5 @@ def test_scene_without_any_texture_still_gives_points(spikes):
     packed = np.full((40, 30), 0 if spikes == "none" else 255, np.uint8)
     cameras = ToyWorld(width=20, height=12).training.cameras
     streams = tuple(SpikeStream(packed, 20, 12, RATE_HZ) for _ in cameras)
-    start = rig(TrainingScene("flat", "flat", cameras, streams, RATE_HZ, 40, GAIN), 0)
+    start = rig(TrainingScene("flat", "flat", cameras, streams, RATE_HZ, 40, GAIN))
     assert len(start.points) > 20 and np.isfinite(start.points).all() and np.isfinite(start.values).all()

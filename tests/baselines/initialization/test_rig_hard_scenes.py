@@ -12,7 +12,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import Start
+from spike4dgs.method.initialization import Start
 
 STILL = ToyWorld(width=96, height=60, n_ticks=200, travel=0.0)
 MOVING = ToyWorld(width=96, height=60, n_ticks=240, travel=0.5)  # 18 px
@@ -21,7 +21,7 @@ SMALL = ToyWorld(width=40, height=24, n_ticks=30)
 
 @cache
 def start(world: ToyWorld) -> Start:
-    return rig(world.training, 0)
+    return rig(world.training)
 
 
 def distance(world: ToyWorld, points: np.ndarray, *times: float) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +92,7 @@ def test_background_that_the_middle_of_the_clip_hides_is_found_at_its_ends(t: fl
 
 @pytest.mark.parametrize("seed", range(6))
 def test_points_by_chance_are_not_taken_for_a_scene(seed: int) -> None:
-    s = rig(gray_scene(SMALL.training.cameras[:4], seed), 0)
+    s = rig(gray_scene(SMALL.training.cameras[:4], seed))
     assert len(s.points) >= 100 and s.points.dtype == s.values.dtype == np.float32
     assert np.isfinite(s.points).all() and np.isfinite(s.values).all()
     assert np.median(s.values) == pytest.approx(0.5, abs=0.1)
@@ -100,7 +100,7 @@ def test_points_by_chance_are_not_taken_for_a_scene(seed: int) -> None:
 
 def test_two_cameras_and_a_clip_shorter_than_a_window_are_enough_to_begin() -> None:
     scene = SMALL.training
-    s = rig(dataclasses.replace(scene, cameras=scene.cameras[:2], streams=scene.streams[:2]), 0)
+    s = rig(dataclasses.replace(scene, cameras=scene.cameras[:2], streams=scene.streams[:2]))
     assert len(s.points) >= 100 and np.isfinite(s.points).all()
 
 
@@ -108,4 +108,4 @@ def test_two_cameras_and_a_clip_shorter_than_a_window_are_enough_to_begin() -> N
 def test_cameras_in_one_place_are_a_user_error(chosen: tuple[int, ...]) -> None:
     scene = gray_scene(tuple(SMALL.cameras[i] for i in chosen), 0)
     with pytest.raises(UserError, match=f"scene gray: expected training cameras apart .* found {len(chosen)} in one"):
-        rig(scene, 0)
+        rig(scene)

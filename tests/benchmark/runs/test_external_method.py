@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import shutil
 import subprocess
@@ -13,28 +14,34 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_scenes import write_small_scene
 from skimage.metrics import peak_signal_noise_ratio
+from small_scenes import write_small_scene
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.cli import main
-from spike4dgs.benchmark.method import Budget, find_methods
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import FitRequest, check_protocol, find_methods, get_method
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The example package, built and installed by pip into a folder of its own, which is on the path."""
-    root = tmp_path_factory.mktemp("external")
-    source, target = shutil.copytree(EXAMPLES / "external_method", root / "source"), root / "site"
+def install(source: Path, target: Path) -> None:
+    """Build a package and install it into a folder of its own, by pip."""
     offline = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check", "--quiet")
     command = [sys.executable, "-m", "pip", "install", *offline, "--target", str(target), str(source)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of the installed example package, which is on the path."""
+    root = tmp_path_factory.mktemp("external")
+    source, target = shutil.copytree(EXAMPLES / "external_method", root / "source"), root / "site"
+    install(source, target)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(target))
         yield target
@@ -86,7 +93,7 @@ def test_the_example_reconstructs_something(installed: Path) -> None:
     world = ToyWorld()
     values = {}
     for name in ("plane-blend", "nearest-view"):
-        model = find_methods()[name].fit(world.training, Budget(), "cpu", 0, lambda *_: None)
+        model = find_methods()[name].fit(world.training, FitRequest())
         image = model.render(world.held_out, 120 * 50.0)
         truth = world.look(world.held_out, 0.5)[0]
         values[name] = peak_signal_noise_ratio(truth, np.clip(image, 0, 1).astype(np.float64), data_range=1)
@@ -125,6 +132,70 @@ def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, tmp_path:
         counts = [scene.stream(camera).counts(*window) for camera in scene.train]
         expected = np.mean(counts, axis=0) / (window[1] - window[0]) / scene.radiance_gain
         np.testing.assert_allclose(read_exr(predictions / f"{target.name}.exr"), expected, rtol=1e-3)
+
+
+@pytest.fixture
+def outdated(tmp_path: Path) -> Iterator[Path]:
+    """The example package as it was written against the earlier protocol, installed."""
+    source, target = shutil.copytree(EXAMPLES / "external_method", tmp_path / "source"), tmp_path / "site"
+    module = source / "plane_blend.py"
+    text = module.read_text()
+    earlier = text.replace("(self, scene, request)", "(self, scene, budget, device, seed, progress, checkpoint=None)")
+    module.write_text(earlier.replace("request.progress(", "progress("))
+    assert module.read_text() != text
+    install(source, target)
+    loaded = sys.modules.pop("plane_blend", None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(target))
+        yield target
+    sys.modules.pop("plane_blend", None)
+    if loaded:
+        sys.modules["plane_blend"] = loaded
+
+
+def test_a_package_of_the_earlier_protocol_is_one_error_that_says_what_to_change(
+    outdated: Path, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(UserError) as found:
+        get_method("plane-blend")
+    assert str(found.value) == (
+        "method 'plane-blend' of spike4dgs-plane-blend 0.1.0, entry point plane-blend = plane_blend:METHODS: expected "
+        "fit(self, scene, request), found the earlier protocol, fit(scene, budget, device, seed, progress, "
+        "checkpoint=None); take a FitRequest, with budget, device, seed, progress and checkpoint"
+    )
+    assert main(["run-benchmark", str(scene.root), "--methods", "plane-blend", "--out", str(tmp_path / "out")]) != 0
+    assert capsys.readouterr().err.count("the earlier protocol") == 1
+
+
+class Takes:
+    """A method whose `fit` is given."""
+
+    name = "takes"
+
+    def __init__(self, fit: Any) -> None:
+        self.fit = fit
+
+
+def test_other_callables_than_plain_methods_pass() -> None:
+    def earlier(scene: Any, budget: Any, device: str, seed: int, progress: Any) -> None: ...
+
+    @functools.wraps(earlier)
+    def adapted(*args: Any, **kwargs: Any) -> None: ...
+
+    passing = (
+        lambda scene, request: None,
+        lambda scene, request, more=1: None,
+        lambda *args: None,
+        lambda scene, *rest, **kwargs: None,
+        functools.partial(lambda extra, scene, request: None, 1),
+        adapted,
+        max,  # compiled, without a signature
+    )
+    for fit in passing:
+        check_protocol(Takes(fit), "here")
+    for fit in (earlier, lambda scene: None, lambda request, *, scene: None, None):
+        with pytest.raises(UserError, match=r"method 'takes' of here: expected fit\(self, scene, request\), found "):
+            check_protocol(Takes(fit), "here")
 
 
 @pytest.mark.parametrize("name", ["predictions_only.py", "external_method/plane_blend.py"])

@@ -7,13 +7,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
-from spike4dgs.method.gaussians.density import GradientStatistics, refine
-from spike4dgs.method.gaussians.optimizer import MOMENTS, Decay, apply_edit, export_state, make_adam, set_rates
+from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
+from spike4dgs.method.gaussians.optimizer import MOMENTS, Decay, apply_edit, export_state, make_adam, set_learning_rates
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate, share
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views, render
 
-SETTINGS = TrainSettings()
+SETTINGS = DensitySettings()
 HIGH = 2 * SETTINGS.grow_gradient
 
 
@@ -46,7 +45,7 @@ def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, torch.
     """Gaussians, something else beside them, and an optimiser whose moments differ in every row."""
     leaves, other = gaussians.trainable(), torch.nn.Parameter(torch.ones(3))
     adam = make_adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
-    set_rates(adam, {g["name"]: Decay(1e-3, 1e-3) for g in adam.param_groups}, 0.0)
+    set_learning_rates(adam, {g["name"]: Decay(1e-3, 1e-3) for g in adam.param_groups}, 0.0)
     rng = torch.Generator().manual_seed(5)
     for _ in range(3):
         for p in [*leaves.tensors().values(), other]:
@@ -59,7 +58,7 @@ EDITS = {
     "prune": lambda g: prune(g, torch.arange(12) % 3 != 0),
     "densify": lambda g: densify(g, mask(12, 1, 4, 5), mask(12, 0, 5, 11), torch.Generator().manual_seed(3)),
     "relocate": lambda g: relocate(g, mask(12, 2, 9), torch.Generator().manual_seed(1)),
-    "refine": lambda g: refine(g, statistics([HIGH, 0] * 6), SETTINGS, 1.0, 100, torch.Generator())[0],
+    "adapt_density": lambda g: adapt_density(g, statistics([HIGH, 0] * 6), SETTINGS, 1.0, 100, torch.Generator())[0],
 }
 
 
@@ -164,33 +163,33 @@ def test_relocation_changes_the_image_far_less_than_plain_copies_would() -> None
     assert change.mean() < 0.02 * before.mean() and change.mean() < 0.2 * uncorrected.mean()
 
 
-def test_refinement_grows_where_the_gradient_is_high_and_removes_the_faint() -> None:
+def test_densification_grows_where_the_gradient_is_high_and_removes_the_faint() -> None:
     g = cloud(6)
     g.logits[3] = -9.0
     g.log_scales[1, 2] = math.log(2 * SETTINGS.split_scale * 3.0)  # large for a scene of this size
-    (edit,) = refine(g, statistics([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
+    (edit,) = adapt_density(g, statistics([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
     assert edit.source.tolist() == [0, 2, 4, 5, -1, -1, -1]
     assert torch.equal(edit.gaussians.means[4], g.means[0])
 
 
 @pytest.mark.parametrize("limit", [6, 7, 8, 11, 12, 50])
-def test_refinement_keeps_to_the_limit_and_prefers_high_gradients(limit: int) -> None:
+def test_densification_keeps_to_the_limit_and_prefers_high_gradients(limit: int) -> None:
     g = cloud(6)
-    (edit,) = refine(g, statistics([(i + 1) * HIGH for i in range(6)]), SETTINGS, 1.0, limit, torch.Generator())
+    (edit,) = adapt_density(g, statistics([(i + 1) * HIGH for i in range(6)]), SETTINGS, 1.0, limit, torch.Generator())
     more = min(limit, 12) - 6
     assert len(edit.gaussians) == 6 + more
     assert torch.equal(edit.gaussians.means[6:].sort(0).values, g.means[6 - more :].sort(0).values)
 
 
-def test_refinement_at_the_limit_moves_the_dead() -> None:
+def test_densification_at_the_limit_moves_the_dead() -> None:
     g = cloud(8)
     g.logits[2] = -9.0
-    (edit,) = refine(g, statistics([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
+    (edit,) = adapt_density(g, statistics([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
     assert len(edit.gaussians) == 8 and edit.source[2] == -1
     assert edit.gaussians.logits.sigmoid().min() > SETTINGS.min_opacity
 
 
-def test_pressure_is_that_of_each_view_alone_in_half_images() -> None:
+def test_gradient_statistics_are_those_of_each_view_alone_in_half_images() -> None:
     g = cloud(6)
     g = Gaussians(g.means, g.log_scales + 3, g.quats, g.logits, g.colors).trainable()
     g.means.data[5] = torch.tensor([0.0, -9.0, 0.0])  # behind both cameras

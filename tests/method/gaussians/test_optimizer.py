@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_rate
+from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_learning_rate
 
 
 def test_a_warm_cosine_rises_linearly_and_falls_to_nothing() -> None:
@@ -19,5 +19,5 @@ def test_a_warm_cosine_rises_linearly_and_falls_to_nothing() -> None:
 
 def test_one_rate_is_set_for_all_groups() -> None:
     adam = make_adam({name: [torch.zeros(1, requires_grad=True)] for name in ("a", "b")}, (0.9, 0.999))
-    set_rate(adam, 0.25)
+    set_learning_rate(adam, 0.25)
     assert [group["lr"] for group in adam.param_groups] == [0.25, 0.25]

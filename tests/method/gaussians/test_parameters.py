@@ -9,7 +9,14 @@ from scipy.integrate import quad
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.gaussians.optimizer import Decay, apply_edit, export_state, import_state, make_adam, set_rates
+from spike4dgs.method.gaussians.optimizer import (
+    Decay,
+    apply_edit,
+    export_state,
+    import_state,
+    make_adam,
+    set_learning_rates,
+)
 from spike4dgs.method.gaussians.parameters import Gaussians, densify, from_points, prune, relocate, share
 from spike4dgs.method.splat import Views, render
 
@@ -28,7 +35,7 @@ def trained(g: Gaussians, steps: int = 3) -> tuple[Gaussians, torch.optim.Adam]:
     g = g.trainable()
     adam = make_adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
     for step in range(steps):
-        set_rates(adam, RATES, step / steps)
+        set_learning_rates(adam, RATES, step / steps)
         adam.zero_grad()
         sum((v * v).sum() for v in g.tensors().values()).backward()
         adam.step()
@@ -112,7 +119,7 @@ def test_optimiser_state_survives_export_and_import():
     fresh = make_adam({k: [v] for k, v in copy.tensors().items()}, (0.9, 0.99))
     import_state(fresh, {k: v.clone() for k, v in export_state(adam).items()})
     for leaves, optimiser in ((g, adam), (copy, fresh)):
-        set_rates(optimiser, RATES, 0.5)
+        set_learning_rates(optimiser, RATES, 0.5)
         optimiser.zero_grad()
         (leaves.means**3).sum().backward()
         optimiser.step()

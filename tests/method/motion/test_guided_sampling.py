@@ -1,4 +1,4 @@
-"""Guided sampling: which pixels are bad, and where the new Gaussians lie."""
+"""Guided sampling: the bad pixels, and the positions of new Gaussians."""
 
 import numpy as np
 import torch
@@ -8,11 +8,10 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.guided_sampling import BAD_PIXELS, PATCH, along_rays, bad_pixels, guide
 from spike4dgs.method.motion.spacetime import SpacetimeLite
-from spike4dgs.method.motion.table import MOTIONS, Extent
+from spike4dgs.method.motion.table import Extent
 from spike4dgs.method.observations.training_images import TrainingImages
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.trainer import seeded
+from spike4dgs.method.torch_state import seeded
 
 HEIGHT, WIDTH = 80, 96
 
@@ -20,17 +19,17 @@ HEIGHT, WIDTH = 80, 96
 def images() -> tuple[torch.Tensor, torch.Tensor]:
     """A render that is right but for two patches, one of them at the border."""
     rng = torch.Generator().manual_seed(0)
-    picture = 0.5 + 0.01 * torch.rand(HEIGHT, WIDTH, generator=rng)
-    image = picture + 0.001 * torch.rand(HEIGHT, WIDTH, generator=rng)
-    image[32:48, 48:64] += 0.3
-    image[0:16, 0:16] += 0.3
-    return image, picture
+    image = 0.5 + 0.01 * torch.rand(HEIGHT, WIDTH, generator=rng)
+    rendered = image + 0.001 * torch.rand(HEIGHT, WIDTH, generator=rng)
+    rendered[32:48, 48:64] += 0.3
+    rendered[0:16, 0:16] += 0.3
+    return rendered, image
 
 
 def test_pixels_of_bad_patches_are_sampled_and_the_border_is_not() -> None:
-    image, picture = images()
+    rendered, image = images()
     chosen = np.zeros((HEIGHT, WIDTH), bool)
-    chosen.flat[bad_pixels(image, picture).numpy()] = True
+    chosen.flat[bad_pixels(rendered, image).numpy()] = True
     expected = np.zeros_like(chosen)
     expected[32:48, 48:64] = True
     expected[8:16, 10:16] = True  # what a tenth of the image leaves of the other patch
@@ -39,16 +38,16 @@ def test_pixels_of_bad_patches_are_sampled_and_the_border_is_not() -> None:
 
 
 def test_exposure_does_not_make_pixels_bad() -> None:
-    image, picture = images()
-    assert torch.equal(bad_pixels(image * 3, picture), bad_pixels(image, picture))
+    rendered, image = images()
+    assert torch.equal(bad_pixels(rendered * 3, image), bad_pixels(rendered, image))
 
 
 def test_a_patch_needs_85_percent_of_bad_pixels() -> None:
-    picture = torch.ones(PATCH * 4, PATCH * 4)
+    image = torch.ones(PATCH * 4, PATCH * 4)
     for bad, found in ((0.8, False), (0.9, True)):
-        image = picture.clone()
-        image[PATCH : PATCH + round(bad * PATCH), PATCH : 2 * PATCH] = 2.0
-        assert bool(len(bad_pixels(image, picture))) == found
+        rendered = image.clone()
+        rendered[PATCH : PATCH + round(bad * PATCH), PATCH : 2 * PATCH] = 2.0
+        assert bool(len(bad_pixels(rendered, image))) == found
     assert BAD_PIXELS == 0.6
 
 
@@ -77,7 +76,7 @@ def test_points_lie_on_their_pixels_rays_at_the_depths_that_the_view_shows() -> 
 def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     cameras = array_cameras(4, width=WIDTH, height=HEIGHT)
     extent = Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH)
-    motion = MOTIONS["spacetime-lite"](extent, TrainSettings(), seeded(0, 0))
+    motion = SpacetimeLite(extent, SpacetimeLite.defaults, seeded(0, 0))
     s = wall(cameras[0], 2.5)
     plain = Gaussians(s.means, s.scales.log(), s.quats, torch.full((len(s),), 4.0), s.colors)
     views = Views.from_cameras(cameras)
@@ -86,7 +85,6 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     truth = right.expand(3, -1, -1, -1).clone()
     truth[2, 1, 32:64, 32:64] = torch.rand(32, 32, generator=torch.Generator().manual_seed(0))
     truth[0, 3, 32:48, 32:64] = torch.rand(16, 32, generator=torch.Generator().manual_seed(1))
-    assert isinstance(motion, SpacetimeLite)
     g = motion.timed(plain, torch.full((len(plain),), 0.5), 1e6)
     new = guide(motion, g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert [t for _, t in new] == [0.9, 0.1]

@@ -6,8 +6,10 @@ from hypothesis import strategies as st
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.hexplane import (
     HexPlane,
-    HexPlaneMotion,
+    HexPlaneDeformation,
+    HexPlaneSettings,
     HexPlaneShape,
+    hexplane_shape,
     plane_tv,
     sample_level,
     time_smoothness,
@@ -15,8 +17,7 @@ from spike4dgs.method.motion.hexplane import (
 )
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.motion.mlp import perceptron, perceptron_reference
-from spike4dgs.method.motion.table import MOTIONS, Extent, hexplane_shape
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.motion.table import MOTIONS, Extent
 
 SHAPE = HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
 
@@ -36,8 +37,8 @@ def gaussians(n: int = 50) -> Gaussians:
     )
 
 
-def motion() -> HexPlaneMotion:
-    return HexPlaneMotion(SHAPE, -torch.ones(3), torch.ones(3), 2.0, rng())
+def motion() -> HexPlaneDeformation:
+    return HexPlaneDeformation(SHAPE, -torch.ones(3), torch.ones(3), 2.0, rng())
 
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
@@ -186,7 +187,7 @@ def extent(n_ticks: int, width: int) -> Extent:
 
 
 def test_resolution_follows_clip_length_and_image_size():
-    s = TrainSettings()
+    s = HexPlaneSettings()
     short, long = hexplane_shape(extent(400, 200), s), hexplane_shape(extent(2000, 400), s)
     assert long.times == pytest.approx(5 * short.times, rel=0.1)
     assert long.spatial[-1] == pytest.approx(2 * short.spatial[-1], rel=0.1)
@@ -195,5 +196,5 @@ def test_resolution_follows_clip_length_and_image_size():
 
 def test_static_motion_returns_the_same_gaussians():
     g = gaussians()
-    static = MOTIONS["static"](extent(100, 64), TrainSettings(), rng())
+    static = MOTIONS["static"](extent(100, 64), MOTIONS["static"].defaults, rng())
     assert torch.equal(static.splats(g, 0.7).means, g.means) and not static.groups() and not static.moves

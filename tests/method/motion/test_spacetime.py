@@ -13,26 +13,27 @@ from small_scenes import array_cameras
 from torch import Tensor
 from toy_world import ToyWorld
 
-from spike4dgs.method.gaussians.density import GradientStatistics, refine
+from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
-from spike4dgs.method.motion.spacetime import Spacetime, SpacetimeLite, move_to
+from spike4dgs.method.motion.polynomial import move_to
+from spike4dgs.method.motion.spacetime import Spacetime, SpacetimeLite, SpacetimeSettings
 from spike4dgs.method.motion.spacetime_decoder import Decoder, rays
 from spike4dgs.method.motion.table import MOTIONS, Extent
-from spike4dgs.method.observations.lookup import look_up, moving, project
+from spike4dgs.method.observations.lookup import look_up, variation_at
+from spike4dgs.method.observations.projection import project
 from spike4dgs.method.observations.training_images import TrainingImages
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.splat.reference import rotation_matrices
-from spike4dgs.method.trainer import seeded
+from spike4dgs.method.torch_state import seeded
 
 WORLD = ToyWorld(width=64, height=40, side=2, n_ticks=200)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 2.0, 200, 64)
-SETTINGS = TrainSettings()
+SETTINGS = SpacetimeSettings()
 
 
 def motion(name: str = "spacetime") -> SpacetimeLite:
-    made = MOTIONS[name](EXTENT, SETTINGS, seeded(0, -1))
+    made = MOTIONS[name](EXTENT, MOTIONS[name].defaults, seeded(0, -1))
     assert isinstance(made, SpacetimeLite)
     return made
 
@@ -42,14 +43,14 @@ def test_opacity_and_path_are_the_published_ones(t: float) -> None:
     g = cloud(dtype=torch.float64)
     splats = motion().splats(g, t)
     for i in range(len(g)):
-        x, m = g.means[i].numpy(), g.extra["paths"][i].numpy().reshape(3, 3)
+        x, m = g.means[i].numpy(), g.extra["coefficients"][i].numpy().reshape(3, 3)
         d = t - float(g.extra["times"][i])
         mean = x + m[0] * d + m[1] * d**2 + m[2] * d**3
-        fade = np.exp(-((d / np.exp(float(g.extra["lives"][i]))) ** 2))
+        fade = np.exp(-((d / np.exp(float(g.extra["log_temporal_scales"][i]))) ** 2))
         np.testing.assert_allclose(splats.means[i].numpy(), mean, rtol=1e-12, atol=1e-12)
         opacity = fade / (1 + np.exp(-float(g.logits[i])))
         np.testing.assert_allclose(float(splats.opacities[i]), opacity, rtol=1e-12)
-        quat = g.quats[i].numpy() + d * g.extra["spins"][i].numpy()
+        quat = g.quats[i].numpy() + d * g.extra["angular_velocities"][i].numpy()
         R = Rotation.from_quat(quat / np.linalg.norm(quat), scalar_first=True).as_matrix()
         np.testing.assert_allclose(rotation_matrices(splats.quats[i : i + 1])[0].numpy(), R, atol=1e-12)
         np.testing.assert_allclose(splats.scales[i].numpy(), np.exp(g.log_scales[i].numpy()), rtol=1e-12)
@@ -57,12 +58,12 @@ def test_opacity_and_path_are_the_published_ones(t: float) -> None:
         np.testing.assert_allclose(splats.colors[i].numpy(), [float(g.colors[i]), f[0], d * f[1]], rtol=1e-12)
 
 
-def test_a_small_spin_turns_evenly() -> None:
+def test_a_small_angular_velocity_turns_evenly() -> None:
     g = cloud(1, dtype=torch.float64)
     start, axis = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]), np.array([0.0, 0.0, 1.0])
     end = start * Rotation.from_rotvec(0.05 * axis)
     q0, q1 = (torch.from_numpy(r.as_quat(scalar_first=True)) for r in (start, end))
-    g = replace(g, quats=q0[None], extra={**g.extra, "times": torch.zeros(1), "spins": (q1 - q0)[None]})
+    g = replace(g, quats=q0[None], extra={**g.extra, "times": torch.zeros(1), "angular_velocities": (q1 - q0)[None]})
     halfway = rotation_matrices(motion().splats(g, 0.5).quats)[0].numpy()
     expected = Slerp([0, 1], Rotation.concatenate([start, end]))(0.5).as_matrix()
     np.testing.assert_allclose(halfway, expected, atol=1e-6)
@@ -83,8 +84,8 @@ def test_a_faded_gaussian_is_not_rasterised() -> None:
     g = cloud(20)
     g.means.mul_(0.2)
     g.logits[:] = 5.0
-    g.extra["times"][:10], g.extra["lives"][:] = 0.9, -2.5
-    g.extra["times"][10:], g.extra["paths"][:] = 0.2, 0.0
+    g.extra["times"][:10], g.extra["log_temporal_scales"][:] = 0.9, -2.5
+    g.extra["times"][10:], g.extra["coefficients"][:] = 0.2, 0.0
     out = render(motion("spacetime-lite").splats(g, 0.2), Views.from_cameras(array_cameras(1)))
     assert not out.visible[0, :10].any() and out.visible[0, 10:].all()
 
@@ -134,7 +135,7 @@ def test_moments_of_extra_parameters_follow_an_edit() -> None:
     before = {k: adam.state[v]["exp_avg"].clone() for k, v in g.extra.items()}
     keep = torch.tensor([0, 1, 1, 0, 1, 1]).bool()
     new = apply_edit(adam, prune(g, keep))
-    assert set(new.extra) == {"times", "lives", "paths", "spins", "features"}
+    assert set(new.extra) == {"times", "log_temporal_scales", "coefficients", "angular_velocities", "features"}
     for name, leaf in new.extra.items():
         assert leaf.requires_grad and torch.equal(adam.state[leaf]["exp_avg"], before[name][keep])
 
@@ -143,7 +144,7 @@ def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> No
     g = cloud(12)
     g.logits[:] = 0.0
     statistics = GradientStatistics(torch.tensor([1.0, 0.0] * 6), torch.ones(12))
-    (edit,) = refine(g, statistics, SETTINGS, 100.0, 50, torch.Generator().manual_seed(0))
+    (edit,) = adapt_density(g, statistics, DensitySettings(), 100.0, 50, torch.Generator().manual_seed(0))
     born = motion().born(edit, torch.Generator().manual_seed(1))
     old, new = born.gaussians.rows(torch.arange(12)), born.gaussians.rows(torch.arange(12, 18))
     assert edit.added == born.added == 6 and all(torch.equal(v, g.tensors()[k]) for k, v in old.tensors().items())
@@ -193,8 +194,8 @@ def test_decoder_is_two_pointwise_layers_beside_the_albedo() -> None:
 
 def make_training_images(count: int = 9) -> TrainingImages:
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks - 1, count))
-    looks = [[WORLD.look(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
-    images = torch.from_numpy(np.array(looks, np.float32))
+    frames = [[WORLD.look(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
+    images = torch.from_numpy(np.array(frames, np.float32))
     return TrainingImages(Views.from_cameras(WORLD.cameras), ticks, images, WORLD.n_ticks)
 
 
@@ -221,18 +222,17 @@ def test_points_are_seen_where_the_cameras_see_them() -> None:
 def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times() -> None:
     points, board = surface()
     f = make_training_images()
-    change = moving(points, f).numpy()
+    change = variation_at(points, f).numpy()
     shift = change > SETTINGS.moving_change
     assert shift[board].mean() > 0.5 > 3 * shift[~board].mean()  # the board uncovers some of what is behind it
     n = len(points)
     g = Gaussians(points, torch.zeros(n, 3), torch.ones(n, 4), torch.zeros(n), torch.zeros(n, 1))
     timed = motion().attach(g, f)
-    lives = timed.extra["lives"].exp()
-    short = lives < 1
+    short = timed.extra["log_temporal_scales"].exp() < 1
     assert len(timed) == n + (SETTINGS.moving_copies - 1) * shift.sum() and int(short.sum()) == 3 * shift.sum()
     thirds = (timed.extra["times"][short].view(3, -1) * 3).long()
     assert torch.equal(thirds, torch.arange(3)[:, None].expand_as(thirds))
-    assert not timed.extra["paths"].any() and not timed.extra["spins"].any()
+    assert not timed.extra["coefficients"].any() and not timed.extra["angular_velocities"].any()
     assert torch.equal(timed.extra["features"][:, 0], timed.colors[:, 0])
     i = int(torch.nonzero(short)[0])
     t = timed.extra["times"][i : i + 1]
@@ -246,9 +246,9 @@ def _at(point: Tensor, f: TrainingImages) -> tuple[Tensor, list[int]]:
     return project(point, f.views)[0], [0] * len(f.views)
 
 
-def test_groups_and_rates_name_every_parameter() -> None:
+def test_groups_and_learning_rates_name_every_parameter() -> None:
     full, lite = motion(), motion("spacetime-lite")
     g = full.timed(cloud(4), torch.zeros(4), 1.0)
-    assert set(full.rates()) == set(g.extra) and set(lite.rates()) == set(g.extra) - {"features"}
+    assert set(full.learning_rates()) == set(g.extra) and set(lite.learning_rates()) == set(g.extra) - {"features"}
     assert isinstance(full, Spacetime) and set(full.groups()) == {"decoder"} and not lite.groups()
     assert full.groups()["decoder"][0] == list(full.decoder.parameters())

@@ -10,14 +10,16 @@ import torch
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Progress
-from spike4dgs.method.fit import FitJob, Start, measure
+from spike4dgs.benchmark.method import FitRequest, Progress
+from spike4dgs.method.fit import FitJob, measure
+from spike4dgs.method.initialization import Start
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.radiance_field import PUBLISHED, RADIANCE_FIELD, RadianceFieldSettings, fit_radiance_field
 from spike4dgs.method.radiance_field.fit import Fitter
 from spike4dgs.method.radiance_field.march import camera_rays
 from spike4dgs.method.radiance_field.model import RadianceModel
-from spike4dgs.method.settings import make_settings
+from spike4dgs.method.radiance_field.occupancy import OccupancySettings
+from spike4dgs.method.settings import override, scaled
 from spike4dgs.method.splat import Views
 
 WORLD = ToyWorld(width=40, height=25, n_ticks=80)
@@ -32,10 +34,8 @@ SMALL = RadianceFieldSettings(
     coarse_width=16,
     position_frequencies=5,
     direction_frequencies=1,
-    field_rate=1e-2,
-    field_rate_last=1e-3,
-    occupancy_cells=16,
-    occupancy_every=8,
+    lr_field=1e-2,
+    lr_field_last=1e-3,
 )
 
 
@@ -46,22 +46,27 @@ def silent(done: int, total: int, note: str = "") -> None:
 def plane(camera, t: float = 0.5, travel: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Radiance [H, W] of a textured plane y = 0, and its points [H * W, 3]; the texture moves by `travel` m in all."""
     v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    looks = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
-    points = camera.center + looks * (-camera.center[1] / looks[:, 1:2])
+    towards = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+    points = camera.center + towards * (-camera.center[1] / towards[:, 1:2])
     x, z = points[:, 0] - travel * (t - 0.5), points[:, 2]
     return (0.5 + 0.3 * np.sin(5 * x + 2 * z) * np.cos(4 * z - 3 * x)).reshape(camera.height, camera.width), points
 
 
-def job(settings=SMALL, progress: Progress = silent, checkpoint: Path | None = None, seed=0, travel=0.0) -> FitJob:
+def job(
+    motion=SMALL, progress: Progress = silent, checkpoint: Path | None = None, seed=0, travel=0.0, every=8
+) -> FitJob:
     scene = WORLD.training
     ticks = tuple(range(4, 80, 8))
-    pictures = np.stack([[plane(c, k / 80, travel)[0] for c in scene.cameras] for k in ticks]).astype(np.float32)
+    frames = np.stack([[plane(c, k / 80, travel)[0] for c in scene.cameras] for k in ticks]).astype(np.float32)
     points = np.concatenate([plane(c)[1][::5] for c in scene.cameras])
     points += np.random.default_rng(0).normal(size=points.shape) * [0, 0.02, 0]
     start = Start(scene.cameras, points.astype(np.float32), np.full(len(points), 0.5, np.float32))
-    footage = TrainingImages(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(pictures), 80)
+    images = TrainingImages(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(frames), 80)
     extent = measure(start, scene)
-    return FitJob(scene, start, footage, extent, settings, "cpu", seed, progress, checkpoint, "this")
+    grid = OccupancySettings(cells=16, every=every)
+    settings = {**RADIANCE_FIELD.settings, "motion": motion, "occupancy": grid}
+    request = FitRequest(seed=seed, progress=progress, checkpoint=checkpoint)
+    return FitJob(scene, start, images, extent, settings, request, "this")
 
 
 @cache
@@ -78,7 +83,7 @@ def psnr(model: RadianceModel, travel: float, at: float | None = None) -> float:
     return float(-10 * np.log10(errors).mean())
 
 
-def test_a_static_plane_is_seen_from_a_new_place() -> None:
+def test_a_static_plane_is_seen_from_a_new_viewpoint() -> None:
     assert psnr(fitted(0.0), 0.0) > 27
 
 
@@ -118,7 +123,11 @@ def test_a_render_is_the_same_bits_again_and_stops_at_the_ends_of_the_clip() -> 
     assert not np.array_equal(images[0.0], images[1e9])
 
 
-SHORT = replace(SMALL, steps=24, rays=32, occupancy_every=3)
+SHORT = replace(SMALL, steps=24, rays=32)
+
+
+def short(progress: Progress = silent, checkpoint: Path | None = None, seed: int = 0, travel: float = 0.3) -> FitJob:
+    return job(SHORT, progress, checkpoint, seed, travel, every=3)
 
 
 def tensors(fitter: Fitter) -> dict[str, torch.Tensor]:
@@ -127,7 +136,7 @@ def tensors(fitter: Fitter) -> dict[str, torch.Tensor]:
 
 @cache
 def uninterrupted() -> dict[str, torch.Tensor]:
-    fitter = Fitter(job(SHORT, travel=0.3))
+    fitter = Fitter(short())
     fitter.run()
     return tensors(fitter)
 
@@ -144,8 +153,8 @@ def test_killed_and_resumed_gives_the_same_bits(step: int, tmp_path: Path) -> No
 
     path = tmp_path / "fit.safetensors"
     with pytest.raises(Killed):
-        Fitter(job(SHORT, dies, path, travel=0.3)).run(checkpoint_s=0)
-    second = Fitter(job(SHORT, silent, path, travel=0.3))
+        Fitter(short(dies, path)).run(checkpoint_s=0)
+    second = Fitter(short(silent, path))
     second.run()
     result = tensors(second)
     assert result.keys() == uninterrupted().keys()
@@ -155,20 +164,20 @@ def test_killed_and_resumed_gives_the_same_bits(step: int, tmp_path: Path) -> No
 
 def test_another_seed_gives_another_field_and_another_fits_checkpoint_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
-    other = Fitter(job(SHORT, silent, path, seed=1, travel=0.3))
+    other = Fitter(short(silent, path, seed=1))
     other.run()
     assert not torch.equal(tensors(other)["field.fine.value.weight"], uninterrupted()["field.fine.value.weight"])
     with pytest.raises(UserError, match="another fit's; delete it"):
-        Fitter(replace(job(SHORT, silent, path), key="that")).run()
+        Fitter(replace(short(silent, path, travel=0.0), key="that")).run()
 
 
 def test_every_parameter_learns() -> None:
-    fitter = Fitter(job(SHORT, travel=0.3))
+    fitter = Fitter(short())
     before = {k: v.detach().clone() for k, v in fitter.field.named_parameters()}
     for _ in range(3):
         fitter.train_step()
-    still = [k for k, v in fitter.field.named_parameters() if torch.equal(v, before[k])]
-    assert not still
+    unchanged = [k for k, v in fitter.field.named_parameters() if torch.equal(v, before[k])]
+    assert not unchanged
 
 
 def test_times_open_up_from_the_middle() -> None:
@@ -184,9 +193,11 @@ def test_times_open_up_from_the_middle() -> None:
 
 def test_budgets_scale_the_steps_and_published_values_are_settings() -> None:
     s = RADIANCE_FIELD.settings
-    assert s.scaled(0.5) == replace(s, steps=round(s.steps / 2))
-    paper = make_settings(PUBLISHED, "paper", s)
-    assert paper.steps == 200_000 and paper.width == 256 and paper.field_rate == 5e-4
+    motion = RadianceFieldSettings()
+    assert scaled(s, 0.5) == {**s, "motion": replace(motion, steps=round(motion.steps / 2))}
+    paper = override(s, PUBLISHED, "paper")
+    assert isinstance(found := paper["motion"], RadianceFieldSettings)
+    assert found.steps == 200_000 and found.width == 256 and found.lr_field == 5e-4
 
 
 def test_spikes_of_the_stream_are_what_a_rate_is_compared_with() -> None:

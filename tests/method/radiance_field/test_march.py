@@ -179,7 +179,7 @@ def ball(points: torch.Tensor) -> torch.Tensor:
 def looked_at(looks: int) -> Occupancy:
     grid = Occupancy(-torch.ones(3), torch.ones(3), 16, 0.01)
     for k in range(looks):
-        grid.look(ball, 0.5, rng(k))
+        grid.update(ball, 0.5, rng(k))
     return grid
 
 
@@ -196,10 +196,10 @@ def test_occupancy_keeps_all_matter_and_drops_most_of_nothing() -> None:
 def test_occupancy_forgets_what_has_gone_and_finds_what_comes_back() -> None:
     grid = looked_at(10)
     for k in range(120):
-        grid.look(lambda p: torch.zeros(len(p)), 0.5, rng(k))
+        grid.update(lambda p: torch.zeros(len(p)), 0.5, rng(k))
     assert not grid.occupied.any()
     for k in range(10):
-        grid.look(ball, 0.5, rng(k))
+        grid.update(ball, 0.5, rng(k))
     points = torch.rand(20_000, 3, generator=rng(100)) * 2 - 1
     assert grid(points)[ball(points) > 0].all()
 
@@ -218,7 +218,7 @@ def test_candidates_are_cells_near_points_and_cells_that_may_move() -> None:
 def test_cells_that_may_move_are_seen_changing_by_all_who_see_them() -> None:
     cameras = array_cameras()
     grid = Occupancy(torch.tensor([-1.0, -1.0, -1.0]), torch.ones(3), 20, 0.01)
-    centers = grid.places(torch.arange(20**3)).double().numpy()
+    centers = grid.positions(torch.arange(20**3)).double().numpy()
     there = np.linalg.norm(centers, axis=1) < 0.3
     moving = np.zeros((len(cameras), 24, 40), bool)
     for camera, mask in zip(cameras, moving, strict=True):

@@ -8,14 +8,13 @@ import pytest
 import torch
 from toy_world import GAIN, ToyWorld, run_neurons
 
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.supervision.spike_cameras import fire
-from spike4dgs.method.supervision.spike_render import SpikeRender
+from spike4dgs.method.supervision.spike_render import SpikeRender, SpikeRenderSettings
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
-SETTINGS = TrainSettings()
+SETTINGS = SpikeRenderSettings()
 
 
 @pytest.mark.parametrize("ticks", [1, 7, 40])
@@ -47,7 +46,7 @@ def test_rates_beyond_the_cameras_range_are_still_drawn_back() -> None:
     assert rate.grad is not None and rate.grad[0] < 0 < rate.grad[1]
 
 
-def scene_loss(settings: TrainSettings = SETTINGS) -> SpikeRender:
+def scene_loss(settings: SpikeRenderSettings = SETTINGS) -> SpikeRender:
     loss = SUPERVISIONS["spike-render"](settings, WORLD.training)
     assert isinstance(loss, SpikeRender)
     return loss
@@ -109,7 +108,7 @@ def test_noise_embedding_scales_and_lifts_its_own_view_only() -> None:
 def test_embedding_is_trained_and_kept_small() -> None:
     loss = scene_loss()
     ((leaf,), rate) = loss.groups()["noise"]
-    assert leaf is loss.noise and rate.at(0.5) == pytest.approx(SETTINGS.noise_rate)
+    assert leaf is loss.noise and rate.at(0.5) == pytest.approx(SETTINGS.lr_noise)
     with torch.no_grad():
         loss.noise.fill_(0.2)
     heavy, free = (float(scene_with(w, loss)) for w in (1.0, 0.0))

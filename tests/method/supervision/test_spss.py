@@ -14,15 +14,21 @@ from toy_world import GAIN, RATE_HZ, ToyWorld, run_neurons
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.settings import TrainSettings
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.supervision.base import Sample, Supervision
+from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, fire, random_charge, recorded
-from spike4dgs.method.supervision.spss import FLOOR, SpikeVariation, first_sequence, window_moments
-from spike4dgs.method.supervision.table import SUPERVISIONS, Pixel
+from spike4dgs.method.supervision.spss import (
+    FLOOR,
+    SpikeVariation,
+    SpikeVariationSettings,
+    first_sequence,
+    window_moments,
+)
+from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
-SETTINGS = TrainSettings()
+SETTINGS = SpikeVariationSettings()
 VIEWS = (0, 2)
 
 
@@ -31,7 +37,7 @@ def sample(tick: int, step: int = 0, images: torch.Tensor | None = None) -> Samp
 
 
 def make(name: str, scene: TrainingScene = WORLD.training, **changes: float) -> Supervision:
-    return SUPERVISIONS[name](replace(SETTINGS, **changes), scene)
+    return SUPERVISIONS[name](replace(SUPERVISIONS[name].defaults, **changes), scene)
 
 
 def truth(t: float) -> torch.Tensor:
@@ -192,7 +198,7 @@ def test_sums_render_once_and_add_up() -> None:
 def test_phi_is_trained_and_kept_and_maps_are_not() -> None:
     loss = make("spss")
     ((parameters, rate),) = loss.groups().values()
-    assert {p.numel() for p in parameters} == {40} and rate.at(0.3) == pytest.approx(SETTINGS.phi_rate)
+    assert {p.numel() for p in parameters} == {40} and rate.at(0.3) == pytest.approx(SETTINGS.lr_phi)
     assert {name.rsplit(".", 1)[-1] for name in loss.state_dict()} == {"weight", "bias"}
     loss(lambda t: truth(t), sample(60, 0, truth(0.5))).backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in parameters)
@@ -284,7 +290,7 @@ def test_a_pixel_whose_image_is_no_number_teaches_nothing() -> None:
     picture[0, 3, 4] = torch.nan
     picture[1, 5, 6] = torch.inf
     image = truth(0.6).requires_grad_()
-    loss = Pixel(replace(SETTINGS, ssim_weight=0.0), WORLD.training)
+    loss = Pixel(PixelSettings(ssim_weight=0.0), WORLD.training)
     loss(lambda t: image, sample(60, 0, picture)).backward()
     assert image.grad is not None and int((image.grad == 0).sum()) == 2
     assert not image.grad[0, 3, 4] and not image.grad[1, 5, 6]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,17 +13,20 @@ from toy_world import GAIN, RATE_HZ, ToyWorld
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import Start, make_training_images, measure
+from spike4dgs.method.fit import measure
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.settings import TrainSettings
+from spike4dgs.method.images import ImageSettings, make_training_images
+from spike4dgs.method.initialization import Start
+from spike4dgs.method.motion.static import Static
 from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.trainer import Trainer, seeded
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
 
 WIDTH, HEIGHT = 16, 12
 CAMERAS = ToyWorld(width=WIDTH, height=HEIGHT, side=2).cameras[:3]
-SETTINGS = TrainSettings()
 NAMES = sorted(SUPERVISIONS)
 Maps = tuple[Calibration, ...] | None
 
@@ -93,11 +96,11 @@ SCENES: list[Callable[[], TrainingScene]] = [
 IMAGES = {"black": 0.0, "gray": 0.4, "white": 1.0, "glare": 1e4, "faint": 1e-12}
 
 
-def check(loss: Supervision, scene: TrainingScene, picture: float = 0.3) -> None:
+def check(loss: Supervision, scene: TrainingScene, gray: float = 0.3) -> None:
     """Loss and gradients are finite for every tick and rendered image, and parameters stay so in training."""
     for value in IMAGES.values():
         for tick in {0, scene.n_ticks // 2, scene.n_ticks - 1}:
-            images = torch.full((2, HEIGHT, WIDTH), picture)
+            images = torch.full((2, HEIGHT, WIDTH), gray)
             images[0, 0, 0] = torch.nan
             image = torch.full((2, HEIGHT, WIDTH), value, requires_grad=True)
             now = Sample(tick / scene.n_ticks, tick, (1, 2), images, tick)
@@ -116,14 +119,16 @@ def check(loss: Supervision, scene: TrainingScene, picture: float = 0.3) -> None
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_is_lost_at_the_edges(name: str, make_scene: Callable[[], TrainingScene]) -> None:
     scene = make_scene()
-    check(SUPERVISIONS[name](SETTINGS, scene), scene)
+    check(SUPERVISIONS[name](SUPERVISIONS[name].defaults, scene), scene)
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("make_scene", [dark, saturated, identical_frames], ids=lambda f: f.__name__)
 def test_nothing_is_lost_in_windows_of_one_tick(name: str, make_scene: Callable[[], TrainingScene]) -> None:
     scene = make_scene()
-    check(SUPERVISIONS[name](replace(SETTINGS, spike_ticks=1, neuron_ticks=1), scene), scene)
+    defaults = SUPERVISIONS[name].defaults
+    ticks = {f.name: 1 for f in fields(defaults) if f.name in ("spike_ticks", "neuron_ticks")}
+    check(SUPERVISIONS[name](replace(defaults, **ticks), scene), scene)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -131,12 +136,12 @@ def test_nothing_is_lost_in_windows_of_one_tick(name: str, make_scene: Callable[
 def test_float32_gives_the_losses_of_float64(name: str, make_scene: Callable[[], TrainingScene]) -> None:
     scene = make_scene()
     rng = np.random.default_rng(1)
-    shown, picture = rng.uniform(0.02, 1.2, (2, 2, HEIGHT, WIDTH))
+    shown, target = rng.uniform(0.02, 1.2, (2, 2, HEIGHT, WIDTH))
     values, gradients = [], []
     for dtype in (torch.float32, torch.float64):
-        loss = SUPERVISIONS[name](SETTINGS, scene).to(dtype)
+        loss = SUPERVISIONS[name](SUPERVISIONS[name].defaults, scene).to(dtype)
         image = torch.from_numpy(shown).to(dtype).requires_grad_()
-        now = Sample(0.5, 40, (0, 1), torch.from_numpy(picture).to(dtype), 2)
+        now = Sample(0.5, 40, (0, 1), torch.from_numpy(target).to(dtype), 2)
         result = loss(lambda t, i=image: i, now)
         result.backward()
         assert result.dtype == dtype and image.grad is not None
@@ -151,7 +156,7 @@ def test_float32_gives_the_losses_of_float64(name: str, make_scene: Callable[[],
 @pytest.mark.parametrize("make_scene", [one_camera_saw_nothing, no_number_in_one_map, one_tick_clip])
 def test_training_keeps_every_parameter_a_number(name: str, make_scene: Callable[[], TrainingScene]) -> None:
     scene = make_scene()
-    s = TrainSettings(coarse_steps=6, fine_steps=1, views_per_step=3, time_spacing_ticks=40)
+    s, spaced = TrainerSettings(coarse_steps=6, fine_steps=1, views_per_step=3), ImageSettings(time_spacing_ticks=40)
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.2, 0.2], [0.8, 0.6, 1.2], (60, 3)).astype(np.float32)
     start = Start(CAMERAS, points, rng.random(60).astype(np.float32))
@@ -162,10 +167,11 @@ def test_training_keeps_every_parameter_a_number(name: str, make_scene: Callable
         return np.repeat(image[None], len(list(ticks)), 0).astype(np.float32)  # type: ignore[call-overload]
 
     extent = measure(start, scene)
-    motion = MOTIONS["static"](extent, s, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, s, "cpu")
+    motion = Static(extent, Static.defaults, seeded(0, -1))
+    training_images = make_training_images(scene, start.cameras, images, spaced, "cpu")
     gaussians = from_points(points, start.values, opacity=0.5)
-    trainer = Trainer(training_images, gaussians, motion, SUPERVISIONS[name](s, scene), s, scale=extent.scale, seed=0)
+    loss, density = SUPERVISIONS[name](SUPERVISIONS[name].defaults, scene), DensitySettings()
+    trainer = Trainer(training_images, gaussians, motion, loss, s, density, scale=extent.scale, seed=0)
     losses = [float(trainer.train_step()) for _ in range(6)]
     assert np.isfinite(losses).all()
-    assert all(v.isfinite().all() for k, v in trainer.state().tensors.items() if not k.startswith("pressure"))
+    assert all(v.isfinite().all() for k, v in trainer.state().tensors.items() if not k.startswith("statistics"))

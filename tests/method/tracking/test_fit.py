@@ -10,20 +10,21 @@ from scipy.spatial.transform import Rotation, Slerp
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, Recipe
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, Start, measure
+from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, measure
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.observations.foreground import foreground_masks
 from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
+from spike4dgs.method.supervision.pixel import PixelSettings
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.tracking.fit import (
-    PUBLISHED,
     TRACKING,
     Tracker,
-    TrackingSettings,
     Visit,
     first_index,
     fit_tracking,
@@ -31,6 +32,7 @@ from spike4dgs.method.tracking.fit import (
 )
 from spike4dgs.method.tracking.losses import find_neighbours
 from spike4dgs.method.tracking.model import TrackedModel, Tracks
+from spike4dgs.method.tracking.settings import PUBLISHED, TrackingSettings
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.25)
 CAMERAS = tuple(c for c in WORLD.cameras if c is not WORLD.held_out)
@@ -52,14 +54,20 @@ def shown() -> tuple[TrainingImages, Start]:
 
 
 def job(
-    checkpoint: Path | None = None, progress: Callable[..., None] = silent, still: bool = False, **changes: object
+    checkpoint: Path | None = None,
+    progress: Callable[..., None] = silent,
+    static: bool = False,
+    ssim_weight: float = 0.2,
+    **changes: object,
 ) -> FitJob:
-    footage, start = shown()
-    if still:
-        footage = replace(footage, images=footage.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
+    images, start = shown()
+    if static:
+        images = replace(images, images=images.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
     scene = TrainingScene("toy", "toy", CAMERAS, (), 20000.0, WORLD.n_ticks, 0.6)
-    settings = replace(TrackingSettings(), **changes)
-    return FitJob(scene, start, footage, measure(start, scene), settings, "cpu", 0, progress, checkpoint, "this")
+    motion, supervision = replace(TrackingSettings(), **changes), PixelSettings(ssim_weight)
+    settings = {**TRACKING.settings, "motion": motion, "supervision": supervision}
+    request = FitRequest(progress=progress, checkpoint=checkpoint)
+    return FitJob(scene, start, images, measure(start, scene), settings, request, "this")
 
 
 def test_times_are_visited_outward_with_the_velocity_known_so_far() -> None:
@@ -81,7 +89,7 @@ def test_the_first_time_is_where_the_settings_say(start: float, index: int) -> N
 
 @cache
 def tracked() -> TrackedModel:
-    return fit_tracking(job(first_steps=150, means_rate=3e-3, means_rate_last=1e-4, colors_rate=2.5e-4))
+    return fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
 
 
 def test_known_translation_is_recovered() -> None:
@@ -98,14 +106,14 @@ def test_known_translation_is_recovered() -> None:
     assert moved[:, 1].abs().max() < 0.03  # depth: a fifth of a pixel of parallax across the whole array
 
 
-def test_the_board_is_seen_from_a_new_place_at_times_between_the_tracked_ones() -> None:
+def test_the_board_is_seen_from_a_new_viewpoint_at_times_between_the_tracked_ones() -> None:
     for t in (0.375, 0.625, 0.8):
         truth, _, board = WORLD.look(WORLD.held_out, t)
         error = (tracked().render(WORLD.held_out, t * WORLD.n_ticks * 50.0) - truth) ** 2
         assert -10 * np.log10(error[board].mean()) > 22
 
 
-def test_background_stands_still_or_hardly_moves() -> None:
+def test_the_background_is_fixed_or_hardly_moves() -> None:
     model = tracked()
     start, stop = model.at(0.0), model.at(model.duration_us)
     others = torch.ones(len(start), dtype=torch.bool).index_fill(0, model.tracks.free, False)
@@ -118,7 +126,7 @@ def test_background_stands_still_or_hardly_moves() -> None:
     assert (soft.tracks.means[0, moving:] != soft.tracks.means[2, moving:]).any()
 
 
-def test_only_the_window_is_drawn_and_the_gradient_is_that_of_the_whole_image() -> None:
+def test_only_the_window_is_rendered_and_the_gradient_is_that_of_the_whole_image() -> None:
     gradients = []
     for margin in (8, 1000):
         j = job(**TINY, margin_px=margin, ssim_weight=0.0)
@@ -194,7 +202,7 @@ def test_progress_counts_all_steps_to_the_end() -> None:
 
 
 def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
-    model = fit_tracking(job(tmp_path / "fit.safetensors", still=True, **TINY))
+    model = fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
     images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
     assert len(model.tracks.free) == 0 and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
 
@@ -217,7 +225,7 @@ def tracks() -> Tracks:
     ("t_us", "x", "color"),
     [(500, 0, 0), (1000, 0.5, 0.1), (1500, 1, 0.2), (1875, 2.5, 0.35), (2000, 3, 0.4), (250, -0.25, 0), (2250, 4, 0.4)],
 )
-def test_between_times_all_is_linear_and_places_go_on_beyond_the_ends(t_us: float, x: float, color: float) -> None:
+def test_between_times_all_is_linear_and_positions_go_on_beyond_the_ends(t_us: float, x: float, color: float) -> None:
     values = tracks().between(t_us)
     torch.testing.assert_close(values["means"], torch.full((4, 3), float(x)))
     torch.testing.assert_close(values["colors"], torch.full((5, 1), float(color)))
@@ -248,9 +256,12 @@ def test_a_recipe_runs_it_from_spikes_to_images() -> None:
     def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
         return np.stack([stream.counts(t - 10, t + 10) / (20 * gain) for t in ticks]).astype(np.float32)
 
-    parts = Parts({"mean": images}, {"true": lambda scene, seed: shown()[1]}, {}, SUPERVISIONS, {"tracking": TRACKING})
-    recipe = Recipe("test", "mean", "true", "tracking", "pixel", {**TINY, "time_spacing_ticks": 110})
-    model = RecipeMethod(recipe, parts).fit(WORLD.training, Budget(2.0), "cpu", 0, silent)
+    parts = Parts(
+        {"mean": images}, {"true": Initialization(lambda request: shown()[1])}, {}, SUPERVISIONS, {"tracking": TRACKING}
+    )
+    settings = {**{f"motion.{name}": value for name, value in TINY.items()}, "images.time_spacing_ticks": 110}
+    recipe = Recipe("test", "mean", "true", "tracking", "pixel", settings)
+    model = RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest(Budget(2.0)))
     image = model.render(WORLD.held_out, 6000.0)
     truth = WORLD.look(WORLD.held_out, 0.5)[0]
     assert len(model.tracks.times_us) == 3
@@ -262,4 +273,5 @@ def test_budget_scales_steps_only_and_the_publications_counts_are_settings() -> 
     half = s.scaled(0.5)
     assert (half.first_steps, half.later_steps) == (s.first_steps // 2, s.later_steps // 2)
     assert replace(half, first_steps=s.first_steps, later_steps=s.later_steps) == s
-    assert TRACKING.published == PUBLISHED and replace(s, **PUBLISHED).later_steps == 500
+    paper = override(TRACKING.settings, PUBLISHED, "paper")
+    assert TRACKING.published == PUBLISHED and paper["motion"] == replace(s, first_steps=2500, later_steps=500)

@@ -1,0 +1,66 @@
+"""Training images of a fit: at which ticks they are made, and by what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.settings import Settings
+from spike4dgs.method.splat import Views
+
+
+@dataclass(frozen=True)
+class ImageSettings(Settings):
+    """Times at which images are made from the spikes, and their correction (prefix `images`)."""
+
+    time_spacing_ticks: int = 10  # 0.5 ms at 20 kHz: half a ground-truth interval
+    edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their images belong to a later time
+    max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
+    flat_field: bool = False  # correct the images by each camera's calibrated gain n(x, y) and dark rate, if known
+
+
+class ImageMaker(Protocol):
+    """Images from spikes, corrected if the camera's calibration is given; `spike_to_image.base` says more."""
+
+    def __call__(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> Float32:
+        """Return linear radiance [n, H, W]; `gain` is spikes per tick of white."""
+        ...
+
+
+def wanted_images(n_ticks: int, settings: ImageSettings) -> float:
+    """Return how many images of a view a clip has room for, edges included."""
+    return min(settings.max_times, n_ticks / settings.time_spacing_ticks)
+
+
+def choose_ticks(n_ticks: int, settings: ImageSettings) -> tuple[int, ...]:
+    """Return the ticks of the training images: evenly spaced, an edge away from the clip's ends."""
+    edge = min(settings.edge_ticks, (n_ticks - 1) // 2)
+    span = n_ticks - 2 * edge
+    count = min(settings.max_times, max(1, round(span / settings.time_spacing_ticks) + 1))
+    return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
+
+
+def make_training_images(
+    scene: TrainingScene, cameras: Sequence[Camera], make: ImageMaker, settings: ImageSettings, device: str
+) -> TrainingImages:
+    """Return images of all training views at the chosen times, as `cameras` see them."""
+    ticks = choose_ticks(scene.n_ticks, settings)
+    gain, calibrations = scene.radiance_gain, scene.calibrations if settings.flat_field else None
+    if calibrations:
+        made = [make(s, ticks, gain, camera) for s, camera in zip(scene.streams, calibrations, strict=True)]
+    else:
+        made = [make(s, ticks, gain) for s in scene.streams]
+    images = torch.from_numpy(np.stack(made, axis=1)).to(device)
+    return TrainingImages(Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks)

@@ -1,0 +1,68 @@
+"""The motion `paths`: gray values on polynomial paths that begin at rest in the middle of the clip.
+
+The static stage finds things where they are then; while the times open up, they are followed from there. One Gaussian
+sees its thing for the whole clip, which averages the noise that a short temporal scale would keep. Clips much longer
+than 20 ms are fitted in pieces: no cubic follows a wheel for longer, and an error at one time would pull at all others.
+
+A Gaussian that densification adds keeps its parent's time, and nothing is laid down by guided sampling: what things
+lack is added to them, for as long as they are seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from spike4dgs.method.gaussians.optimizer import Decay
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSettings, at_time, move_to
+from spike4dgs.method.observations.training_images import TrainingImages
+
+PIECE_TICKS = 400  # 20 ms at 20 kHz
+PIECE_IMAGES = 20  # at least about as many times of a view in each
+
+
+@dataclass(frozen=True)
+class PathSettings(PolynomialSettings):
+    """Numbers of the motion `paths` (prefix `motion`)."""
+
+    lr_coefficients: float = 1.4e-3  # of the polynomials, in scene scales a clip
+    lr_coefficients_last: float = 1.4e-4
+
+
+class Paths(PolynomialMotion):
+    """Polynomial paths through the whole clip, in pieces where it is long."""
+
+    defaults = PathSettings()
+    settings: PathSettings
+
+    @property
+    def pieces(self) -> int:
+        """About 20 ms each, what a cubic can follow, or longer where images are too far apart for that.
+
+        The cost of rendering does not grow with the clip.
+        """
+        return 2 * round((min(self.extent.n_ticks / PIECE_TICKS, self.extent.images / PIECE_IMAGES) - 1) / 2) + 1
+
+    def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
+        """Return the Gaussians as they are at the piece's end, or beginning, going straight on at their velocities."""
+        end, ahead = (1.0, 0.5) if forward else (0.0, -0.5)
+        with torch.no_grad():
+            g = move_to(gaussians, torch.full_like(gaussians.logits, end))
+            velocities, turning = g.extra["coefficients"][:, :3], g.extra["angular_velocities"]
+            logits = torch.logit(at_time(gaussians, end)[3], 1e-6)  # as far as they have faded
+            there = replace(g, means=g.means + ahead * velocities, quats=g.quats + ahead * turning, logits=logits)
+            new = self.timed(there, torch.full_like(logits, 0.5), self.settings.static_temporal_scale)
+            new.extra["coefficients"][:, :3], new.extra["angular_velocities"][:] = velocities, turning
+        return new
+
+    def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+        """Return all Gaussians at rest in the middle of the clip, for as long as it lasts."""
+        return self.timed(gaussians, torch.full((len(gaussians),), 0.5), self.settings.static_temporal_scale)
+
+    def learning_rates(self) -> dict[str, Decay]:
+        """Return the learning rates: coefficients must follow motion while the times open up, and rest in the end."""
+        s, scale = self.settings, self.extent.scale
+        coefficients = Decay(s.lr_coefficients * scale, s.lr_coefficients_last * scale)
+        return {**super().learning_rates(), "coefficients": coefficients}
