@@ -1,1 +1,1 @@
-"""What the training views observe: images over time, points looked up in them, what moves."""
+"""Observations of the training views: images over time, their values at points, and what changes in them."""

@@ -1,3 +1,7 @@
+"""Foreground masks, the points in them, and the window around them, on the toy world."""
+
+from __future__ import annotations
+
 from functools import cache
 
 import numpy as np
@@ -11,7 +15,6 @@ from spike4dgs.method.observations.foreground import (
     foreground_points,
     moving_window,
     stray_points,
-    temporal_deviation,
 )
 from spike4dgs.method.splat import Views
 
@@ -21,11 +24,11 @@ TIMES = np.linspace(0, 1, 7)
 
 @cache
 def clip() -> tuple[torch.Tensor, torch.Tensor]:
-    """Noisy images [T, C, H, W] of the toy world, and where the board is at any of the times [C, H, W]."""
-    looks = [[WORLD.look(c, t) for c in WORLD.cameras] for t in TIMES]
-    images = np.array([[image for image, _, _ in row] for row in looks])
+    """Return noisy images [T, C, H, W] of the toy world, and the pixels of the board at any of the times [C, H, W]."""
+    views = [[WORLD.trace(c, t) for c in WORLD.cameras] for t in TIMES]
+    images = np.array([[image for image, _, _ in row] for row in views])
     images += np.random.default_rng(0).normal(0, 0.015, images.shape)
-    swept = np.array([[board for _, _, board in row] for row in looks]).any(0)
+    swept = np.array([[board for _, _, board in row] for row in views]).any(0)
     return torch.tensor(images, dtype=torch.float32), torch.from_numpy(swept)
 
 
@@ -34,19 +37,12 @@ def flat(noise: float, seed: int = 0) -> torch.Tensor:
     return torch.tensor(0.5 + noise * rng.normal(size=(9, 2, 30, 50)), dtype=torch.float32)
 
 
-def test_deviation_is_that_of_images_averaged_over_3x3_pixels() -> None:
-    images = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
-    padded = np.pad(images.double().numpy(), ((0, 0), (0, 0), (1, 1), (1, 1)))
-    smooth = sum(padded[..., y : y + 8, x : x + 9] for y in range(3) for x in range(3)) / 9
-    np.testing.assert_allclose(temporal_deviation(images), smooth.std(axis=0), atol=1e-12)
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.005, 0.02, 0.04])
-def test_noise_alone_does_not_move(noise: float) -> None:
+def test_noise_alone_is_not_foreground(noise: float) -> None:
     assert not foreground_masks(flat(noise)).any()
 
 
-def test_mask_holds_where_the_board_has_been_and_little_else() -> None:
+def test_mask_holds_the_path_of_the_board_and_little_else() -> None:
     images, swept = clip()
     masks = foreground_masks(images)
     assert (masks & swept).sum() > 0.95 * swept.sum()
@@ -54,14 +50,14 @@ def test_mask_holds_where_the_board_has_been_and_little_else() -> None:
     assert not (masks & ~around).any()  # blur and growth, one pixel each
 
 
-def test_inside_of_a_uniform_thing_is_filled() -> None:
+def test_inside_of_a_uniform_object_is_filled() -> None:
     images = flat(0.005)
     for t in range(len(images)):
         images[t, :, 3 + t : 19 + t, 10 + t : 36 + t] = 0.9  # 8x18 pixels never change
     assert foreground_masks(images)[:, 12:19, 19:36].all()
 
 
-def test_a_thing_that_leaves_the_image_is_not_cut_at_its_edge() -> None:
+def test_an_object_that_leaves_the_image_is_not_cut_at_its_edge() -> None:
     images = flat(0.0)
     for t in range(len(images)):
         images[t, :, 10:20, : 2 + 2 * t] = 0.9
@@ -72,7 +68,7 @@ def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
     images, _ = clip()
     masks = foreground_masks(images)
     camera = WORLD.held_out
-    _, depth, board = WORLD.look(camera, 0.5)
+    _, depth, board = WORLD.trace(camera, 0.5)
     v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
     points = torch.from_numpy(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
     moving = foreground_points(points, Views.from_cameras(WORLD.cameras), masks).numpy()
@@ -82,14 +78,14 @@ def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
     assert np.array_equal(stray_points(points, Views.from_cameras(WORLD.cameras), masks).numpy(), ~moving)
 
 
-def test_points_behind_all_cameras_or_out_of_their_sight_neither_move_nor_stray() -> None:
+def test_points_outside_all_images_neither_move_nor_stray() -> None:
     masks = torch.ones(len(WORLD.cameras), WORLD.height, WORLD.width, dtype=torch.bool)
     points = torch.tensor([[0.0, -9.0, 1.0], [50.0, 0.0, 1.0]])
     assert not foreground_points(points, Views.from_cameras(WORLD.cameras), masks).any()
     assert not stray_points(points, Views.from_cameras(WORLD.cameras), masks).any()  # they have left
 
 
-def test_window_shows_the_same_pixels_through_the_same_lines_of_sight() -> None:
+def test_window_shows_the_same_pixels_along_the_same_rays() -> None:
     images, swept = clip()
     views = Views.from_cameras(WORLD.cameras)
     window = moving_window(views, swept, 3)
