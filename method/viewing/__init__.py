@@ -1,1 +1,1 @@
-"""Looking at fitted models: camera paths, videos, the viewer, and how fast a model renders."""
+"""Views of fitted models: camera paths, videos, the viewer, and the speed of rendering."""

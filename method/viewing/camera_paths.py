@@ -1,7 +1,7 @@
 """Cameras that move: functions of s in [0, 1], laid out from the training cameras.
 
-Nothing is known of a scene but what the training cameras saw, so every path stays among them: a circle around the scene
-would show its back, which no view has seen.
+The training cameras saw only one side of a scene, so every path stays among them: a circle around the scene would show
+its back, which no view has seen.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from spike4dgs.benchmark.scene.cameras import Camera, Float64, look_at
 
 Path = Callable[[float], Camera]
 PathName = Literal["orbit", "rig", "still"]
-ALONE = 0.05  # radius of the orbit around a single camera, in distances to what it looks at
+ALONE = 0.05  # radius of the orbit around a single camera, in distances to the focus
 FAR = 5.0  # distance of the focus of cameras whose axes never meet, in radii of the array
 PARALLEL = 1e-4  # smallest eigenvalue, per camera, below which axes count as parallel: about half a degree
 
 
 def make_path(name: PathName, cameras: Sequence[Camera], camera: str | None = None) -> Path:
-    """The path called `name`; `still` stands at the training camera `camera`, or at the middle one."""
+    """Return the path called `name`; `still` is the training camera `camera`, or the middle one."""
     if camera is not None and name != "still":
         raise problem("--camera", "--path still beside it", f"--path {name}", "leave one of them out")
     if name == "orbit":
         return orbit(cameras)
-    return rig(cameras) if name == "rig" else still(cameras, camera)
+    return rig(cameras) if name == "rig" else fixed(cameras, camera)
 
 
 def focus(cameras: Sequence[Camera]) -> Float64:
-    """The point [3] that is nearest to all optical axes: what an array looks at.
+    """Return the point [3] that is nearest to all optical axes, the middle of the scene.
 
-    min over x of sum |(I - d d^T) (x - c)|^2. Where the axes are parallel, or meet behind the array, it is a point on
-    the mean axis, five of the array's radii away.
+    It minimises sum |(I - d d^T) (x - c)|^2 over x. If the axes are parallel, or meet behind the array, it is a point
+    on the mean axis, five of the array's radii away.
     """
     centers, axes = np.stack([c.center for c in cameras]), np.stack([c.R[2] for c in cameras])
     middle, forward = centers.mean(0), axes.mean(0) / np.linalg.norm(axes.mean(0))
@@ -51,7 +51,7 @@ def focus(cameras: Sequence[Camera]) -> Float64:
 
 
 def orbit(cameras: Sequence[Camera]) -> Path:
-    """A closed ellipse as wide and as high as the array, around its middle, always looking at the focus."""
+    """Return a closed ellipse as wide and as high as the array, around its middle, directed at the focus."""
     centers, target = np.stack([c.center for c in cameras]), focus(cameras)
     middle, up = centers.mean(0), -np.mean([c.R[1] for c in cameras], axis=0)
     first = look_at("orbit", middle, target, up, focal=1.0, width=1, height=1)
@@ -64,14 +64,14 @@ def orbit(cameras: Sequence[Camera]) -> Path:
 
     def at(s: float) -> Camera:
         angle = 2 * math.pi * s
-        place = middle + reach[0] * math.cos(angle) * right + reach[1] * math.sin(angle) * down
-        return look_at("orbit", place, target, up, focal=focal, width=size.width, height=size.height)
+        center = middle + reach[0] * math.cos(angle) * right + reach[1] * math.sin(angle) * down
+        return look_at("orbit", center, target, up, focal=focal, width=size.width, height=size.height)
 
     return at
 
 
 def rig(cameras: Sequence[Camera]) -> Path:
-    """From training camera to training camera, each time to the nearest one that was not visited, with soft stops."""
+    """Return a path from training camera to training camera, each time to the nearest new one, with soft stops."""
     from scipy.spatial.transform import Rotation, Slerp
 
     order = visiting_order(np.stack([c.center for c in cameras]))
@@ -79,9 +79,9 @@ def rig(cameras: Sequence[Camera]) -> Path:
     turns = Rotation.from_matrix(np.stack([c.R for c in stops]))
 
     def at(s: float) -> Camera:
-        place = min(max(s, 0.0), 1.0) * (len(stops) - 1)
-        i = min(int(place), max(len(stops) - 2, 0))
-        w = place - i
+        stop = min(max(s, 0.0), 1.0) * (len(stops) - 1)
+        i = min(int(stop), max(len(stops) - 2, 0))
+        w = stop - i
         w = w * w * (3 - 2 * w)
         a, b = stops[i], stops[min(i + 1, len(stops) - 1)]
         R = Slerp([0.0, 1.0], turns[[i, min(i + 1, len(stops) - 1)]])(w).as_matrix()
@@ -93,7 +93,7 @@ def rig(cameras: Sequence[Camera]) -> Path:
 
 
 def visiting_order(centers: Float64) -> list[int]:
-    """Indices of places [C, 3]: the one farthest from the middle first, then always the nearest that is left."""
+    """Return the order of centres [C, 3]: the one farthest from the middle, then always the nearest that is left."""
     left = set(range(len(centers)))
     here = int(np.argmax(np.linalg.norm(centers - centers.mean(0), axis=1)))
     order = [here]
@@ -103,8 +103,8 @@ def visiting_order(centers: Float64) -> list[int]:
     return order
 
 
-def still(cameras: Sequence[Camera], name: str | None = None) -> Path:
-    """One training camera, at all times. Raises UserError for a name that none has."""
+def fixed(cameras: Sequence[Camera], name: str | None = None) -> Path:
+    """Return a path that is one training camera throughout. Raises UserError for a name that none has."""
     known = {c.id: c for c in cameras}
     if name is None:
         middle = np.mean([c.center for c in cameras], axis=0)
@@ -117,9 +117,9 @@ def still(cameras: Sequence[Camera], name: str | None = None) -> Path:
 
 
 def resized(camera: Camera, scale: float) -> Camera:
-    """The same view with `scale` times as many pixels each way, rounded to even numbers, which video codecs need.
+    """Return the same view with `scale` times as many pixels each way, rounded to even numbers for video codecs.
 
-    A view is stretched by what the rounding takes, at most a pixel.
+    The rounding stretches a view by a pixel at most.
     """
     width, height = (max(2, 2 * round(scale * n / 2)) for n in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height

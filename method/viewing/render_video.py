@@ -37,7 +37,7 @@ def render(
         path: orbit: an ellipse as large as the camera array, around its middle; rig: from training camera to training
             camera; still: one of them.
         camera: The training camera of `still`; the middle one if left out.
-        slow_motion: How many times slower than the world; 1000 makes 20 s of 20 ms.
+        slow_motion: Times slower than the world; 1000 makes 20 s of 20 ms.
         fps: Frames per second of the video.
         scale: Size, as a multiple of the training views' each way.
         out: Video, .mp4 (VP9) or .avi (Motion JPEG); SCENE-PATH.mp4 if left out, or none where --frames is given.
@@ -63,7 +63,7 @@ def render(
             writers.append(stack.enter_context(video_writer(out, (first.width, first.height), fps)))
         if frames is not None:
             writers.append(png_writer(frames))
-        for image in _shown(make_images(saved, views, times, scale), len(times), saved.title):
+        for image in _shown(render_frames(saved, views, times, scale), len(times), saved.title):
             for write in writers:
                 write(image)
     seconds = len(times) / fps
@@ -73,27 +73,27 @@ def render(
 
 
 def frame_times(duration_us: float, slow_motion: float, fps: float) -> list[float]:
-    """Times in the clip, in microseconds, of the frames of a video that plays it `slow_motion` times slower."""
+    """Return the times in the clip, in us, of the frames of a video that plays it `slow_motion` times slower."""
     step_us = 1e6 / (fps * slow_motion)
     count = max(1, math.ceil(duration_us / step_us - 1e-9))
     return [i * step_us for i in range(count)]
 
 
-def make_images(saved: SavedModel, path: camera_paths.Path, times: list[float], scale: float) -> Iterator[UInt8]:
-    """The frames [H, W]: the model along the path, at each of the times, sRGB-encoded."""
+def render_frames(saved: SavedModel, path: camera_paths.Path, times: list[float], scale: float) -> Iterator[UInt8]:
+    """Yield the frames [H, W]: the model along the path, at each of the times, sRGB-encoded."""
     for i, t_us in enumerate(times):
         camera = resized(path(i / max(len(times) - 1, 1)), scale)
         yield encode_srgb(saved.model.render(camera, t_us))
 
 
 def png_writer(folder: Path) -> Write:
-    """What writes frames as FOLDER/00000.png and so on."""
+    """Return a function that writes frames as FOLDER/00000.png and so on."""
     count = iter(range(10**9))
     return lambda image: write_png(folder / f"{next(count):05d}.png", image)
 
 
 def _shown(frames: Iterator[UInt8], total: int, title: str) -> Iterator[UInt8]:
-    """The same frames, with a progress bar on a terminal."""
+    """Yield the same frames, with a progress bar on a terminal."""
     from rich.console import Console
     from rich.progress import track
 

@@ -1,7 +1,7 @@
-"""`speed render`: how fast saved models render, side by side in one process, and how far from float64.
+"""`speed render`: the rendering speed of saved models, side by side in one process, and their error against float64.
 
-Models take turns at every camera and time, so that whatever else the machine does meets all of them alike. The exact
-image is composited in float64 at some patches; how a model moves its Gaussians is not part of the comparison.
+Models take turns at every camera and time, so that other load on the machine affects all of them alike. The exact image
+is composited in float64 at some patches; the motion of a model's Gaussians is not part of the comparison.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat.reference import Projection, composite, project
 from spike4dgs.method.splat.types import EPS2D, NEAR
-from spike4dgs.method.trainer import one_torch_thread
+from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
 
 PATCH = (32, 16)  # px, width and height
@@ -34,18 +34,18 @@ PATCHES = ((0.2, 0.3), (0.5, 0.3), (0.8, 0.3), (0.2, 0.7), (0.5, 0.7), (0.8, 0.7
 
 @runtime_checkable
 class Splatting(Protocol):
-    """A model that draws Gaussians."""
+    """A model that renders Gaussians."""
 
     def render(self, camera: Camera, t_us: float) -> Float32:
-        """Gray linear radiance [H, W]."""
+        """Return gray linear radiance [H, W]."""
         ...
 
     def splats(self, t_us: float) -> Splats:
-        """What is drawn at `t_us`."""
+        """Return the Gaussians to render at `t_us`."""
         ...
 
     def image(self, image: Tensor, views: Views) -> Tensor:
-        """Drawn channels [V, H, W, F] -> gray radiance [V, H, W]."""
+        """Return gray radiance [V, H, W] from rendered channels [V, H, W, F]."""
         ...
 
 
@@ -75,7 +75,7 @@ def render(argv: Sequence[str] = ()) -> int:
 
 
 def _shots(saved: SavedModel, times: int, scale: float) -> list[tuple[Camera, float]]:
-    """Every training camera at `times` times in the middle of equal parts of the clip; cameras take turns."""
+    """Return every training camera at `times` times, the middles of equal parts of the clip; cameras take turns."""
     about = saved.provenance
     cameras = [c if scale == 1 else resized(c, scale) for c in about.cameras]
     return [(c, (i + 0.5) / times * about.duration_us) for i in range(times) for c in cameras]
@@ -101,26 +101,26 @@ def _row(saved: SavedModel, shots: list[tuple[Camera, float]], times_ms: list[fl
 
 @torch.no_grad()
 def errors(model: Splatting, camera: Camera, t_us: float) -> Iterator[Float32]:
-    """Absolute differences [h, w] of a model's image from the exact one, at patches of it."""
-    picture = model.render(camera, t_us)
+    """Yield absolute differences [h, w] of a model's image from the exact one, at patches of it."""
+    image = model.render(camera, t_us)
     width, height = min(PATCH[0], camera.width), min(PATCH[1], camera.height)
     for u, v in PATCHES:
         x = min(max(int(u * camera.width) - width // 2, 0), camera.width - width)
         y = min(max(int(v * camera.height) - height // 2, 0), camera.height - height)
         exact = exact_patch(model, camera, t_us, (x, y), (width, height))
-        yield np.abs(picture[y : y + height, x : x + width] - exact)
+        yield np.abs(image[y : y + height, x : x + width] - exact)
 
 
 @torch.no_grad()
 def exact_patch(
     model: Splatting, camera: Camera, t_us: float, corner: tuple[int, int], size: tuple[int, int]
 ) -> Float32:
-    """Part of a model's image, composited in float64: `size` (width, height) pixels from `corner` (x, y) on: [h, w].
+    """Return a part [h, w] of a model's image, composited in float64: `size` (width, height) px from `corner` (x, y).
 
     The Gaussians are projected as for the whole image; those that cannot reach the patch are left out.
     """
-    drawn, views = model.splats(t_us), Views.from_cameras([camera])
-    wide = Splats(*(t.double().cpu() for t in (*drawn.geometry, drawn.colors)))
+    splats, views = model.splats(t_us), Views.from_cameras([camera])
+    wide = Splats(*(t.double().cpu() for t in (*splats.geometry, splats.colors)))
     whole = (camera.width, camera.height)
     seen = project(wide, views.w2c[0], views.K[0], whole, False, NEAR, EPS2D)
     offset = torch.tensor(corner, dtype=torch.float64)
@@ -130,7 +130,7 @@ def exact_patch(
     image, _ = composite(part, part.center - offset, wide.colors[part.index], size)
     K = views.K.clone()
     K[:, :2, 2] -= offset
-    device = drawn.means.device
+    device = splats.means.device
     cut = Views(views.w2c.to(device), K.to(device), *size)
-    picture = model.image(image[None].to(drawn.colors), cut)
-    return picture[0].clamp(min=0).cpu().numpy()
+    gray = model.image(image[None].to(splats.colors), cut)
+    return gray[0].clamp(min=0).cpu().numpy()

@@ -1,4 +1,4 @@
-"""Video files. OpenCV's own ffmpeg has no encoder for H.264; VP9 is what it has that browsers and players show."""
+"""Video files. OpenCV's own ffmpeg has no encoder for H.264; its VP9 plays in browsers and players."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def check_video(path: Path) -> None:
 
 @contextmanager
 def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
-    """Yield what writes a frame, gray [H, W] or RGB [H, W, 3]; the file appears when all are written.
+    """Yield a function that writes a frame, gray [H, W] or RGB [H, W, 3]; the file appears when all are written.
 
     `size` is (width, height), both even. Raises UserError for another suffix, where no codec works, and for frames of
     another size.

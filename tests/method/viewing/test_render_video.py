@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 
-from spike4dgs.benchmark.cli import load_speed, main
+from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat import render as rasterise
-from spike4dgs.method.viewing.camera_paths import PathName, focus, make_path, orbit, resized, rig, still
+from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
 from spike4dgs.method.viewing.render_video import frame_times
 from spike4dgs.method.viewing.speed_render import exact_patch
 from spike4dgs.method.viewing.video import video_writer
@@ -28,22 +28,22 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parallel(n: int = 3) -> tuple[Camera, ...]:
-    """Cameras side by side with parallel axes, 0.2 m apart."""
+    """Return cameras side by side with parallel axes, 0.2 m apart."""
     one = look_at("a", np.zeros(3), np.array([0.0, 1.0, 0.0]), UP, focal=30, width=40, height=24)
     return tuple(replace(one, id=f"c{i}", t=-one.R @ np.array([0.2 * i, 0, 0])) for i in range(n))
 
 
-def test_the_focus_is_where_the_cameras_look() -> None:
+def test_the_focus_is_the_target_of_the_cameras() -> None:
     np.testing.assert_allclose(focus(WORLD.cameras), [0.0, 0.3, 0.7], atol=1e-9)
 
 
-def test_the_focus_of_parallel_cameras_is_before_them() -> None:
+def test_the_focus_of_parallel_cameras_is_in_front_of_them() -> None:
     np.testing.assert_allclose(focus(parallel()), [0.2, 1.0, 0.0], atol=1e-9)  # five radii of 0.2 m
     np.testing.assert_allclose(focus(parallel(1)), [0.0, 5.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("cameras", [WORLD.cameras, parallel(), parallel(1)], ids=["grid", "row", "one"])
-def test_an_orbit_is_closed_stays_within_the_array_and_looks_at_the_focus(cameras: tuple[Camera, ...]) -> None:
+def test_an_orbit_is_closed_stays_within_the_array_and_faces_the_focus(cameras: tuple[Camera, ...]) -> None:
     path, target = orbit(cameras), focus(cameras)
     centers = np.stack([path(s).center for s in S])
     np.testing.assert_allclose(centers[0], centers[-1], atol=1e-12)
@@ -55,7 +55,7 @@ def test_an_orbit_is_closed_stays_within_the_array_and_looks_at_the_focus(camera
     for s in S:
         uv, z = path(s).project(target[None])
         np.testing.assert_allclose(uv[0], [20, 12], atol=1e-6)
-        assert z[0] > 0 and path(s).R[1] @ UP < -0.5, "up stays up"
+        assert z[0] > 0 and path(s).R[1] @ UP < -0.5, "the image is upright"
 
 
 def test_the_rig_path_visits_every_training_camera_in_short_steps() -> None:
@@ -73,17 +73,17 @@ def test_the_rig_path_visits_every_training_camera_in_short_steps() -> None:
     np.testing.assert_allclose(between.R @ between.R.T, np.eye(3), atol=1e-9)
 
 
-def test_the_still_path_stands() -> None:
+def test_the_fixed_path_is_one_training_camera() -> None:
     nine = parallel(3)
-    assert still(nine)(0.3).id == "c1" and still(nine, "c2")(0.9) is nine[2]
+    assert fixed(nine)(0.3).id == "c1" and fixed(nine, "c2")(0.9) is nine[2]
     with pytest.raises(UserError, match="--camera: expected one of c0, c1, c2, found 'c7'"):
-        still(nine, "c7")
+        fixed(nine, "c7")
     with pytest.raises(UserError, match="--path still beside it, found --path orbit"):
         make_path("orbit", nine, "c1")
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0, 3.3])
-def test_a_resized_camera_sees_the_same_in_even_sizes(scale: float) -> None:
+def test_a_resized_camera_has_the_same_view_in_even_sizes(scale: float) -> None:
     small = replace(WORLD.cameras[0], height=25)
     large = resized(small, scale)
     assert large.width % 2 == large.height % 2 == 0
@@ -93,11 +93,11 @@ def test_a_resized_camera_sees_the_same_in_even_sizes(scale: float) -> None:
     np.testing.assert_allclose(*share, atol=1e-9)
 
 
-def test_slow_motion_plays_the_clip_at_its_pace() -> None:
+def test_slow_motion_spaces_the_frames_evenly_over_the_clip() -> None:
     times = frame_times(20_000.0, slow_motion=1000, fps=30)
     assert len(times) == 600 and times[0] == 0.0 and max(times) < 20_000.0
     np.testing.assert_allclose(np.diff(times), 1e6 / 30_000)
-    assert frame_times(20_000.0, 1, 30) == [0.0], "a clip that is over before the second frame"
+    assert frame_times(20_000.0, 1, 30) == [0.0], "a clip shorter than a frame"
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def saved(tmp_path: Path) -> Path:
 
 
 def shown(path: Path) -> list[np.ndarray]:
-    """The frames of a video, gray."""
+    """Return the frames of a video, gray."""
     video, frames = cv2.VideoCapture(str(path)), []
     while (read := video.read())[0]:
         frames.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY))
@@ -117,7 +117,7 @@ def shown(path: Path) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("suffix", [".mp4", ".avi"])
 @pytest.mark.parametrize("path", ["orbit", "still"])
-def test_a_video_shows_what_the_model_renders(saved: Path, tmp_path: Path, path: PathName, suffix: str) -> None:
+def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: PathName, suffix: str) -> None:
     out, frames = tmp_path / f"v{suffix}", tmp_path / "frames"
     options = ["--path", path, "--slow-motion", "48", "--fps", "25", "--out", str(out), "--frames", str(frames)]
     assert main(["render", str(saved), *options]) == 0
@@ -126,18 +126,18 @@ def test_a_video_shows_what_the_model_renders(saved: Path, tmp_path: Path, path:
     expected = [
         encode_srgb(model("spacetime-lite").render(resized(cameras(i / 5), 2.0), t)) for i, t in enumerate(times)
     ]
-    assert np.abs(expected[0].astype(int) - expected[-1]).mean() > 2, "a test of nothing"
-    pictures = [np.asarray(Image.open(p)) for p in sorted(frames.iterdir())]
+    assert np.abs(expected[0].astype(int) - expected[-1]).mean() > 2, "the model must move"
+    written = [np.asarray(Image.open(p)) for p in sorted(frames.iterdir())]
     # Provenance keeps poses to the last bit but one: a rounding may fall the other way.
-    assert np.abs(np.array(pictures, int) - np.array(expected, int)).max() <= 1
+    assert np.abs(np.array(written, int) - np.array(expected, int)).max() <= 1
     found = shown(out)
     assert len(found) == 6 and found[0].shape == (48, 80)
-    for picture, wanted in zip(found, expected, strict=True):
-        assert np.abs(picture.astype(int) - wanted).mean() < 6
+    for image, wanted in zip(found, expected, strict=True):
+        assert np.abs(image.astype(int) - wanted).mean() < 6
     assert {p.name for p in tmp_path.iterdir()} == {"m.safetensors", out.name, "frames"}, "nothing half written"
 
 
-def test_colours_are_written_as_they_are(tmp_path: Path) -> None:
+def test_colours_survive_the_video(tmp_path: Path) -> None:
     frame = np.zeros((32, 48, 3), np.uint8)
     frame[..., 0] = 200  # red
     with video_writer(tmp_path / "v.avi", (48, 32), 10) as write:
@@ -189,7 +189,7 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
     for name in names:
         model(name).save(tmp_path / name, provenance(method={"name": name}))
     files = [str(tmp_path / name) for name in names]
-    assert load_speed("render")([*files, "--times", "2", "--csv", str(tmp_path / "t.csv")]) == 0
+    assert main(["speed", "render", *files, "--times", "2", "--csv", str(tmp_path / "t.csv")]) == 0
     rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
     assert [r["model"] for r in rows] == [f"{name} on toy" for name in names]
     assert all(r["pixels"] == "40x24" and float(r["frames/s"]) > 0 for r in rows)

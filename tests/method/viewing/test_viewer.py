@@ -1,4 +1,4 @@
-"""What the viewer shows, without a browser; then the viewer in a real one."""
+"""The viewer's content without a browser; then the viewer in a real one."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import ERROR_MAX, error_colors
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
 from spike4dgs.method.saved_model import SavedModel
-from spike4dgs.method.viewing.camera_paths import still
-from spike4dgs.method.viewing.stage import (
+from spike4dgs.method.viewing.camera_paths import fixed
+from spike4dgs.method.viewing.content import (
     BORDER,
     MODES,
-    Stage,
+    Content,
     free_camera,
     matching,
-    open_stage,
+    open_content,
     padded,
     window,
 )
@@ -36,18 +36,18 @@ from spike4dgs.method.viewing.viewer import FREE, Viewer
 TRAINED = WORLD.training.cameras
 
 
-def stage(with_scene: bool = True) -> Stage:
+def content(with_scene: bool = True) -> Content:
     saved = SavedModel(model("spacetime-lite"), provenance(cameras=TRAINED))
-    return Stage(saved, WORLD.training if with_scene else None)
+    return Content(saved, WORLD.training if with_scene else None)
 
 
 def test_the_three_images() -> None:
-    shown, camera, t_us = stage(), TRAINED[1], 0.5 * DURATION_US
+    shown, camera, t_us = content(), TRAINED[1], 0.5 * DURATION_US
     rendered = model("spacetime-lite").render(camera, t_us)
     np.testing.assert_array_equal(shown.image("rendered", camera, t_us)[..., 0], encode_srgb(rendered))
-    truth = WORLD.look(camera, 0.5)[0]
+    truth = WORLD.trace(camera, 0.5)[0]
     rate = shown.spike_rate(camera.id, t_us)
-    assert np.abs(rate - truth).mean() < 0.03, "40 ticks tell a radiance to 1/24, and the board moves"
+    assert np.abs(rate - truth).mean() < 0.03, "40 ticks resolve radiance to 1/24, and the board moves"
     np.testing.assert_array_equal(shown.image("spike rate", camera, t_us)[..., 2], encode_srgb(rate))
     error = np.minimum(np.abs(np.clip(rendered, 0, 1) - np.clip(rate, 0, 1)), ERROR_MAX)
     colors = error_colors()[np.rint(error / ERROR_MAX * 255).astype(int)]
@@ -56,11 +56,11 @@ def test_the_three_images() -> None:
 
 
 def test_without_the_scene_there_is_only_the_model() -> None:
-    assert stage(False).modes == ("rendered",) and stage().modes == MODES
+    assert content(False).modes == ("rendered",) and content().modes == MODES
     with pytest.raises(UserError, match="none: no scene is given"):
-        stage(False).image("error", TRAINED[0], 0.0)
+        content(False).image("error", TRAINED[0], 0.0)
     with pytest.raises(UserError, match="expected a training camera of the scene .*found 'free'"):
-        stage().spike_rate("free", 0.0)
+        content().spike_rate("free", 0.0)
 
 
 @pytest.mark.parametrize(("tick", "expected"), [(0, (0, 40)), (50, (30, 70)), (99, (60, 100))])
@@ -71,15 +71,15 @@ def test_windows_stay_whole_at_the_ends(tick: int, expected: tuple[int, int]) ->
 def test_another_scene_is_refused(small_scene: Path) -> None:
     about = provenance(scene="pattern-0")
     with pytest.raises(UserError, match="expected toy, which the model was fitted to, found pattern-0"):
-        open_stage(SavedModel(model("static"), provenance()), small_scene)
+        open_content(SavedModel(model("static"), provenance()), small_scene)
     with pytest.raises(UserError, match="expected 100 ticks at 20000 Hz, cameras .*found 80 ticks"):
-        open_stage(SavedModel(model("static"), about), small_scene)
+        open_content(SavedModel(model("static"), about), small_scene)
     fitting = provenance(scene="pattern-0", n_ticks=80, cameras=array_cameras()[:3])
-    opened = open_stage(SavedModel(model("static"), fitting), small_scene)
+    opened = open_content(SavedModel(model("static"), fitting), small_scene)
     assert opened.scene is not None and opened.image("spike rate", opened.scene.cameras[2], 1e9).shape == (24, 40, 3)
 
 
-def test_a_free_camera_at_a_training_cameras_place_sees_its_image() -> None:
+def test_a_free_camera_at_a_training_cameras_position_sees_its_image() -> None:
     camera = TRAINED[0]
     aspect = camera.width / camera.height
     _, fov = matching(TRAINED, camera.id, aspect)
@@ -92,7 +92,7 @@ def test_a_free_camera_at_a_training_cameras_place_sees_its_image() -> None:
 
 
 @pytest.mark.parametrize(("aspect", "shape"), [(1.0, (40, 40)), (40 / 24, (24, 40)), (3.0, (24, 72))])
-def test_a_image_is_padded_to_the_window(aspect: float, shape: tuple[int, int]) -> None:
+def test_an_image_is_padded_to_the_window(aspect: float, shape: tuple[int, int]) -> None:
     image = np.full((24, 40, 3), 200, np.uint8)
     found = padded(image, aspect)
     assert found.shape == (*shape, 3) and (found == 200).sum() == image.size and set(np.unique(found)) <= {200, BORDER}
@@ -115,7 +115,7 @@ def viewer() -> Iterator[Viewer]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    made = Viewer(stage(), "127.0.0.1", port)
+    made = Viewer(content(), "127.0.0.1", port)
     loop = threading.Thread(target=made.run)
     loop.start()
     yield made
@@ -125,8 +125,10 @@ def viewer() -> Iterator[Viewer]:
 
 
 def difference(page: Page, image: UInt8) -> float:
-    """Mean difference, of 255, of the page from a gray image that fills it: in the middle, beside the controls and
-    viser's own notes."""
+    """Return the mean difference, of 255, of the page from a gray image that fills it.
+
+    It counts the middle, beside the controls and viser's own notes.
+    """
     shot = page.screenshot().astype(float)
     wanted = cv2.resize(image[:, :, 0], shot.shape[::-1], interpolation=cv2.INTER_LINEAR)
     free = slice(int(0.36 * shot.shape[1]), int(0.64 * shot.shape[1]))
@@ -134,7 +136,7 @@ def difference(page: Page, image: UInt8) -> float:
 
 
 def shows(page: Page, image: UInt8, other: UInt8) -> bool:
-    """Whether the page shows the one image and not the other: it comes in a quality of its own, and coarser first."""
+    """Return whether the page shows the one image and not the other; the image is a JPEG, and coarse at first."""
     return difference(page, image) < difference(page, other) / 2
 
 
@@ -145,11 +147,11 @@ def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp
         wait_for("slider", lambda: page.value("!!document.querySelector('[role=slider]')"))
         wait_for("sharp image", lambda: viewer.images >= 2)
         # The window opens at the middle camera, as wide as the browser.
-        camera = still(TRAINED)(0.0)
+        camera = fixed(TRAINED)(0.0)
         _, fov = matching(TRAINED, camera.id, WIDTH / HEIGHT)
         free = free_camera(camera.R.T, camera.center, fov, WIDTH / HEIGHT, 4 * camera.width * camera.height)
-        first, last = (viewer.stage.image("rendered", free, t) for t in (0.0, viewer.time.max))
-        assert np.abs(first.astype(float) - last).mean() > 4, "a test of nothing"
+        first, last = (viewer.content.image("rendered", free, t) for t in (0.0, viewer.time.max))
+        assert np.abs(first.astype(float) - last).mean() > 4, "the two images must differ"
         wait_for("image at the start", lambda: shows(page, first, last))
         page.value("document.querySelector('[role=slider]').focus()")
         page.press("End")
@@ -157,10 +159,10 @@ def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp
         assert viewer.time.value == viewer.time.max
         assert "frames/s" in viewer.speed.value
 
-        # Spikes are shown where a camera stood: the nearest one is chosen, and the image keeps its shape.
+        # Only training cameras have spikes: the nearest one is chosen, and the image keeps its shape.
         viewer.mode.value = "spike rate"
         wait_for("camera", lambda: viewer.camera.value == camera.id)
-        rate = padded(viewer.stage.image("spike rate", camera, viewer.time.max), WIDTH / HEIGHT)
+        rate = padded(viewer.content.image("spike rate", camera, viewer.time.max), WIDTH / HEIGHT)
         wait_for("spike rate", lambda: difference(page, rate) < 4)
         viewer.camera.value = FREE
         wait_for("rendered again", lambda: viewer.mode.value == "rendered" and shows(page, last, first))

@@ -1,4 +1,4 @@
-"""What the viewer shows: the model's image, what the spikes say, and the difference of the two."""
+"""Content of the viewer: the model's image, the spike rate, and the difference of the two."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ BORDER = 24  # gray around an image that is not as wide or high as the window
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """A model, and the spikes that it was fitted to if the scene is at hand."""
+class Content:
+    """A model, and the spikes that it was fitted to if the scene is given."""
 
     saved: SavedModel
     scene: TrainingScene | None = None
@@ -37,11 +37,11 @@ class Stage:
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """What can be shown: without the scene there are no spikes."""
+        """The kinds of image that the viewer offers: without the scene there are no spikes."""
         return MODES if self.scene else MODES[:1]
 
     def image(self, mode: Mode, camera: Camera, t_us: float) -> UInt8:
-        """RGB [H, W, 3] at `t_us`. For other modes than `rendered`, `camera` is a training camera of the scene."""
+        """Return RGB [H, W, 3] at `t_us`. Modes other than `rendered` need a training camera of the scene."""
         if mode == "rendered":
             return _gray(self.saved.model.render(camera, t_us))
         recorded = self.spike_rate(camera.id, t_us)
@@ -50,9 +50,9 @@ class Stage:
         return error_image(self.saved.model.render(camera, t_us), recorded)
 
     def spike_rate(self, camera: str, t_us: float) -> Float32:
-        """Spikes per tick in the window around `t_us`, over the radiance gain: [H, W], 1.0 = white.
+        """Return the spikes per tick in the window around `t_us` over the radiance gain: [H, W], 1.0 = white.
 
-        Raises UserError where there is no scene, or where it has no such training camera.
+        Raises UserError if there is no scene, or if it has no such training camera.
         """
         scene = self.scene
         names = [c.id for c in scene.cameras] if scene else []
@@ -65,16 +65,16 @@ class Stage:
 
 
 def window(tick: int, n_ticks: int) -> tuple[int, int]:
-    """Ticks [start, stop) of the window around `tick`, moved where it would leave the clip."""
+    """Return the ticks [start, stop) of the window around `tick`, shifted into the clip at its ends."""
     length = min(WINDOW_TICKS, n_ticks)
     start = min(max(tick - length // 2, 0), n_ticks - length)
     return start, start + length
 
 
-def open_stage(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) -> Stage:
-    """A model and its scene's training views. Raises UserError for another scene's folder."""
+def open_content(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) -> Content:
+    """Return the content of a model and its scene's training views. Raises UserError for another scene's folder."""
     if scene is None:
-        return Stage(saved)
+        return Content(saved)
     about = saved.provenance
     opened = open_scene(scene, allow_gaps)
     if opened.id != about.scene:
@@ -85,27 +85,30 @@ def open_stage(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) 
         found = f"{opened.n_ticks} ticks at {opened.rate_hz:g} Hz, cameras {', '.join(opened.train)}"
         expected = f"{about.n_ticks} ticks at {about.rate_hz:g} Hz, cameras {', '.join(c.id for c in about.cameras)}"
         raise problem(scene, expected, found, "give the scene that the model was fitted to")
-    return Stage(saved, opened.training)
+    return Content(saved, opened.training)
 
 
 def _gray(image: Float32) -> UInt8:
     return np.repeat(encode_srgb(image)[:, :, None], 3, 2)
 
 
-def padded(picture: UInt8, aspect: float) -> UInt8:
-    """The image in the middle of a gray one whose width is `aspect` times its height."""
-    height, width = picture.shape[:2]
+def padded(image: UInt8, aspect: float) -> UInt8:
+    """Return the image in the middle of a gray one whose width is `aspect` times its height."""
+    height, width = image.shape[:2]
     full = (max(height, round(width / aspect)), max(width, round(height * aspect)))
     out = np.full((*full, 3), BORDER, np.uint8)
     top, left = (full[0] - height) // 2, (full[1] - width) // 2
-    out[top : top + height, left : left + width] = picture
+    out[top : top + height, left : left + width] = image
     return out
 
 
 def free_camera(
     rotation: NDArray[np.float64], position: NDArray[np.float64], fov: float, aspect: float, pixels: float
 ) -> Camera:
-    """A camera of about so many pixels: camera-to-world rotation [3, 3] (OpenCV axes), position [3], vertical angle."""
+    """Return a camera of about `pixels` pixels in all.
+
+    `rotation` [3, 3] is camera-to-world (OpenCV axes), `position` [3] in metres, `fov` the vertical angle in radians.
+    """
     height = max(16, round((pixels / aspect) ** 0.5))
     width = max(16, round(height * aspect))
     focal = 0.5 * height / np.tan(0.5 * fov)
@@ -113,7 +116,7 @@ def free_camera(
 
 
 def matching(cameras: Sequence[Camera], name: str, aspect: float) -> tuple[Camera, float]:
-    """A camera by name, and the vertical angle of a window of that aspect that holds its whole image."""
+    """Return a camera by name, and the vertical angle at which a window of that aspect holds its whole image."""
     camera = next(c for c in cameras if c.id == name)
     height = max(camera.height, camera.width / aspect)
     return camera, float(2 * np.arctan(0.5 * height / camera.fy))
