@@ -105,7 +105,7 @@ def _cluster(address: str) -> Iterator[Run]:
             "--scheduler", "the package distributed", "none", "pip install 'spike4dgs[cluster]' here and on the workers"
         ) from None
     try:
-        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as e:
         reason = str(e).splitlines()[0] if str(e) else type(e).__name__
         raise problem(

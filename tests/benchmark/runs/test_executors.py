@@ -1,4 +1,4 @@
-"""Where tasks run: the same results in the same order everywhere, and clear errors."""
+"""Executors: the same results in the same order everywhere, and clear errors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import socket
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.runs import executors
 from spike4dgs.benchmark.runs.executors import chunked, executor
-from spike4dgs.generators.audit import errors
 
 
 class Square:
@@ -83,25 +82,11 @@ def test_wrong_arguments_are_one_error():
         pass
 
 
-def test_a_scheduler_that_does_not_answer_is_one_error():
+def test_a_scheduler_that_does_not_answer_is_one_error(monkeypatch):
+    monkeypatch.setattr(executors, "_CONNECT_S", 1)
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         port = s.getsockname()[1]
     with pytest.raises(UserError, match=f"--scheduler: expected a dask scheduler at tcp://127.0.0.1:{port}"):
         with executor(1, f"tcp://127.0.0.1:{port}"):
             pass
-
-
-def test_audit_errors_against_closed_forms():
-    truth = np.full((10, 10), 0.5, np.float32)
-    image, moving = truth.copy(), np.zeros((10, 10), bool)
-    image[:5] += 0.05
-    moving[:1] = True
-    found = errors(image, truth, moving)
-    assert found["psnr_db"] == pytest.approx(-10 * np.log10(0.05**2 / 2), abs=1e-3)
-    assert found["psnr_db_moving"] == pytest.approx(-20 * np.log10(0.05), abs=1e-3)
-    assert found["mean_percent"] == pytest.approx(5, abs=1e-3) and found["mean_percent_moving"] == pytest.approx(
-        10, abs=1e-3
-    )
-    assert found["mean_absolute"] == pytest.approx(0.025, abs=1e-4)
-    assert "psnr_db_moving" not in errors(image, truth, np.zeros((10, 10), bool))

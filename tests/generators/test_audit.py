@@ -1,0 +1,23 @@
+"""The audit's errors against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from spike4dgs.generators.audit import errors
+
+
+def test_audit_errors_against_closed_forms():
+    truth = np.full((10, 10), 0.5, np.float32)
+    image, moving = truth.copy(), np.zeros((10, 10), bool)
+    image[:5] += 0.05
+    moving[:1] = True
+    found = errors(image, truth, moving)
+    assert found["psnr_db"] == pytest.approx(-10 * np.log10(0.05**2 / 2), abs=1e-3)
+    assert found["psnr_db_moving"] == pytest.approx(-20 * np.log10(0.05), abs=1e-3)
+    assert found["mean_percent"] == pytest.approx(5, abs=1e-3) and found["mean_percent_moving"] == pytest.approx(
+        10, abs=1e-3
+    )
+    assert found["mean_absolute"] == pytest.approx(0.025, abs=1e-4)
+    assert "psnr_db_moving" not in errors(image, truth, np.zeros((10, 10), bool))
