@@ -1,6 +1,6 @@
 """Recipes whose initialisation estimates poses: the held-out view's pose is refined before a second scoring.
 
-A model that stands on estimated poses is a little off the calibrated frame in which held-out cameras are given, and a
+A model from estimated poses is a little off the calibrated frame in which held-out cameras are given, and a
 sharp image rendered half a pixel aside scores badly. Both scores are therefore published: (i) at the calibrated pose,
 and (ii) after the pose alone was fitted to pixels of the test view, with the Gaussians frozen (BARF, InstantSplat).
 Those pixels are of static things only and of a time that is not scored (`benchmark.refinement` chooses them).

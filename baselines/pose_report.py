@@ -156,7 +156,7 @@ def measure_poses(
 ) -> list[Row]:
     """Return rows of the table: errors (None where fewer than two views have poses) and seconds.
 
-    An estimator's refusal stands in the row's `error`. With a budget to refine, a row of the refined poses follows.
+    An estimator's refusal is the row's `error`. With a budget to refine, a row of the refined poses follows.
     """
     start = time.perf_counter()
     try:

@@ -80,7 +80,7 @@ def make_budget(text: str) -> Budget:
 
 
 class Progress(Protocol):
-    """Where a fit reports to: `done` of `total` steps and a short note such as the loss."""
+    """A receiver of a fit's progress: `done` of `total` steps and a short note such as the loss."""
 
     def __call__(self, done: int, total: int, note: str = "") -> None:
         """Report."""

@@ -1,8 +1,8 @@
 """`speed splat` and `speed ssim`: the CPU kernels beside pure torch in one process, with the difference.
 
-The other side of `splat` is the rasteriser `torch_ref` of the package metal-gauss, which draws three channels; ours is
-timed with one, as the spike cameras need, and with three. It cuts Gaussians off at three standard deviations where we
-go on to an alpha of 1/255, so images differ by up to 1/255 a Gaussian; the tests hold our error against float64.
+The other side of `splat` is the rasteriser `torch_ref` of the package metal-gauss, which renders three channels; ours
+is timed with one, as the spike cameras need, and with three. It cuts Gaussians off at three standard deviations where
+we go on to an alpha of 1/255, so images differ by up to 1/255 a Gaussian; the tests hold our error against float64.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA
 from spike4dgs.benchmark.speed.timing import show_table, time_ms
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.ssim import C1, C2, RADIUS, ssim_reference
@@ -29,7 +30,7 @@ Run = Callable[
 
 
 def random_scene(n: int, seed: int = 0) -> tuple[Splats, Views]:
-    """N Gaussians in front of a camera that sees most of them, radii as in `MEAN_RADIUS_PX`. float32, one channel."""
+    """Return N Gaussians in front of a camera, most in view, radii as in `MEAN_RADIUS_PX`; float32, one channel."""
     g = torch.Generator().manual_seed(seed)
     z = 2 + 4 * torch.rand(n, generator=g)
     at = [(1.06 * torch.rand(n, generator=g) - 0.53) * size / WIDTH * z for size in (WIDTH, HEIGHT)]
@@ -79,7 +80,7 @@ def _metal_gauss(splats: Splats, views: Views, weight: Tensor, backward: bool) -
 
 
 def _difference(ours: tuple[Tensor, list[Tensor]], theirs: tuple[Tensor, list[Tensor]]) -> tuple[str, str]:
-    """Largest difference of the image, and of the gradients' relative L2 norms over the five parameters."""
+    """Return the largest difference of the image, and of the gradients' relative L2 norms over the five parameters."""
     image = f"{float((ours[0] - theirs[0]).abs().max()):.1e}"
     pairs = [(a, b[..., : a.shape[-1]] if a.ndim == 2 else b) for a, b in zip(ours[1], theirs[1], strict=True)]
     relative = [float((a - b).norm() / b.norm()) for a, b in pairs]
@@ -114,7 +115,7 @@ def splat(argv: Sequence[str] = ()) -> int:
 
 
 def _one_channel(run: Run, theirs: tuple[Tensor, list[Tensor]], channels: int) -> tuple[str, str]:
-    """Differences where both sides differentiate the same loss; with three channels ours weighs all of them."""
+    """Return differences where both sides differentiate the same loss; with three channels ours weighs all of them."""
     return _difference(run(), theirs) if channels == 1 else (_difference((run()[0], []), (theirs[0], []))[0], "")
 
 
@@ -161,7 +162,7 @@ def _differentiate(
 def _ssim_square(image: Tensor, target: Tensor) -> Tensor:
     """SSIM as training code usually writes it: five convolutions with one 11x11 window."""
     at = torch.arange(-RADIUS, RADIUS + 1, dtype=image.dtype)
-    line = torch.exp(-0.5 * (at / 1.5) ** 2)
+    line = torch.exp(-0.5 * (at / SSIM_SIGMA) ** 2)
     window = torch.outer(line, line) / line.sum() ** 2
 
     def blur(x: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """The one trainer of all recipes: the stages of `schedule`, static and deforming; several views of one time per step.
 
-Everything random is drawn from generators seeded by (seed, step), so that the step number is the whole random state
+Everything random comes from generators seeded by (seed, step), so that the step number is the whole random state
 and a fit that resumes from a checkpoint gives the bits of one that never stopped (on the CPU).
 """
 
@@ -129,7 +129,7 @@ class Trainer:
         return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step)
 
     def train_step(self) -> Tensor:
-        """One step; returns the loss."""
+        """Take one step; return the loss."""
         stage, sample = self.stage, self.sample()
         if self.step == stage.first and self.step:
             self._continue(stage)

@@ -39,7 +39,7 @@ class Dust3rShape:
 
     @property
     def hooks(self) -> tuple[int, int, int, int]:
-        """What the head sees: 0 is the encoder's output, k the k-th decoder layer's."""
+        """The layers that the head reads: 0 is the encoder's output, k the k-th decoder layer's."""
         n = self.decoder_layers
         return 0, n // 2, 3 * n // 4, n
 
@@ -53,10 +53,10 @@ class CrossAttention(nn.Module):
         self.projq, self.projk, self.projv = (nn.Linear(width, width) for _ in range(3))
         self.proj = nn.Linear(width, width)
 
-    def forward(self, x: Tensor, other: Tensor, places: Tensor, other_places: Tensor) -> Tensor:
+    def forward(self, x: Tensor, other: Tensor, positions: Tensor, other_positions: Tensor) -> Tensor:
         """[B, N, C] and [B, M, C] -> [B, N, C]."""
         q, k, v = self.projq(x), self.projk(other), self.projv(other)
-        out: Tensor = self.proj(attend_rotary(q, k, v, places, other_places, self.heads))
+        out: Tensor = self.proj(attend_rotary(q, k, v, positions, other_positions, self.heads))
         return out
 
 
@@ -73,10 +73,10 @@ class DecoderBlock(nn.Module):
         self.norm2, self.norm_y, self.cross_attn = _norm(width), _norm(width), CrossAttention(width, heads)
         self.norm3, self.mlp = _norm(width), Mlp(width)
 
-    def forward(self, x: Tensor, other: Tensor, places: Tensor, other_places: Tensor) -> Tensor:
+    def forward(self, x: Tensor, other: Tensor, positions: Tensor, other_positions: Tensor) -> Tensor:
         """[B, N, C] and [B, M, C] -> [B, N, C]."""
-        x = x + self.attn(self.norm1(x), places)
-        x = x + self.cross_attn(self.norm2(x), self.norm_y(other), places, other_places)
+        x = x + self.attn(self.norm1(x), positions)
+        x = x + self.cross_attn(self.norm2(x), self.norm_y(other), positions, other_positions)
         out: Tensor = x + self.mlp(self.norm3(x))
         return out
 
@@ -104,11 +104,11 @@ class Dust3r(nn.Module):
         self.downstream_head1, self.downstream_head2 = (nn.ModuleDict({"dpt": _dpt(s)}) for _ in range(2))
 
     def encode(self, images: Tensor) -> Tensor:
-        """Tokens [B, N, C] of images, row by row."""
+        """Return tokens [B, N, C] of images, row by row."""
         x = self.patch_embed["proj"](images).flatten(2).transpose(1, 2)
-        places = self._places(images)
+        positions = self._positions(images)
         for block in self.enc_blocks:
-            x = block(x, places)
+            x = block(x, positions)
         out: Tensor = self.enc_norm(x)
         return out
 
@@ -117,11 +117,11 @@ class Dust3r(nn.Module):
 
         `images` gives the size, which is the same for both.
         """
-        places = self._places(images)
+        positions = self._positions(images)
         pair = self.decoder_embed(first), self.decoder_embed(second)
         layers = [(first, second)]
         for one, two in zip(self.dec_blocks, self.dec_blocks2, strict=True):
-            pair = one(pair[0], pair[1], places, places), two(pair[1], pair[0], places, places)
+            pair = one(pair[0], pair[1], positions, positions), two(pair[1], pair[0], positions, positions)
             layers.append(pair)
         layers[-1] = (self.dec_norm(pair[0]), self.dec_norm(pair[1]))
         rows, columns = (n // self.shape.patch for n in images.shape[-2:])
@@ -130,7 +130,7 @@ class Dust3r(nn.Module):
             unpack(head([layers[h][view] for h in self.shape.hooks], rows, columns)) for view, head in enumerate(heads)
         )
 
-    def _places(self, images: Tensor) -> Tensor:
+    def _positions(self, images: Tensor) -> Tensor:
         rows, columns = (n // self.shape.patch for n in images.shape[-2:])
         return grid(rows, columns, images.device)
 
@@ -140,7 +140,7 @@ _UNUSED = re.compile(r"mask_token|prediction_head\..*|(enc|dec)_pos_embed")
 
 
 def canonical(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict with the names that `Dust3r` uses: files keep one or the other of two names of a layer."""
+    """Return the state dict with the names that `Dust3r` uses: files keep one or the other of two names of a layer."""
     return {canonical_head(name): tensor for name, tensor in state.items() if not _UNUSED.fullmatch(name)}
 
 
@@ -148,6 +148,6 @@ def load_dust3r(path: Path, shape: Dust3rShape | None = None) -> Dust3r:
     """Build the network from a file of safetensors. Raises UserError where it is another network's or damaged."""
     fix = "use model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
     state = canonical(read_tensors(path, "weights in safetensors format", fix))
-    with torch.device("meta"):  # 571 M parameters need not be drawn at random first
+    with torch.device("meta"):  # 571 M parameters need no random start
         network = Dust3r(shape)
     return load_into(network, state, path, "tensors of DUSt3R with a ViT-L encoder and DPT heads", fix)

@@ -192,9 +192,9 @@ def unposed(scene: TrainingScene, estimate: Estimate, seed: int, *, calibrated: 
         fix = "use rig or colmap"
         raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
     known = [pose.w2c for pose in poses if pose.w2c is not None]
-    placed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
-    move = align_cameras(placed, scene.cameras)
-    moved = tuple(move.camera(c) for c in placed)
+    posed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
+    move = align_cameras(posed, scene.cameras)
+    moved = tuple(move.camera(c) for c in posed)
     cloud = thin(moved, Cloud(move(estimate.points[estimate.sure]), estimate.images[estimate.sure]))
     images = estimate.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
     cloud = fill(moved, images, cloud)

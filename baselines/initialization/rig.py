@@ -70,7 +70,7 @@ def rig(scene: TrainingScene, *, flat_field: bool = False) -> Start:
 def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
     """Return the points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
-        found = f"{len(scene.cameras)} in one place"
+        found = f"{len(scene.cameras)} at one position"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
     mean = window_means(scene, 0, scene.n_ticks, flat_field)
     windows = _windows(scene.n_ticks)

@@ -14,7 +14,7 @@ BACKGROUND = "still"  # the group of the background's tensors
 TENSORS = {"log_temporal_scales": "lives", "coefficients": "paths", "angular_velocities": "spins"}  # code -> file
 _FROM_FILE = {saved: name for name, saved in TENSORS.items()}
 
-# A setting of the trainer, which no motion has: files of earlier versions hold one flat list of the settings of all parts.
+# A setting of the trainer, which no motion has: earlier files hold one flat list of the settings of all parts.
 _ONLY_FLAT = "coarse_steps"
 
 

@@ -30,7 +30,7 @@ class Extent:
 
 
 class Motion(nn.Module):
-    """How Gaussians move. A model says where they are at a time; the rest has defaults that cost nothing.
+    """The motion of Gaussians. A model gives their splats at a time; the rest has defaults that cost nothing.
 
     All that it needs to render is in its state dict and in `Gaussians.extra`, or follows from the extent and the
     settings that it was made from: a saved model is built again from these.
@@ -38,7 +38,7 @@ class Motion(nn.Module):
 
     defaults: ClassVar[Settings] = Settings()  # of the model's own settings
     published: ClassVar[Mapping[str, Any]] = {}  # overrides that give the step counts of the publication
-    moves: ClassVar[bool] = True  # False: all times look the same, and only the static stage is trained
+    moves: ClassVar[bool] = True  # False: all times are the same, and only the static stage is trained
     rests_first: ClassVar[bool] = True  # a static stage comes before the moving one
 
     @property
@@ -48,7 +48,7 @@ class Motion(nn.Module):
 
     @property
     def guided_rounds(self) -> int:
-        """How many times in a fit the trainer asks for `guide`."""
+        """Number of times in a fit that the trainer asks for `guide`."""
         return 0
 
     def splats(self, gaussians: Gaussians, t: float) -> Splats:

@@ -99,7 +99,7 @@ class HexPlane(nn.Module):
 
 
 def sample_level(unit: Tensor, space: Tensor, lines: Tensor) -> Tensor:
-    """One level in plain torch: unit coordinates [N, 3], planes [3, R, R, F], lines [3, R, F] -> product [N, F]."""
+    """Return the products [N, F] of one level at unit points [N, 3]: planes [3, R, R, F], lines [3, R, F]."""
     grid = 2 * unit - 1
     product = torch.ones((), dtype=unit.dtype, device=unit.device)
     for plane, (a, b) in zip(space, SPATIAL_AXES, strict=True):
@@ -111,7 +111,7 @@ def sample_level(unit: Tensor, space: Tensor, lines: Tensor) -> Tensor:
 
 
 def _bilinear(plane: Tensor, grid: Tensor) -> Tensor:
-    """A plane [A, B, F] at grid [N, 2] in [-1, 1] -> [N, F]."""
+    """Return a plane [A, B, F] at grid [N, 2] in [-1, 1]: [N, F]."""
     image = plane.permute(2, 0, 1)[None]
     out = functional.grid_sample(image, grid[None, :, None], padding_mode="border", align_corners=True)
     return out[0, :, :, 0].T
@@ -194,7 +194,7 @@ class HexPlaneMotion(HexPlaneDeformation, Motion):
 
 
 def plane_tv(space: Sequence[Tensor]) -> Tensor:
-    """Total variation of the spatial planes: mean squared difference of neighbours, both axes.
+    """Return the total variation of the spatial planes: mean squared difference of neighbours, both axes.
 
     sum over the three planes of mean (P[i+1,j] - P[i,j])^2 + mean (P[i,j+1] - P[i,j])^2, averaged over levels, so that
     the weight means the same with any number of levels (the published code sums over them).
@@ -204,10 +204,10 @@ def plane_tv(space: Sequence[Tensor]) -> Tensor:
 
 
 def time_smoothness(time: Sequence[Tensor]) -> Tensor:
-    """Second differences of the time planes along time: sum over planes of mean (P[t-1] - 2 P[t] + P[t+1])^2."""
+    """Return second differences along time: the sum over time planes of mean (P[t-1] - 2 P[t] + P[t+1])^2."""
     return torch.stack([3 * p.diff(n=2, dim=1).square().mean() for p in time]).mean()
 
 
 def time_sparsity(time: Sequence[Tensor]) -> Tensor:
-    """Distance of the time planes from 1, where they have no influence: sum over planes of mean |1 - P|."""
+    """Return the distance of the time planes from 1, where they have no influence: sum over planes of mean |1 - P|."""
     return torch.stack([3 * (1 - p).abs().mean() for p in time]).mean()

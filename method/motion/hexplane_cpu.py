@@ -23,7 +23,7 @@ def _pool() -> ThreadPoolExecutor:
 
 @njit(inline="always")
 def _cell(u: np.float32, size: int) -> tuple[int, np.float32, np.float32]:
-    """Lower cell, weight of the upper one, and cells per unit (0 where the point is clamped to the border)."""
+    """Return lower cell, weight of the upper one, and cells per unit (0 where the point is clamped to the border)."""
     x = u * np.float32(size - 1)
     slope = np.float32(size - 1)
     if x <= 0:
@@ -147,6 +147,6 @@ class _Levels(torch.autograd.Function):
 
 
 def sample_levels(unit: Tensor, lines: list[Tensor], space: list[Tensor]) -> Tensor:
-    """Products of all levels: unit points [N, 3], lines of [3, R, F], planes of [3, R, R, F] -> [N, levels * F]."""
+    """Return products [N, levels * F] of all levels at unit points [N, 3]: lines [3, R, F], planes [3, R, R, F]."""
     out: Tensor = _Levels.apply(unit, len(space), *space, *(line.contiguous() for line in lines))
     return out

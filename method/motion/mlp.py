@@ -25,7 +25,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _in_parts(rows: int, work: Callable[[list[slice]], Any]) -> list[Any]:
-    """Call `work` on each part's blocks of rows; the results in order."""
+    """Call `work` on each part's blocks of rows; return the results in order."""
     blocks = [slice(a, min(a + BLOCK, rows)) for a in range(0, rows, BLOCK)]
     cut = (len(blocks) + 1) // PARTS
     quiet = torch.no_grad()(work)  # the mode belongs to the thread that calls

@@ -65,7 +65,7 @@ class SpacetimeLite(PolynomialMotion):
 
     @property
     def guided_rounds(self) -> int:
-        """As the settings say."""
+        """The settings' number."""
         return self.settings.guided_rounds
 
     def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
@@ -124,7 +124,7 @@ class Spacetime(SpacetimeLite):
         return decoded
 
     def timed(self, gaussians: Gaussians, times: Tensor, temporal_scale: float) -> Gaussians:
-        """As lite; view features start as the gray values and time features at 0, as published."""
+        """Return Gaussians as lite does; view features start as gray values and time features at 0, as published."""
         g = super().timed(gaussians, times, temporal_scale)
         return replace(g, extra={**g.extra, "features": torch.cat([g.colors, torch.zeros_like(g.colors)], -1)})
 

@@ -34,7 +34,7 @@ def _cuts(rows: int) -> list[slice]:
 
 
 def _in_parts(blocks: list[Any], work: Callable[[Any], Any]) -> list[list[Any]]:
-    """Call `work` on each of the blocks, on one thread per part; the results in order, by part."""
+    """Call `work` on each of the blocks, on one thread per part; return the results by part."""
     cut = len(blocks) // PARTS
     later = _pool().submit(lambda: [work(b) for b in blocks[cut:]])
     return [[work(b) for b in blocks[:cut]], later.result()]

@@ -103,7 +103,7 @@ class Fitter:
         return spike_loss(rates[0], recorded) + spike_loss(rates[1], recorded) + s.tv_weight * plane_tv(space) + smooth
 
     def train_step(self) -> Tensor:
-        """One step; returns the loss."""
+        """Take one step; return the loss."""
         s, grid, generator = self.settings, self.occupancy, seeded(self.job.request.seed, self.step)
         set_learning_rates(self.adam, self.learning_rates, self.step / s.steps)
         self.adam.zero_grad(set_to_none=True)

@@ -1,6 +1,6 @@
 """Ray marching: sampling of rays, and sums of their samples (Max 1995; Mildenhall et al. 2020).
 
-A sample's place on its ray is a depth z along the camera's axis between two planes, which hold the scene. The far
+A sample lies on its ray at a depth z along the camera's axis between two planes, which hold the scene. The far
 plane is opaque: whatever light is left there sees the field's value on it.
 """
 
@@ -48,19 +48,19 @@ def camera_rays(camera: Camera, device: str = "cpu") -> Rays:
 
 
 def spread(rays: int, count: int, generator: torch.Generator | None) -> Tensor:
-    """Return places [rays, count] in [0, 1]: one in each of `count` bins, random, or its middle without generator."""
+    """Return fractions [rays, count] in [0, 1]: one in each of `count` bins, random, or its middle by default."""
     within = torch.rand(rays, count, generator=generator) if generator else torch.full((rays, count), 0.5)
     return (torch.arange(count) + within) / count
 
 
-def resample(places: Tensor, weights: Tensor, u: Tensor) -> Tensor:
-    """Return places [R, m] distributed as the weights along the rays: their inverse piecewise linear CDF at u [R, m].
+def resample(fractions: Tensor, weights: Tensor, u: Tensor) -> Tensor:
+    """Return fractions [R, m] distributed as the weights along rays: their inverse piecewise linear CDF at u [R, m].
 
-    `places` [R, n] ascend, `weights` [R, n] are their samples' shares of the image. A sample's weight is spread
+    `fractions` [R, n] ascend, `weights` [R, n] are their samples' shares of the image. A sample's weight is spread
     evenly over the stretch between the middles of its neighbours, so that the ends' weights are not used (as
     published). A little is added to each weight, so that a ray that meets nothing is sampled everywhere.
     """
-    middles = 0.5 * (places[:, 1:] + places[:, :-1])  # [R, n - 1]
+    middles = 0.5 * (fractions[:, 1:] + fractions[:, :-1])  # [R, n - 1]
     share = weights[:, 1:-1] + 1e-5
     cdf = torch.cumsum(share / share.sum(-1, keepdim=True), -1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], -1)  # [R, n - 1]

@@ -97,24 +97,24 @@ class DynamicField(nn.Module):
         device = rays.origins.device
         s, view = self.shape, encode_position(_unit(rays.directions), self.shape.direction_frequencies)
         inner = spread(len(rays), s.coarse_samples - 1, generator).to(device)
-        places = torch.cat([inner, inner.new_ones(len(rays), 1)], 1)  # the last sample is on the opaque far plane
-        samples = self._samples(rays, places, t, 0)
+        fractions = torch.cat([inner, inner.new_ones(len(rays), 1)], 1)  # the last sample is on the opaque far plane
+        samples = self._samples(rays, fractions, t, 0)
         density, value = _evaluate(self.coarse, samples, view, s.coarse_samples)
-        weights = weigh(density / self.bounds.scale, self.depth(places), rays.lengths)
+        weights = weigh(density / self.bounds.scale, self.depth(fractions), rays.lengths)
         coarse = (weights * value).sum(-1)
 
         u = spread(len(rays), s.fine_samples, generator).to(device)
-        more = resample(places, weights.detach(), u)
+        more = resample(fractions, weights.detach(), u)
         samples = samples.and_also(self._samples(rays, more, t, s.coarse_samples))
-        places, order = torch.cat([places, more], 1).sort(dim=1, stable=True)
+        fractions, order = torch.cat([fractions, more], 1).sort(dim=1, stable=True)
         both = _evaluate(self.fine, samples, view, s.coarse_samples + s.fine_samples)
         density, value = (x.gather(1, order) for x in both)
-        weights = weigh(density / self.bounds.scale, self.depth(places), rays.lengths)
+        weights = weigh(density / self.bounds.scale, self.depth(fractions), rays.lengths)
         return coarse, (weights * value).sum(-1)
 
-    def depth(self, places: Tensor) -> Tensor:
-        """Return depths in metres of places in [0, 1] between the near and the far plane."""
-        return self.bounds.near + (self.bounds.far - self.bounds.near) * places
+    def depth(self, fractions: Tensor) -> Tensor:
+        """Return depths in metres of fractions in [0, 1] between the near and the far plane."""
+        return self.bounds.near + (self.bounds.far - self.bounds.near) * fractions
 
     def update_occupancy(self, t: float, share: float, generator: torch.Generator) -> None:
         """Evaluate a share of the occupancy grid's cells at t in [0, 1]."""
@@ -124,10 +124,10 @@ class DynamicField(nn.Module):
 
         self.occupancy.update(density, share, generator)
 
-    def _samples(self, rays: Rays, places: Tensor, t: float, first: int) -> Samples:
-        """Return the samples at `places` [R, n] that need a network, as columns `first` and following."""
-        points = rays.at(self.depth(places))
-        kept = self.occupancy(points) | (places == 1)  # the far plane is no empty space
+    def _samples(self, rays: Rays, fractions: Tensor, t: float, first: int) -> Samples:
+        """Return the samples at `fractions` [R, n] that need a network, as columns `first` and following."""
+        points = rays.at(self.depth(fractions))
+        kept = self.occupancy(points) | (fractions == 1)  # the far plane is no empty space
         ray, column = torch.nonzero(kept, as_tuple=True)
         return Samples(ray, first + column, self._canonical(points[kept], t))
 

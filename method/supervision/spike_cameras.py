@@ -13,7 +13,7 @@ from spike4dgs.method.supervision.base import Sample
 
 
 class SpikeCameras(nn.Module):
-    """How much charge the pixels of a scene's training cameras gather, in units of the firing threshold.
+    """The charge that pixels of a scene's training cameras gather, in units of the firing threshold.
 
         charge in a tick = white(x, y) I + dark(x, y)       I: radiance, 1.0 = white
 

@@ -10,7 +10,7 @@ that generalises over illumination". Its equations and code are not. All of the 
 
 Integrate-and-fire with subtractive reset is the camera's public model, and L1 with SSIM is 3DGS's loss. `gain` is the
 scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own. The image is
-taken as constant for M ticks. v keeps the embedding from painting the image itself: every camera stands still, so
+taken as constant for M ticks. v keeps the embedding from painting the image itself: every camera is fixed, so
 that a(x) alone could explain what it sees.
 """
 

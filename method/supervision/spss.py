@@ -9,7 +9,7 @@ Public is the text of these equations. It leaves open, and is read here as follo
 - The neuron: subtractive reset, random charge at the start of each step (`spike_cameras.fire`).
 - "A single spike", the value (H, W, 1) that the neuron gives for one rendered image, is its mean spikes over
   `neuron_ticks` ticks, as in SpikeNeRF. With 1 it would be binary, and no image minimises the L1 distance of a binary
-  value to a mean: in expectation the straight-through gradient of |S - R| draws every rate to 1/2. A fit of a car
+  value to a mean: in expectation the straight-through gradient of |S - R| pulls every rate to 1/2. A fit of a car
   (64x40 pixels, a quarter of `quick`) came to 3.0 dB with 1 and to 30.6 dB with 256.
 - phi_s: one linear layer and a sigmoid, since what comes out are spikes. It begins as the sequence that an even stream
   of spikes has, sorted: element k fires where the value exceeds (k + 1/2) / Gamma. Average and deviation are then those

@@ -181,7 +181,7 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
 
     world = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1)
     model = method.fit(world.training, FitRequest())
-    truth = world.look(world.held_out, 0.5)[0].astype(np.float32)
+    truth = world.trace(world.held_out, 0.5)[0].astype(np.float32)
     assert isinstance(model, RefinableModel)
     found = model.refine(world.held_out, truth, np.ones_like(truth, bool), 3000.0)
     assert np.linalg.norm(found.center - world.held_out.center - shift) < 0.5 * np.linalg.norm(shift)

@@ -130,7 +130,7 @@ def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, sce
 def test_nearest_view_is_the_nearest_training_cameras_tfp(scene: Scene) -> None:
     model = METHODS["nearest-view"].fit(scene.training, FitRequest(TINY))
     for tick in (0, 20, 60, scene.n_ticks - 1):
-        # The cameras stand in a row and cam_03 is held out, next to cam_02.
+        # The cameras are in a row and cam_03 is held out, next to cam_02.
         expected = tfp_image(scene.stream("cam_02"), tick) / scene.radiance_gain
         np.testing.assert_allclose(model.render(scene.cameras["cam_03"], scene.t_us(tick)), expected, rtol=1e-6)
     own = model.render(scene.cameras["cam_00"], scene.t_us(40))

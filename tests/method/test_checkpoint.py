@@ -18,7 +18,7 @@ def some(step: int = 7) -> Checkpoint:
         "adam.means.0.step": torch.tensor(3.0),
         "motion.low": torch.tensor([float("nan"), -0.0, float("inf")]),
         "motion.empty": torch.zeros(0, 4),
-        "pressure.seen": torch.arange(4),
+        "statistics.seen": torch.arange(4),
     }
     return Checkpoint(step, tensors)
 

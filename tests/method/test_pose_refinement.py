@@ -55,7 +55,7 @@ def test_poses_start_where_the_views_are_and_the_first_stays() -> None:
 def truth(stream: object, ticks: list[int], gain: float) -> np.ndarray:
     """A stand-in for the images part: what the camera sees without noise."""
     index = next(i for i, s in enumerate(SCENE.streams) if s is stream)
-    return np.stack([WORLD.look(SCENE.cameras[index], 0.5)[0]] * len(ticks)).astype(np.float32)
+    return np.stack([WORLD.trace(SCENE.cameras[index], 0.5)[0]] * len(ticks)).astype(np.float32)
 
 
 def off(camera: Camera, seed: int) -> Camera:

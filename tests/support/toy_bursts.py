@@ -13,7 +13,7 @@ from spike4dgs.benchmark.scene.bursts import Burst, BurstFacts, burst_path, stac
 def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
     """Return `count` images around `t` in [0, 1]; the pixels of the board at any of these times count as moving."""
     times = t + np.linspace(-0.05, 0.05, count)
-    traced = [[world.look(camera, when) for camera in world.cameras] for when in times]
+    traced = [[world.trace(camera, when) for camera in world.cameras] for when in times]
     keys = np.array([[image for image, _, _ in row] for row in traced], np.float32)
     shape = keys.shape[1:]
     rng = np.random.default_rng(world.seed)
@@ -32,7 +32,7 @@ def write_toy_shard(folder: Path, variant: int, *, width: int = 32, height: int 
     """Write the shard `toy-VARIANT` of one rig and return its path."""
     world = ToyWorld(width=width, height=height, seed=variant)
     bursts = [toy_burst(world, t) for t in np.linspace(0.3, 0.7, instants)]
-    traced = [world.look(camera, 1e3) for camera in world.cameras]  # the board is far outside all images
+    traced = [world.trace(camera, 1e3) for camera in world.cameras]  # the board is far outside all images
     static = [tuple(np.array([maps[k] for maps in traced], np.float32) for k in range(2))]
     facts = BurstFacts("toy", variant, 0, width, height, len(world.cameras), 1, instants, 1, GAIN, 5e4)
     path = burst_path(folder, "toy", variant)

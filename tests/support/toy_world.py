@@ -30,7 +30,7 @@ def run_neurons(rate: NDArray[np.floating], charge: NDArray[np.floating], ticks:
 
 @dataclass(frozen=True)
 class ToyWorld:
-    """Cameras in a square array 4 m before a wall; the board in between moves `travel` m to the right in the clip."""
+    """A square array of cameras 4 m in front of a wall; the board between moves `travel` m to the right in the clip."""
 
     width: int = 64
     height: int = 40
@@ -41,7 +41,7 @@ class ToyWorld:
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        places = np.linspace(-0.4, 0.4, self.side)
+        offsets = np.linspace(-0.4, 0.4, self.side)
         return tuple(
             look_at(
                 f"cam_{i:02d}",
@@ -52,7 +52,7 @@ class ToyWorld:
                 width=self.width,
                 height=self.height,
             )
-            for i, (z, x) in enumerate((z, x) for z in places for x in places)
+            for i, (z, x) in enumerate((z, x) for z in offsets for x in offsets)
         )
 
     def texture(self, surface: int, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -65,7 +65,7 @@ class ToyWorld:
             total += np.sin(k[0] * a + k[1] * b + rng.uniform(0, 6.28))
         return 0.45 + 0.35 * np.tanh(total / 2.5)
 
-    def look(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    def trace(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Radiance, depth z and board mask, each [H, W], at t in [0, 1]."""
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
         d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
@@ -86,7 +86,7 @@ class ToyWorld:
     def stream(self, camera: Camera, index: int) -> SpikeStream:
         """Noise-free integrate-and-fire of the radiance, which is traced every 8 ticks and interpolated."""
         keys = np.arange(0, self.n_ticks + 8, 8)
-        frames = np.stack([self.look(camera, k / self.n_ticks)[0] for k in keys])
+        frames = np.stack([self.trace(camera, k / self.n_ticks)[0] for k in keys])
         charge = np.random.default_rng([self.seed, 100 + index]).random(frames.shape[1:])
         packed = []
         for tick in range(self.n_ticks):
@@ -103,7 +103,7 @@ class ToyWorld:
         """Noisy points [n, 3] on what `cameras` see at the middle of the clip, a point for 2x2 pixels; values [n]."""
         rng, points, values = np.random.default_rng(seed), [], []
         for camera in cameras:
-            image, depth, _ = self.look(camera, 0.5)
+            image, depth, _ = self.trace(camera, 0.5)
             v, u = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2].reshape(2, -1)
             points.append(camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u]))
             values.append(image[v, u])
@@ -115,7 +115,7 @@ class ToyWorld:
         """Mean over the clip, dB, of the centre camera: everywhere, or on the board only."""
         error = []
         for t in np.linspace(0.1, 0.9, 5):
-            truth, _, board = self.look(self.held_out, t)
+            truth, _, board = self.trace(self.held_out, t)
             squared = (model.render(self.held_out, t * self.training.duration_us) - truth) ** 2
             error.append(squared[board].mean() if moving else squared.mean())
         return float(-10 * np.log10(error).mean())

@@ -30,10 +30,10 @@ def mapping() -> Mapping:
 
 def test_means_are_the_radiance_of_what_stands_still() -> None:
     means = clip_means(WORLD.training)
-    image, _, board = WORLD.look(WORLD.training.cameras[2], 0.5)
-    still = ~cv2.dilate(board.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
+    image, _, board = WORLD.trace(WORLD.training.cameras[2], 0.5)
+    background = ~cv2.dilate(board.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
     assert means.shape == (8, 76, 120) and means.dtype == np.float32
-    assert np.abs(means[2] - image)[still].max() < 0.02  # less than one spike in 96 ticks, at 0.6 spikes a tick
+    assert np.abs(means[2] - image)[background].max() < 0.02  # less than one spike in 96 ticks, at 0.6 spikes a tick
 
 
 def test_poses_of_all_views_are_found(mapping: Mapping) -> None:
@@ -50,7 +50,7 @@ def test_points_lie_on_the_surfaces_in_the_scenes_frame_with_their_gray_values(m
     uv, z = WORLD.held_out.project(mapping.points)
     inside = (uv >= 0).all(axis=1) & (uv < [120, 76]).all(axis=1) & (z > 0)
     u, v = uv[inside].astype(int).T
-    image, depth, _ = WORLD.look(WORLD.held_out, 0.5)
+    image, depth, _ = WORLD.trace(WORLD.held_out, 0.5)
     assert inside.mean() > 0.7
     assert np.median(np.abs(z[inside] / depth[v, u] - 1)) < 0.03
     assert np.corrcoef(mapping.values[inside], image[v, u])[0, 1] > 0.7
@@ -100,14 +100,14 @@ def test_points_of_corrected_images_come_from_a_plane_sweep_at_the_estimated_pos
 
 
 class UnevenWorld(ToyWorld):
-    """The world seen by sensors whose pixels' gains spread by 8 %: a pattern that stands still in every view."""
+    """The world seen by sensors whose pixels' gains spread by 8 %: a pattern that is fixed in every view."""
 
     def gains(self, camera: Camera) -> NDArray[np.float64]:
         rng = np.random.default_rng([7, int(camera.id[-2:])])
         return 1 + 0.08 * rng.standard_normal((camera.height, camera.width)).clip(-3, 3)
 
-    def look(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        image, depth, board = super().look(camera, t)
+    def trace(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        image, depth, board = super().trace(camera, t)
         return image * self.gains(camera), depth, board
 
     def recordings(self, camera: Camera) -> Recordings:
@@ -131,6 +131,6 @@ def test_features_are_sought_in_images_without_the_pixels_pattern(monkeypatch: p
 
     monkeypatch.setattr(module, "map_views", watched)
     assert len(colmap(scene, 0, flat_field=True).cameras) == 8
-    truth = np.stack([even.look(camera, 0.5)[0] for camera in scene.cameras])
+    truth = np.stack([even.trace(camera, 0.5)[0] for camera in scene.cameras])
     corrected, plain = (np.sqrt(np.mean((p - truth) ** 2)) for p in (seen[0], clip_means(scene)))
     assert corrected < 0.012 < 0.03 < plain

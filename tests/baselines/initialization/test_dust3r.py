@@ -52,10 +52,10 @@ def test_the_published_shape_has_the_published_number_of_parameters() -> None:
 
 def test_rotation_equals_a_loop_over_pairs_and_depends_on_differences_of_places() -> None:
     g = torch.Generator().manual_seed(0)
-    x, places = torch.randn(1, 2, 6, 16, generator=g), torch.cartesian_prod(torch.arange(2), torch.arange(3))
-    out = rotate(x, places)
-    for n, place_of in enumerate(places.tolist()):
-        for half, at in enumerate(place_of):
+    x, positions = torch.randn(1, 2, 6, 16, generator=g), torch.cartesian_prod(torch.arange(2), torch.arange(3))
+    out = rotate(x, positions)
+    for n, position in enumerate(positions.tolist()):
+        for half, at in enumerate(position):
             for i in range(4):
                 a, b = 8 * half + i, 8 * half + i + 4
                 z = torch.complex(x[..., n, a], x[..., n, b]) * np.exp(1j * at * 100 ** (-i / 4))
@@ -147,7 +147,7 @@ def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(
     try:
         start = dust3r(WORLD.training, 0)
     except UserError as e:  # random points seldom have a pose
-        assert "found no consistent points" in str(e) or "cameras in different places" in str(e)
+        assert "found no consistent points" in str(e) or "cameras at different positions" in str(e)
     else:
         assert len(start.cameras) == 8 and np.isfinite(start.points).all()
 
@@ -179,8 +179,8 @@ def test_resized_view_sees_the_same_scene() -> None:
     middle, half = np.array([256, 152]), np.array([50, 31])
     assert np.allclose(view.project(points)[0] - middle, 5.12 * (camera.project(points)[0] - half))
     v, u = np.mgrid[:62, :100] + 0.5
-    picture = (0.2 + 0.005 * u + 0.003 * v).astype(np.float32)
-    shown = module._decode_srgb(module._resize(picture, view))[8:-8, 8:-8]
+    image = (0.2 + 0.005 * u + 0.003 * v).astype(np.float32)
+    shown = module._decode_srgb(module._resize(image, view))[8:-8, 8:-8]
     y, x = np.mgrid[8:296, 8:504] + 0.5
     expected = 0.2 + 0.005 * (50 + (x - 256) / 5.12) + 0.003 * (31 + (y - 152) / 5.12)
     assert np.abs(shown - expected).max() < 0.005 and abs((shown - expected).mean()) < 5e-4  # 8 bits; 0.1 px
@@ -197,7 +197,7 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(
 
     def seen(i: int) -> np.ndarray:
         v, u = np.mgrid[: views[0].height, : views[0].width] + 0.5
-        depth = WORLD.look(views[i], 0.5)[1]
+        depth = WORLD.trace(views[i], 0.5)[1]
         points = views[i].unproject(np.column_stack([u.ravel(), v.ravel()]), depth.ravel())
         return (points @ views[0].R.T + views[0].t).reshape(*depth.shape, 3)
 
@@ -213,7 +213,7 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(
     uv, z = WORLD.held_out.project(start.points.astype(np.float64))
     inside = (uv >= 0).all(axis=1) & (uv < [100, 62]).all(axis=1)
     u, v = uv[inside].astype(int).T
-    image, depth, _ = WORLD.look(WORLD.held_out, 0.5)
+    image, depth, _ = WORLD.trace(WORLD.held_out, 0.5)
     assert np.median(np.abs(z[inside] / depth[v, u] - 1)) < 0.01
     assert np.corrcoef(start.values[inside], image[v, u])[0, 1] > 0.8
 

@@ -28,9 +28,9 @@ FACTOR, SCALE = 2, 3.7
 
 
 def guess(error: float) -> NDArray[np.float64]:
-    """What view 0 sees, at half the size and another scale, depths wrong by `error`; nothing is known of some rows."""
+    """Points of view 0, at half the size and another scale, depths wrong by `error`; nothing is known of some rows."""
     camera = shrunk(SCENE.cameras[0], FACTOR)
-    depth = WORLD.look(camera, 0.5)[1]
+    depth = WORLD.trace(camera, 0.5)[1]
     depth = depth * np.exp(error * np.random.default_rng(0).standard_normal(depth.shape))
     points = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None])[0].astype(np.float64) / SCALE
     points[10:16] = np.nan
@@ -61,7 +61,7 @@ def test_points_lie_on_the_surfaces(found: Mapping) -> None:
     uv, z = WORLD.held_out.project(found.points)
     u, v = np.floor(uv).astype(int).T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 120) & (v < 76)
-    depth = WORLD.look(WORLD.held_out, 0.5)[1]
+    depth = WORLD.trace(WORLD.held_out, 0.5)[1]
     assert inside.sum() > 100 and np.median(np.abs(z[inside] / depth[v[inside], u[inside]] - 1)) < 0.03
 
 

@@ -46,7 +46,7 @@ OFF = slice(10, 16)  # rows of which the perfect network says that it is not sur
 def perfect() -> Estimate:
     """The truth at half the size and another scale; some rows are far off, and known to be."""
     cameras = tuple(shrunk(c, 2) for c in SCENE.cameras)
-    frames = [WORLD.look(c, 0.5) for c in cameras]
+    frames = [WORLD.trace(c, 0.5) for c in cameras]
     relative = np.stack([c.w2c @ np.linalg.inv(cameras[0].w2c) for c in cameras])
     depth = np.array([x[1] for x in frames], np.float32)
     points = points_of(depth, np.stack([c.K for c in cameras]), relative).astype(np.float64) / SCALE
@@ -58,7 +58,7 @@ def perfect() -> Estimate:
 
 def depth_errors(start: Start, camera: Camera) -> np.ndarray:
     """Relative errors of the depths of the points that a camera sees, beside the board's edges."""
-    _, truth, board = WORLD.look(camera, 0.5)
+    _, truth, board = WORLD.trace(camera, 0.5)
     uv, z = camera.project(start.points.astype(np.float64))
     u, v = np.floor(uv).astype(int).T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
@@ -76,7 +76,7 @@ def near_edge(board: np.ndarray) -> np.ndarray:
 def test_holes_of_the_matched_points_take_the_networks(perfect: Estimate) -> None:
     """A network that is right but for a line through its inverse depths, and matches of one half of the image."""
     camera = SCENE.cameras[0]
-    _, truth, board = WORLD.look(camera, 0.5)
+    _, truth, board = WORLD.trace(camera, 0.5)
     v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
     points = camera.unproject(np.stack([u, v], -1) + 0.5, truth[v, u])
     half = Cloud(points, np.full(len(points), 0.5, np.float32))
@@ -113,14 +113,14 @@ def test_a_line_is_found_through_outliers(a: float, b: float, seed: int) -> None
 def test_without_a_rising_line_the_matched_points_are_all(perfect: Estimate) -> None:
     camera = SCENE.cameras[0]
     v, u = np.mgrid[0:61:2, 0:48:2].reshape(2, -1)
-    depth = WORLD.look(camera, 0.5)[1][v, u]
+    depth = WORLD.trace(camera, 0.5)[1][v, u]
     for count, z in ((20, depth), (len(depth), 1 / depth)):
         points = camera.unproject((np.stack([u, v], -1) + 0.5)[:count], z[:count])
         cloud = Cloud(points, np.full(count, 0.5, np.float32))
         assert completed(cloud, perfect) is cloud
 
 
-def test_the_start_is_that_of_corrected_images_where_views_match(drawn: Path) -> None:
+def test_the_start_is_that_of_corrected_images_where_views_match(random_network: Path) -> None:
     start, flat = msdi(SCENE), rig(SCENE, flat_field=True)
     assert start.cameras is SCENE.cameras
     n = len(matched(SCENE, flat_field=True)[0].points)
@@ -140,7 +140,7 @@ def test_without_poses_the_rig_is_found_again(perfect: Estimate) -> None:
 def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.MonkeyPatch) -> None:
     world = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
     scene, camera = world.training, world.training.cameras[0]
-    truth, depth, _ = world.look(camera, 0.5)
+    truth, depth, _ = world.trace(camera, 0.5)
     seen = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None]).astype(np.float64) / SCALE
     estimate = Estimate(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
     monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.infer", lambda scene, calibrated: estimate)
@@ -150,7 +150,7 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     uv, z = world.held_out.project(start.points.astype(np.float64))
     u, v = np.floor(uv).astype(int).T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 120) & (v < 76)
-    expected = world.look(world.held_out, 0.5)[1][v[inside], u[inside]]
+    expected = world.trace(world.held_out, 0.5)[1][v[inside], u[inside]]
     assert inside.sum() > 2000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
 
 
@@ -177,24 +177,24 @@ def test_maps_of_blocks_are_means_of_the_pixels_that_there_are() -> None:
 
 
 @pytest.fixture
-def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def random_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Weights that nobody trained."""
     torch.manual_seed(0)
-    path = tmp_path / "drawn.safetensors"
+    path = tmp_path / "network.safetensors"
     save_weights(path, Msdi(TINY), Card("tiny", 0, 0, ("toy-1",), {}))
     monkeypatch.setenv(VARIABLE, str(path))
     return path
 
 
-def test_the_network_in_use_looks_at_the_middle_of_the_clip(drawn: Path) -> None:
+def test_the_network_in_use_sees_the_middle_of_the_clip(random_network: Path) -> None:
     estimate = infer(SCENE, calibrated=True)
     assert estimate.factor == 1 and estimate.points.shape == (8, 61, 96, 3) and estimate.images.shape == (8, 61, 96)
     assert np.isfinite(estimate.points).all() and (estimate.confidence > 1).all()
 
 
-def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path) -> None:
+def test_without_calibration_the_network_is_not_told_the_intrinsics(random_network: Path) -> None:
     """The layer that takes them starts at zero and is set here: other intrinsics are then other points."""
-    network = load_network(drawn, "cpu")
+    network = load_network(random_network, "cpu")
     torch.nn.init.normal_(network.encoder.ray_embed.weight, std=0.1)
     longer = replace(SCENE, cameras=tuple(replace(c, fx=1.3 * c.fx, fy=1.3 * c.fy) for c in SCENE.cameras))
     for calibrated in (True, False):
@@ -202,7 +202,7 @@ def test_without_calibration_the_network_is_not_told_the_intrinsics(drawn: Path)
         assert np.array_equal(a, b) != calibrated
 
 
-def test_images_are_the_networks_and_know_the_camera(drawn: Path) -> None:
+def test_images_are_the_networks_and_know_the_camera(random_network: Path) -> None:
     stream, maker = SCENE.streams[0], IMAGES["msdi"]
     plain = maker(stream, [40], GAIN)
     even = Calibration(np.ones((61, 96), np.float32), np.zeros((61, 96), np.float32), GAIN)

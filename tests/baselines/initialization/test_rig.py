@@ -19,9 +19,9 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
 
 
-def still(world: ToyWorld) -> tuple[np.ndarray, np.ndarray]:
+def static_views(world: ToyWorld) -> tuple[np.ndarray, np.ndarray]:
     """Noise-free images and depths of all cameras at the middle of the clip."""
-    seen = [world.look(c, 0.5) for c in world.cameras]
+    seen = [world.trace(c, 0.5) for c in world.cameras]
     return np.stack([s[0] for s in seen]).astype(np.float32), np.stack([s[1] for s in seen])
 
 
@@ -48,14 +48,14 @@ def test_lifted_pixels_project_back_to_their_centres():
 
 
 def test_sweep_finds_the_depth_of_textured_surfaces():
-    images, depths = still(WORLD)
+    images, depths = static_views(WORLD)
     found = sweep(WORLD.cameras, images, 4, full_range(WORLD.cameras))
     error = np.abs(found.inverse * depths[4] - 1)[5:-5, 5:-5]
     assert np.median(error) < 0.02 and np.mean(error < 0.1) > 0.85
 
 
 def test_sweep_of_a_part_equals_the_whole_sweep_inside_it():
-    images, _ = still(WORLD)
+    images, _ = static_views(WORLD)
     planes, mask = full_range(WORLD.cameras), np.zeros((60, 96), bool)
     mask[20:40, 30:50] = True
     part, whole = (sweep(WORLD.cameras, images, 0, planes, m) for m in (mask, None))
@@ -65,14 +65,14 @@ def test_sweep_of_a_part_equals_the_whole_sweep_inside_it():
 
 
 def test_range_holds_the_scene_and_is_much_smaller_than_everything():
-    images, depths = still(WORLD)
+    images, depths = static_views(WORLD)
     planes = find_range(WORLD.cameras, images)
     low, high = np.quantile(1 / depths, [0.01, 0.99])
     assert planes[0] <= low and planes[-1] >= high and len(planes) < 0.7 * len(full_range(WORLD.cameras))
 
 
 def test_views_agree_on_true_depths_and_not_on_chance():
-    images, depths = still(WORLD)
+    images, depths = static_views(WORLD)
     planes = full_range(WORLD.cameras)
     maps = [sweep(WORLD.cameras, images, i, planes) for i in range(9)]
     kept = agreed(WORLD.cameras, maps, 4)
@@ -99,7 +99,7 @@ def test_rig_points_lie_on_the_surfaces_of_the_middle_of_the_clip(start):
     uv, z = WORLD.held_out.project(start.points.astype(np.float64))
     inside = (uv >= 0).all(axis=1) & (uv < [96, 60]).all(axis=1) & (z > 0)
     u, v = uv[inside].astype(int).T
-    image, depth, board = WORLD.look(WORLD.held_out, 0.5)
+    image, depth, board = WORLD.trace(WORLD.held_out, 0.5)
     interior = cv2.erode(board.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
     error = np.abs(z[inside] / depth[v, u] - 1)
     assert inside.mean() > 0.6 and np.median(error) < 0.03 and np.mean(error < 0.1) > 0.75

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.initialization import Start
 
-STILL = ToyWorld(width=96, height=60, n_ticks=200, travel=0.0)
+STATIC = ToyWorld(width=96, height=60, n_ticks=200, travel=0.0)
 MOVING = ToyWorld(width=96, height=60, n_ticks=240, travel=0.5)  # 18 px
 SMALL = ToyWorld(width=40, height=24, n_ticks=30)
 
@@ -27,9 +27,9 @@ def start(world: ToyWorld) -> Start:
 def distance(world: ToyWorld, points: np.ndarray, *times: float) -> tuple[np.ndarray, np.ndarray]:
     """Distance in m of points [N, 3] to floor or wall, and to the board where it is at any of `times`."""
     x, y, z = points.astype(np.float64).T
-    places = [world.travel * (t - 0.5) for t in times]
+    offsets = [world.travel * (t - 0.5) for t in times]
     outside = [
-        np.stack([np.maximum(np.abs(x - p) - 0.45, 0), y, np.maximum(np.abs(z - 0.6) - 0.35, 0)]) for p in places
+        np.stack([np.maximum(np.abs(x - p) - 0.45, 0), y, np.maximum(np.abs(z - 0.6) - 0.35, 0)]) for p in offsets
     ]
     return np.minimum(np.abs(z), np.abs(y - 1.0)), np.min([np.linalg.norm(o, axis=0) for o in outside], axis=0)
 
@@ -45,8 +45,8 @@ def gray_scene(cameras: tuple[Camera, ...], seed: int, n_ticks: int = 24) -> Tra
 
 
 def test_points_of_a_still_scene_lie_on_its_planes() -> None:
-    points = start(STILL).points
-    planes, board = distance(STILL, points, 0.5)
+    points = start(STATIC).points
+    planes, board = distance(STATIC, points, 0.5)
     off = np.minimum(planes, board)
     # One px of parallax of the widest pair is 0.08 m at the board and 0.14 m at the wall.
     assert np.median(off) < 0.04 and np.quantile(off, 0.9) < 0.2
@@ -54,19 +54,19 @@ def test_points_of_a_still_scene_lie_on_its_planes() -> None:
 
 
 def test_values_are_the_radiance_of_what_points_lie_on() -> None:
-    camera, s = STILL.held_out, start(STILL)
-    image, depth, _ = STILL.look(camera, 0.5)
+    camera, s = STATIC.held_out, start(STATIC)
+    image, depth, _ = STATIC.trace(camera, 0.5)
     uv, z = camera.project(s.points.astype(np.float64))
     inside = (uv >= 0).all(axis=1) & (uv < [96, 60]).all(axis=1)
     u, v = uv[inside].astype(int).T
-    on_it = np.abs(1 / z[inside] - 1 / depth[v, u]) < 0.7 * inverse_depth_step(STILL.training.cameras)
+    on_it = np.abs(1 / z[inside] - 1 / depth[v, u]) < 0.7 * inverse_depth_step(STATIC.training.cameras)
     assert on_it.mean() > 0.6
     assert np.median(np.abs(s.values[inside] - image[v, u])[on_it]) < 0.06
 
 
 @pytest.mark.parametrize("index", [0, 4, 8])
 def test_every_view_is_covered(index: int) -> None:
-    uv, _ = STILL.cameras[index].project(start(STILL).points.astype(np.float64))
+    uv, _ = STATIC.cameras[index].project(start(STATIC).points.astype(np.float64))
     grid = np.stack(np.meshgrid(np.arange(2, 96, 4), np.arange(2, 60, 4)), -1).reshape(-1, 2)
     gap = np.linalg.norm(uv[None] - grid[:, None], axis=-1).min(axis=1)
     assert (gap < 4).mean() > 0.9
@@ -83,8 +83,8 @@ def test_what_moves_is_found_where_the_fit_begins_and_not_smeared() -> None:
 def test_background_that_the_middle_of_the_clip_hides_is_found_at_its_ends(t: float) -> None:
     camera, points = MOVING.held_out, start(MOVING).points
     u, v = np.clip(camera.project(points.astype(np.float64))[0], 0, [95, 59]).astype(int).T
-    now = cv2.dilate(MOVING.look(camera, t)[2].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-    shown = MOVING.look(camera, 0.5)[2] & ~now
+    now = cv2.dilate(MOVING.trace(camera, t)[2].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    shown = MOVING.trace(camera, 0.5)[2] & ~now
     on_wall = shown[v, u] & (np.abs(points[:, 1] - 1) < 0.2)
     assert shown.sum() > 100
     assert on_wall.sum() > 0.35 * shown.sum()  # about 0.5; 0.2 to 0.25 without the clip's ends
@@ -105,7 +105,7 @@ def test_two_cameras_and_a_clip_shorter_than_a_window_are_enough_to_begin() -> N
 
 
 @pytest.mark.parametrize("chosen", [(0,), (0, 0, 0)])
-def test_cameras_in_one_place_are_a_user_error(chosen: tuple[int, ...]) -> None:
+def test_cameras_at_one_position_are_a_user_error(chosen: tuple[int, ...]) -> None:
     scene = gray_scene(tuple(SMALL.cameras[i] for i in chosen), 0)
-    with pytest.raises(UserError, match=f"scene gray: expected training cameras apart .* found {len(chosen)} in one"):
+    with pytest.raises(UserError, match=f"scene gray: expected training cameras apart .* found {len(chosen)} at one"):
         rig(scene)

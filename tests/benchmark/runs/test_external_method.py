@@ -89,13 +89,13 @@ def test_it_is_fitted_scored_and_ranked_beside_others(installed: Path, scene: Sc
 
 
 def test_the_example_reconstructs_something(installed: Path) -> None:
-    """Where parallax is large, two images warped onto the best plane beat the nearest camera's image."""
+    """With large parallax, two images warped onto the best plane beat the nearest camera's image."""
     world = ToyWorld()
     values = {}
     for name in ("plane-blend", "nearest-view"):
         model = find_methods()[name].fit(world.training, FitRequest())
         image = model.render(world.held_out, 120 * 50.0)
-        truth = world.look(world.held_out, 0.5)[0]
+        truth = world.trace(world.held_out, 0.5)[0]
         values[name] = peak_signal_noise_ratio(truth, np.clip(image, 0, 1).astype(np.float64), data_range=1)
     assert values["plane-blend"] > values["nearest-view"] + 1, values
 

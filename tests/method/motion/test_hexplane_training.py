@@ -44,7 +44,7 @@ def gaussians(n: int = 40) -> Gaussians:
 
 def trainer(density: DensitySettings = DENSITY, planes: HexPlaneSettings = PLANES) -> Trainer:
     times = (10, 50, 90)
-    frames = [[WORLD.look(c, t / 100)[0] for c in WORLD.cameras] for t in times]
+    frames = [[WORLD.trace(c, t / 100)[0] for c in WORLD.cameras] for t in times]
     images = TrainingImages(
         Views.from_cameras(WORLD.cameras), times, torch.from_numpy(np.array(frames, np.float32)), n_ticks=100
     )

@@ -194,7 +194,7 @@ def test_decoder_is_two_pointwise_layers_beside_the_albedo() -> None:
 
 def make_training_images(count: int = 9) -> TrainingImages:
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks - 1, count))
-    frames = [[WORLD.look(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
+    frames = [[WORLD.trace(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
     images = torch.from_numpy(np.array(frames, np.float32))
     return TrainingImages(Views.from_cameras(WORLD.cameras), ticks, images, WORLD.n_ticks)
 
@@ -202,7 +202,7 @@ def make_training_images(count: int = 9) -> TrainingImages:
 def surface() -> tuple[Tensor, np.ndarray]:
     """Points of one view's surfaces at the clip's middle, and which lie on the board that moves."""
     camera = WORLD.cameras[0]
-    _, depth, board = WORLD.look(camera, 0.5)
+    _, depth, board = WORLD.trace(camera, 0.5)
     v, u = np.mgrid[4 : camera.height - 4 : 3, 4 : camera.width - 4 : 3].reshape(2, -1)
     points = camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u])
     return torch.from_numpy(points.astype(np.float32)), board[v, u]

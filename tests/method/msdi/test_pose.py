@@ -24,7 +24,7 @@ def seen(scale: float = 1.0) -> Float64:
     maps = []
     for camera in WORLD.cameras:
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-        depth = WORLD.look(camera, 0.5)[1]
+        depth = WORLD.trace(camera, 0.5)[1]
         world = camera.unproject(np.column_stack([u.ravel(), v.ravel()]), depth.ravel())
         first = world @ WORLD.cameras[0].R.T + WORLD.cameras[0].t
         maps.append(scale * first.reshape(*depth.shape, 3))

@@ -71,12 +71,12 @@ def test_weights_are_the_recursion_and_sum_to_one(seed: int, n: int) -> None:
 @given(st.integers(0, 10**6), st.integers(4, 30))
 def test_resampling_is_interpolation_of_the_inverse_cdf(seed: int, n: int) -> None:
     g = rng(seed)
-    places = torch.rand(3, n, generator=g).double().sort().values
+    fractions = torch.rand(3, n, generator=g).double().sort().values
     weights = torch.rand(3, n, generator=g).double() ** 4
     u = torch.rand(3, 50, generator=g).double()
-    found = resample(places, weights, u)
+    found = resample(fractions, weights, u)
     for r in range(3):
-        middles = ((places[r, 1:] + places[r, :-1]) / 2).numpy()
+        middles = ((fractions[r, 1:] + fractions[r, :-1]) / 2).numpy()
         share = weights[r, 1:-1].numpy() + 1e-5
         cdf = np.concatenate([[0], np.cumsum(share / share.sum())])
         np.testing.assert_allclose(found[r].numpy(), np.interp(u[r].numpy(), cdf, middles), atol=1e-9)
@@ -84,26 +84,26 @@ def test_resampling_is_interpolation_of_the_inverse_cdf(seed: int, n: int) -> No
 
 def test_resampled_places_are_distributed_as_the_weights() -> None:
     """Kolmogorov-Smirnov distance of 20,000 stratified samples to the CDF: below 0.005; unstratified below 0.012."""
-    places = (torch.arange(20) + 0.5)[None] / 20
-    weights = torch.exp(-((places - 0.4) ** 2) / 0.01) + 0.3 * (places > 0.8)
-    middles = ((places[0, 1:] + places[0, :-1]) / 2).double().numpy()
+    fractions = (torch.arange(20) + 0.5)[None] / 20
+    weights = torch.exp(-((fractions - 0.4) ** 2) / 0.01) + 0.3 * (fractions > 0.8)
+    middles = ((fractions[0, 1:] + fractions[0, :-1]) / 2).double().numpy()
     cdf = np.concatenate([[0], np.cumsum(weights[0, 1:-1].double().numpy())])
     for u, bound in ((spread(1, 20_000, rng()), 0.005), (torch.rand(1, 20_000, generator=rng()), 0.012)):
-        x = resample(places, weights, u)[0].sort().values.double().numpy()
+        x = resample(fractions, weights, u)[0].sort().values.double().numpy()
         ks = np.abs(np.interp(x, middles, cdf / cdf[-1]) - (np.arange(len(x)) + 0.5) / len(x)).max()
         assert ks < bound
 
 
 def test_a_ray_that_meets_nothing_is_sampled_everywhere() -> None:
-    places = spread(1, 33, None)
-    x = resample(places, torch.zeros(1, 33), spread(1, 64, None))[0]
+    fractions = spread(1, 33, None)
+    x = resample(fractions, torch.zeros(1, 33), spread(1, 64, None))[0]
     assert x.isfinite().all() and float(x.diff().max()) < 0.02 and float(x[-1] - x[0]) > 0.9
 
 
 def test_spread_puts_one_place_into_each_bin() -> None:
     for generator in (None, rng()):
-        places = spread(50, 16, generator)
-        assert torch.equal((places * 16).long(), torch.arange(16).expand(50, 16))
+        fractions = spread(50, 16, generator)
+        assert torch.equal((fractions * 16).long(), torch.arange(16).expand(50, 16))
 
 
 def test_rays_go_through_pixel_centres() -> None:
@@ -176,9 +176,9 @@ def ball(points: torch.Tensor) -> torch.Tensor:
     return 20.0 * (points.norm(dim=-1) < 0.5)
 
 
-def looked_at(looks: int) -> Occupancy:
+def looked_at(updates: int) -> Occupancy:
     grid = Occupancy(-torch.ones(3), torch.ones(3), 16, 0.01)
-    for k in range(looks):
+    for k in range(updates):
         grid.update(ball, 0.5, rng(k))
     return grid
 

@@ -61,7 +61,7 @@ def test_the_right_image_fires_about_what_was_recorded(tick: int) -> None:
     loss, cameras = scene_loss(), WORLD.training.cameras
 
     def truth(t: float) -> torch.Tensor:
-        return torch.from_numpy(np.stack([WORLD.look(cameras[v], t)[0] for v in (0, 2)])).float()
+        return torch.from_numpy(np.stack([WORLD.trace(cameras[v], t)[0] for v in (0, 2)])).float()
 
     right = float(loss(truth, sample(tick)).detach())
     brighter, darker = (float(loss(lambda t, f=f: truth(t) + f, sample(tick)).detach()) for f in (0.1, -0.1))

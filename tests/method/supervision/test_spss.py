@@ -42,7 +42,7 @@ def make(name: str, scene: TrainingScene = WORLD.training, **changes: float) -> 
 
 def truth(t: float) -> torch.Tensor:
     cameras = WORLD.training.cameras
-    return torch.from_numpy(np.stack([WORLD.look(cameras[v], t)[0] for v in VIEWS])).float()
+    return torch.from_numpy(np.stack([WORLD.trace(cameras[v], t)[0] for v in VIEWS])).float()
 
 
 def every_pixel(phi: torch.nn.Linear, spike: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -150,16 +150,16 @@ def test_deviation_of_spikes_follows_from_their_average(seed: int, ticks: int) -
 @pytest.mark.parametrize("tick", [0, 60, 119])
 def test_the_whole_loss_is_equations_14_to_18(tick: int) -> None:
     scene, step = WORLD.training, 5
-    picture, rendered = truth(0.4).double(), truth(0.6).double()
+    target, rendered = truth(0.4).double(), truth(0.6).double()
     loss = make("spss", ssim_weight=0.0).double()
-    found = float(loss(lambda t: rendered, sample(tick, step, picture)).detach())
+    found = float(loss(lambda t: rendered, sample(tick, step, target)).detach())
     charge = random_charge(rendered, step).numpy()
     spike = run_neurons(GAIN * rendered.numpy(), charge, SETTINGS.neuron_ticks) / SETTINGS.neuron_ticks
     (variation,) = (m for m in loss.modules() if isinstance(m, SpikeVariation))
     average, deviation = (m.detach().numpy() for m in every_pixel(variation.phi, torch.from_numpy(spike)))
     window = slice(max(0, tick - 20), min(120, tick + 20))
     seen = np.stack([scene.streams[v].window(window.start, window.stop) for v in VIEWS]).astype(np.float64)
-    expected = np.abs(rendered.numpy() - picture.numpy()).mean()
+    expected = np.abs(rendered.numpy() - target.numpy()).mean()
     expected += np.abs(average - seen.mean(1)).mean()
     expected += np.abs(deviation - np.sqrt(seen.var(1) + FLOOR)).mean()
     assert found == pytest.approx(expected, rel=1e-6)
@@ -176,14 +176,14 @@ def test_the_spike_loss_is_spikenerfs() -> None:
 
 
 def test_sums_render_once_and_add_up() -> None:
-    picture, calls = truth(0.4), []
+    target, calls = truth(0.4), []
 
     def render(t: float) -> torch.Tensor:
         calls.append(t)
         return truth(0.6)
 
     def value(loss: Supervision) -> float:
-        return float(loss(render, sample(60, 1, picture)).detach())
+        return float(loss(render, sample(60, 1, target)).detach())
 
     pixel, spike = value(make("pixel")), value(make("spike"))
     variation = value(SpikeVariation(SETTINGS, WORLD.training))
@@ -191,7 +191,7 @@ def test_sums_render_once_and_add_up() -> None:
     assert value(make("pixel+spike")) == pytest.approx(pixel + spike, rel=1e-6)
     assert value(make("spss")) == pytest.approx(pixel + variation, rel=1e-6)
     assert calls == [0.5, 0.5]
-    expected = 0.8 * (truth(0.6) - picture).abs().mean() + 0.2 * (1 - ssim(truth(0.6), picture))
+    expected = 0.8 * (truth(0.6) - target).abs().mean() + 0.2 * (1 - ssim(truth(0.6), target))
     assert pixel == pytest.approx(float(expected), rel=1e-6)
 
 
@@ -286,11 +286,11 @@ def test_windows_hold_their_ticks_wherever_they_are() -> None:
 
 
 def test_a_pixel_whose_image_is_no_number_teaches_nothing() -> None:
-    picture = truth(0.6) + 0.1
-    picture[0, 3, 4] = torch.nan
-    picture[1, 5, 6] = torch.inf
+    target = truth(0.6) + 0.1
+    target[0, 3, 4] = torch.nan
+    target[1, 5, 6] = torch.inf
     image = truth(0.6).requires_grad_()
     loss = Pixel(PixelSettings(ssim_weight=0.0), WORLD.training)
-    loss(lambda t: image, sample(60, 0, picture)).backward()
+    loss(lambda t: image, sample(60, 0, target)).backward()
     assert image.grad is not None and int((image.grad == 0).sum()) == 2
     assert not image.grad[0, 3, 4] and not image.grad[1, 5, 6]

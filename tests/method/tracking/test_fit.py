@@ -48,7 +48,7 @@ def silent(done: int, total: int, note: str = "") -> None:
 def shown() -> tuple[TrainingImages, Start]:
     """Exact images of the board at `TIMES` times, and noisy points on the surfaces as they are at the middle one."""
     ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks, TIMES))
-    frames = np.array([[WORLD.look(c, t / WORLD.n_ticks)[0] for c in CAMERAS] for t in ticks], np.float32)
+    frames = np.array([[WORLD.trace(c, t / WORLD.n_ticks)[0] for c in CAMERAS] for t in ticks], np.float32)
     start = Start(CAMERAS, *WORLD.surfaces(CAMERAS[::3], 0.005))
     return TrainingImages(Views.from_cameras(CAMERAS), ticks, torch.from_numpy(frames), WORLD.n_ticks), start
 
@@ -95,7 +95,7 @@ def tracked() -> TrackedModel:
 def test_known_translation_is_recovered() -> None:
     model = tracked()
     tracks, g = model.tracks, model.gaussians
-    # The Gaussians on the board, told by its true place at the first time.
+    # The Gaussians on the board, told by its true position at the first time.
     x, y, z = g.means[tracks.free].unbind(-1)
     board = (x.abs() < 0.4) & (y.abs() < 0.05) & ((z - 0.6).abs() < 0.3) & (g.logits[tracks.free].sigmoid() > 0.3)
     assert board.sum() > 50
@@ -108,7 +108,7 @@ def test_known_translation_is_recovered() -> None:
 
 def test_the_board_is_seen_from_a_new_viewpoint_at_times_between_the_tracked_ones() -> None:
     for t in (0.375, 0.625, 0.8):
-        truth, _, board = WORLD.look(WORLD.held_out, t)
+        truth, _, board = WORLD.trace(WORLD.held_out, t)
         error = (tracked().render(WORLD.held_out, t * WORLD.n_ticks * 50.0) - truth) ** 2
         assert -10 * np.log10(error[board].mean()) > 22
 
@@ -263,7 +263,7 @@ def test_a_recipe_runs_it_from_spikes_to_images() -> None:
     recipe = Recipe("test", "mean", "true", "tracking", "pixel", settings)
     model = RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest(Budget(2.0)))
     image = model.render(WORLD.held_out, 6000.0)
-    truth = WORLD.look(WORLD.held_out, 0.5)[0]
+    truth = WORLD.trace(WORLD.held_out, 0.5)[0]
     assert len(model.tracks.times_us) == 3
     assert -10 * np.log10(((image - truth) ** 2).mean()) > 12  # after six steps
 
