@@ -19,7 +19,14 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images import ImageMaker, ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.images import (
+    ImageMaker,
+    ImageSettings,
+    make_training_images,
+    maker_settings,
+    wanted_images,
+    with_settings,
+)
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.observations.training_images import TrainingImages
@@ -86,6 +93,8 @@ class RecipeMethod:
         self.algorithm = parts.algorithms.get(recipe.motion) or trainer_algorithm(recipe, parts)
         _part(dict.fromkeys(self.algorithm.supervisions) or parts.supervision, recipe, "supervision")
         defaults = {**self.algorithm.settings, "initialization": self.initialization.settings}
+        if own := maker_settings(self.images):
+            defaults["image_maker"] = own
         found = override(defaults, recipe.settings, f"recipe {recipe.name}")
         self.settings = follow_images(found, recipe.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
@@ -103,7 +112,8 @@ class RecipeMethod:
         request.progress(0, 1, "initialisation")
         start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"]))
         request.progress(0, 1, "images")
-        images = make_training_images(scene, start.cameras, self.images, settings["images"], request.device)
+        maker = with_settings(self.images, settings.get("image_maker"))
+        images = make_training_images(scene, start.cameras, maker, settings["images"], request.device)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
         extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
         return self.algorithm.fit(FitJob(scene, start, images, extent, settings, request, key))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -37,6 +37,30 @@ class ImageMaker(Protocol):
     ) -> Float32:
         """Return linear radiance [n, H, W]; `gain` is spikes per tick of white."""
         ...
+
+
+@runtime_checkable
+class TunableImageMaker(ImageMaker, Protocol):
+    """An image maker with numbers of its own (prefix `image_maker`)."""
+
+    @property
+    def settings(self) -> Settings:
+        """Return the maker's own numbers."""
+        ...
+
+    def with_settings(self, settings: Any) -> ImageMaker:
+        """Return the same maker with other numbers."""
+        ...
+
+
+def maker_settings(maker: ImageMaker) -> Settings | None:
+    """Return the maker's own numbers; None where it has none."""
+    return maker.settings if isinstance(maker, TunableImageMaker) and fields(maker.settings) else None
+
+
+def with_settings(maker: ImageMaker, settings: Settings | None) -> ImageMaker:
+    """Return the maker with other numbers, or as it is where they are None."""
+    return maker.with_settings(settings) if settings and isinstance(maker, TunableImageMaker) else maker
 
 
 def wanted_images(n_ticks: int, settings: ImageSettings) -> float:

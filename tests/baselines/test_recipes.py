@@ -80,10 +80,11 @@ def test_a_recipe_holds_settings_of_its_own_parts_only() -> None:
     trained = {"images", "initialization", "motion", "supervision", "trainer", "density"}
     looped = {"images", "initialization", "motion", "supervision"}
     for name, parts in {
-        "tfp+static": trained,
-        "spike4dgs-x": trained,
-        "tfp+d3dgs": looped,
-        "dy-spikenerf": looped | {"occupancy"},
+        "tfp+static": trained | {"image_maker"},
+        "spike4dgs-x": trained | {"image_maker"},
+        "spike4dgs": trained,
+        "tfp+d3dgs": looped | {"image_maker"},
+        "dy-spikenerf": looped | {"image_maker", "occupancy"},
     }.items():
         settings = METHODS[name].params["settings"]
         assert set(settings) == parts
@@ -171,6 +172,17 @@ def test_an_unknown_or_mistyped_setting_is_named(overrides: dict[str, Any], foun
     recipe = Recipe("mine", "tfp", "rig", "hexplane", "pixel", settings=overrides)
     with pytest.raises(UserError, match=f"recipe mine: expected .*found {found}"):
         RecipeMethod(recipe, PARTS)
+
+
+def test_a_recipe_overrides_the_numbers_of_its_image_maker(scene: Scene) -> None:
+    recipe = Recipe("wide", "tfp", "rig", "static", "pixel", {"image_maker.half_window": 30})
+    wide = RecipeMethod(recipe, PARTS)
+    assert wide.params["settings"]["image_maker"] == {"half_window": 30}
+    camera, t_us = scene.cameras["cam_03"], 2000.0
+    default = METHODS["tfp+static"].fit(scene.training, FitRequest(TINY)).render(camera, t_us)
+    assert not np.array_equal(wide.fit(scene.training, FitRequest(TINY)).render(camera, t_us), default)
+    with pytest.raises(UserError, match="settings among image_maker.half_window, found 'image_maker.window'"):
+        RecipeMethod(dataclasses.replace(recipe, settings={"image_maker.window": 30}), PARTS)
 
 
 def test_a_device_that_is_not_there_is_a_user_error(scene: Scene) -> None:
