@@ -83,7 +83,7 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.benchmark.runs.run_command:make_run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
-        needs=("spike4dgs.leaderboard.submit_command:submit", "spike4dgs.baselines.speed.images:images"),
+        needs=("spike4dgs.leaderboard.submit_command:submit_all", "spike4dgs.baselines.speed.images:images"),
     ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",

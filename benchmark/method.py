@@ -117,8 +117,9 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Three attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names
-    of the data sets that learned parts have seen, and `refines_views`: its models have `refine` (see `refinement`).
+    Four attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names
+    of the data sets that learned parts have seen, `refines_views`: its models have `refine` (see `refinement`), and
+    `warm_up(request)`, which compiles what `fit` runs: it is called before the clock of a fit starts.
     """
 
     name: str

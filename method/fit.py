@@ -28,6 +28,7 @@ from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+from spike4dgs.method.warm_up import kept_random_state, made_scene, short
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
@@ -92,6 +93,7 @@ class RecipeMethod:
         self.trained_on: tuple[str, ...] = ()
         if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
+        self._warm: set[str] = set()  # the devices whose kernels are compiled
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views; see `benchmark.method.Method`.
@@ -102,6 +104,22 @@ class RecipeMethod:
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
         start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"]))
+        return self._fit(scene, start, settings, request)
+
+    def warm_up(self, request: FitRequest) -> None:
+        """Compile what the images, the fit and the rendering of this recipe run, on a made scene; once a process."""
+        if request.device in self._warm:
+            return
+        check_device(request.device)
+        request.progress(0, 1, "compilation")
+        scene, start = made_scene()
+        with kept_random_state(request.device):
+            model = self._fit(scene, start, short(self.settings), FitRequest(device=request.device))
+            model.render(scene.cameras[0], scene.duration_us / 2)
+        self._warm.add(request.device)
+
+    def _fit(self, scene: TrainingScene, start: Start, settings: Mapping[str, Any], request: FitRequest) -> Model:
+        """Fit from given cameras and points."""
         request.progress(0, 1, "images")
         images = make_training_images(scene, start.cameras, self.images, settings["images"], request.device)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])

@@ -26,7 +26,7 @@ ORDER = {
     "generators": "profiles sensor worlds rig conventional events recorder rendering bursts streams tasks ground_truth "
     "audit reports scene_maker make_dataset",
     "method": "torch_state settings model_files splat speed observations gaussians motion supervision checkpoint msdi "
-    "initialization images pose_refinement trainer_settings fitted_model schedule trainer fit tracking "
+    "initialization images pose_refinement trainer_settings fitted_model schedule trainer warm_up fit tracking "
     "radiance_field saved_model viewing",
     "baselines": "spike_to_image nearest_view initialization held_out_pose recipes pose_report inspect "
     "export_nerfstudio speed",
