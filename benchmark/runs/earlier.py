@@ -16,9 +16,9 @@ from spike4dgs.benchmark.scene.scene import Scene
 
 
 def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return the other records of `folder` on the same scenes, revisions and split, oldest first; and what was left out.
+    """Return the other records in `folder` on the same scenes, revisions and split, oldest first; and what is left out.
 
-    What was left out is a file name and a reason each: other scenes, or no record that this version reads.
+    What is left out is a file name and a reason each: other scenes, or no record that this version reads.
     """
     names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
     found, left_out = [], []
@@ -38,7 +38,7 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
 
 
 def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
-    """Return whether a sheet can show a record's cell: a missing one, or one whose predictions are those of `folder`."""
+    """Return whether a sheet can show a record's cell: a missing one, or one whose predictions `folder` still holds."""
     cell = record["scenes"][scene.id]
     if cell["status"] != "ok":
         return True

@@ -21,7 +21,7 @@ COMPILED_IN_A_FIT = """
 import gc
 from numba.core.dispatcher import Dispatcher
 from toy_world import ToyWorld
-from spike4dgs.baselines.recipes import PARTS, RECIPES
+from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.method import Budget, FitRequest
 
 def compiled():

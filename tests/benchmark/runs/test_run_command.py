@@ -15,7 +15,7 @@ from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
 from small_scenes import write_small_scene
 
-from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.cli import load
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
@@ -30,7 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
     methods["bad"] = FailingMethod("bad", ValueError("no luck"))
     entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
 
 
 @pytest.mark.usefixtures("installed")
