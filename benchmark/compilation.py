@@ -16,11 +16,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numba
-from numba.core import config
+from numba.core import config as numba_config
 
 from spike4dgs.benchmark.files import user_cache
 
 _lock = threading.Lock()
+config: Any = numba_config  # its names are made from environment variables
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

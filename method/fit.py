@@ -22,13 +22,13 @@ from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images import ImageMaker, ImageSettings, make_training_images, wanted_images
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.observations.made_scene import made_scene
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.supervision.base import Supervision
-from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.torch_state import kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
-from spike4dgs.method.warm_up import kept_random_state, made_scene, short
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
@@ -79,8 +79,8 @@ class RecipeMethod:
     setting.
     """
 
-    def __init__(self, recipe: Recipe, parts: Parts) -> None:
-        self.name, self.recipe = recipe.name, recipe
+    def __init__(self, recipe: Recipe, parts: Parts, description: str = "") -> None:
+        self.name, self.recipe, self.description = recipe.name, recipe, description
         self.images = _part(parts.images, recipe, "images")
         self.initialization = _part(parts.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe, "motion")
@@ -112,7 +112,8 @@ class RecipeMethod:
             return
         check_device(request.device)
         request.progress(0, 1, "compilation")
-        scene, start = made_scene()
+        scene, *points = made_scene()
+        start = Start(scene.cameras, *points)
         with kept_random_state(request.device):
             model = self._fit(scene, start, short(self.settings), FitRequest(device=request.device))
             model.render(scene.cameras[0], scene.duration_us / 2)
@@ -135,6 +136,12 @@ class RecipeMethod:
             fix = "choose another budget"
             raise problem(where, "a publication's step counts for --budget paper", "none", fix)
         return override(self.settings, steps, where)
+
+
+def short(settings: SettingsByPart) -> dict[str, Settings]:
+    """Return settings with three images of each view of the made scene, and a step or a few in each stage."""
+    images: Any = settings["images"]
+    return scaled({**settings, "images": replace(images, time_spacing_ticks=30)}, 0.005)
 
 
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:

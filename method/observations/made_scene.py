@@ -1,39 +1,22 @@
-"""A made scene of a few Gaussians, on which a recipe compiles its kernels before the clock of a fit starts."""
+"""A made scene without files, on which a recipe compiles its kernels before the clock of a fit starts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.initialization import Start
-from spike4dgs.method.settings import Settings, SettingsByPart, scaled
 
 _WIDTH, _HEIGHT, _TICKS = 64, 40, 81  # as small as the smallest profile
 _RATE_HZ, _GAIN = 20_000.0, 0.6
 _DISTANCE_M = 4.0  # from the cameras to the wall
-_SCALE = 0.005  # of the step counts: every stage has a step
-_SPACING_TICKS = 30  # three images of a view
 
 
-def short(settings: SettingsByPart) -> dict[str, Settings]:
-    """Return settings with a few steps and images."""
-    images: Any = settings["images"]
-    return scaled({**settings, "images": replace(images, time_spacing_ticks=_SPACING_TICKS)}, _SCALE)
-
-
-def made_scene() -> tuple[TrainingScene, Start]:
-    """Return four views of a textured wall with a bar that moves in front of it, and points on the wall."""
+def made_scene() -> tuple[TrainingScene, NDArray[np.float32], NDArray[np.float32]]:
+    """Return four views of a textured wall and a bar that moves; and points [N, 3] on the wall with their values [N]."""
     aim = np.array([0.0, 0.0, _DISTANCE_M])
     cameras = tuple(
         look_at(
@@ -49,16 +32,7 @@ def made_scene() -> tuple[TrainingScene, Start]:
     )
     y, x = np.mgrid[-1:1:12j, -1.6:1.6:20j].reshape(2, -1)
     points = np.stack([x, y, np.full_like(x, _DISTANCE_M)], axis=1).astype(np.float32)
-    return scene, Start(cameras, points, _texture(x, y).astype(np.float32))
-
-
-@contextmanager
-def kept_random_state(device: str) -> Iterator[None]:
-    """Put the random states of torch and NumPy back at the end of the context."""
-    before = np.random.get_state()
-    with torch.random.fork_rng(devices=[device] if device_type(device) == "cuda" else []):
-        yield
-    np.random.set_state(before)
+    return scene, points, _texture(x, y).astype(np.float32)
 
 
 def _texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
