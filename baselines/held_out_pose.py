@@ -46,8 +46,10 @@ class Refinement:
 class PosedRecipe(RecipeMethod):
     """A recipe that asks for refined scores too, where its model is one of Gaussians."""
 
-    def __init__(self, recipe: Recipe, parts: Parts, refinement: Refinement | None = None) -> None:
-        super().__init__(recipe, parts)
+    def __init__(
+        self, recipe: Recipe, parts: Parts, refinement: Refinement | None = None, description: str = ""
+    ) -> None:
+        super().__init__(recipe, parts, description)
         self.refinement = refinement or Refinement()
         self.refines_views = recipe.motion != "radiance-field"  # marching along rays has no gradient in the pose
         if self.refines_views:

@@ -36,6 +36,7 @@ class NearestView:
     name: str
     images: ImageMaker
     images_name: str
+    description: str = "the nearest training camera's image, without any reconstruction"
     params: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
+from spike4dgs.baselines.descriptions import describe
 from spike4dgs.baselines.held_out_pose import PosedRecipe
 from spike4dgs.baselines.initialization.colmap import ColmapSettings, colmap, colmap_uncalibrated
 from spike4dgs.baselines.initialization.dust3r import dust3r, dust3r_uncalibrated
@@ -152,7 +153,10 @@ POSED = (
 )
 
 METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)},
-    **{recipe.name: PosedRecipe(recipe, PARTS) for recipe in POSED},
+    **{
+        recipe.name: RecipeMethod(recipe, PARTS, description=describe(recipe))
+        for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)
+    },
+    **{recipe.name: PosedRecipe(recipe, PARTS, description=describe(recipe)) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

@@ -83,7 +83,12 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.benchmark.runs.run_command:make_run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
-        needs=("spike4dgs.leaderboard.submit_command:submit", "spike4dgs.baselines.speed.images:images"),
+        needs=("spike4dgs.leaderboard.submit_command:submit_all", "spike4dgs.baselines.speed.images:images"),
+    ),
+    "methods": Command(
+        "spike4dgs.benchmark.runs.methods_command:methods",
+        "list the installed methods: parts, package, description",
+        "methods",
     ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
@@ -145,8 +150,14 @@ COMMANDS: dict[str, Command] = {
         "report key-frame spacing against error and render time",
         "spacing --help",
     ),
+    "completion": Command(
+        "spike4dgs.benchmark.completion:completion",
+        "print a script that completes commands in bash, zsh or fish",
+        "completion bash",
+    ),
 }
 
+SPEED_SUMMARY = "measure the speed of a part beside a plain one"
 # Speed measurements take the rest of the command line as a list of strings.
 SPEED: dict[str, Command] = {
     "splat": Command(
@@ -207,7 +218,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in ("-h", "--help"):
-        speed = Command("", "measure the speed of a part beside a plain one", "")
+        speed = Command("", SPEED_SUMMARY, "")
         print(_overview("spike4dgs", COMMANDS | {"speed": speed}))
         return 0
     if name == "--version":

@@ -33,6 +33,12 @@ _FAILURES = {  # what writing expected, and what to do; other errors are the pro
 }
 
 
+def user_cache() -> Path:
+    """Return the user's cache folder of this package: `spike4dgs` in XDG_CACHE_HOME or ~/.cache."""
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.path.expanduser(base)) / "spike4dgs"
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turn what the system says while `path` is written (disk full, no permission, ...) into a UserError."""

@@ -15,7 +15,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.plugins import Found, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
@@ -117,8 +117,10 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Three attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names
-    of the data sets that learned parts have seen, and `refines_views`: its models have `refine` (see `refinement`).
+    Five attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
+    the data sets that learned parts have seen, `refines_views`: its models have `refine` (see `refinement`),
+    `description`, one line for `spike4dgs methods`, and `warm_up(request)`, which compiles what `fit` runs and is
+    called before the clock of a fit starts.
     """
 
     name: str
@@ -155,32 +157,17 @@ def find_methods() -> dict[str, Method]:
 
     Raises UserError where two packages use one name, and where one cannot be imported or has another protocol.
     """
-    methods: dict[str, Method] = {}
-    for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
-        try:
-            found = entry.load()
-        except Exception as e:  # somebody else's package
-            fix = "repair or uninstall the package that registers it"
-            raise problem(f"entry point {entry.name}", entry.value, f"{type(e).__name__}: {e}", fix) from e
-        for name, method in found.items():
-            if name in methods:
-                raise problem(f"entry point {entry.name}", "a new method name", f"'{name}' twice", "rename one of them")
-            check_protocol(method, _source(entry))
-            methods[name] = method
-    return methods
+    return {name: found.value for name, found in find_packaged_methods().items()}
 
 
-def _source(entry: EntryPoint) -> str:
-    """Return the words for an error by which a user finds an entry point."""
-    package = f"{entry.dist.name} {entry.dist.version}, " if entry.dist else ""
-    return f"{package}entry point {entry.name} = {entry.value}"
+def find_packaged_methods() -> dict[str, Found]:
+    """Return the methods as `find_methods` does, each with the package that it comes from."""
+    return find_plugins(GROUP, "method", lambda name, method, source: check_protocol(method, source))
 
 
 def get_method(name: str) -> Method:
     """Return the method called `name`. Raises UserError that lists the known names."""
     methods = find_methods()
     if name not in methods:
-        raise problem(
-            "method", f"one of {', '.join(sorted(methods))}", repr(name), "see `spike4dgs run-benchmark --help`"
-        )
+        raise problem("method", f"one of {', '.join(sorted(methods))}", repr(name), "see `spike4dgs methods`")
     return methods[name]

@@ -29,10 +29,11 @@ from spike4dgs.method.images import (
 )
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.observations.made_scene import made_scene
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.supervision.base import Supervision
-from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.torch_state import kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 
@@ -85,8 +86,8 @@ class RecipeMethod:
     setting.
     """
 
-    def __init__(self, recipe: Recipe, parts: Parts) -> None:
-        self.name, self.recipe = recipe.name, recipe
+    def __init__(self, recipe: Recipe, parts: Parts, description: str = "") -> None:
+        self.name, self.recipe, self.description = recipe.name, recipe, description
         self.images = _part(parts.images, recipe, "images")
         self.initialization = _part(parts.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe, "motion")
@@ -101,6 +102,7 @@ class RecipeMethod:
         self.trained_on: tuple[str, ...] = ()
         if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
+        self._warm: set[str] = set()  # the devices whose kernels are compiled
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views; see `benchmark.method.Method`.
@@ -111,6 +113,23 @@ class RecipeMethod:
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
         start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"]))
+        return self._fit(scene, start, settings, request)
+
+    def warm_up(self, request: FitRequest) -> None:
+        """Compile what the images, the fit and the rendering of this recipe run, on a made scene; once a process."""
+        if request.device in self._warm:
+            return
+        check_device(request.device)
+        request.progress(0, 1, "compilation")
+        scene, *points = made_scene()
+        start = Start(scene.cameras, *points)
+        with kept_random_state(request.device):
+            model = self._fit(scene, start, short(self.settings), FitRequest(device=request.device))
+            model.render(scene.cameras[0], scene.duration_us / 2)
+        self._warm.add(request.device)
+
+    def _fit(self, scene: TrainingScene, start: Start, settings: Mapping[str, Any], request: FitRequest) -> Model:
+        """Fit from given cameras and points."""
         request.progress(0, 1, "images")
         maker = with_settings(self.images, settings.get("image_maker"))
         images = make_training_images(scene, start.cameras, maker, settings["images"], request.device)
@@ -127,6 +146,12 @@ class RecipeMethod:
             fix = "choose another budget"
             raise problem(where, "a publication's step counts for --budget paper", "none", fix)
         return override(self.settings, steps, where)
+
+
+def short(settings: SettingsByPart) -> dict[str, Settings]:
+    """Return settings with three images of each view of the made scene, and a step or a few in each stage."""
+    images: Any = settings["images"]
+    return scaled({**settings, "images": replace(images, time_spacing_ticks=30)}, 0.005)
 
 
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch
+
+from spike4dgs.benchmark.environment import device_type
 
 
 def seeded(seed: int, step: int) -> torch.Generator:
@@ -26,3 +29,14 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def kept_random_state(device: str) -> Iterator[None]:
+    """Put the random states of torch and NumPy back at the end of the context."""
+    before = np.random.get_state()
+    try:
+        with torch.random.fork_rng(devices=[device] if device_type(device) == "cuda" else []):
+            yield
+    finally:
+        np.random.set_state(before)

@@ -36,6 +36,13 @@ def write_paper_table(
         write_views(folder / "views.png", content)
 
 
+def in_every_split(runs: Sequence[Run]) -> list[Run]:
+    """Return the runs with the methods that all of them have, in the order of the first."""
+    names = [{r["method"]["name"]: r for r in records} for _, records in runs]
+    common = [name for name in names[0] if all(name in of_run for of_run in names)]
+    return [(scenes, [of_run[name] for name in common]) for (scenes, _), of_run in zip(runs, names, strict=True)]
+
+
 def join_splits(runs: Sequence[Sequence[Record]]) -> list[Record]:
     """Join the records of several splits into one record per method, whose scenes are named by `column_of`."""
     joined = []

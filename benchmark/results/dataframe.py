@@ -31,15 +31,16 @@ def records_to_dataframe(*records: Record | Path | str, per_image: bool = False)
         fix = "pip install 'spike4dgs[pandas]'"
         raise problem("records_to_dataframe", "the package pandas", "none", fix) from None
     loaded = [read_record(Path(r)) if isinstance(r, (str, Path)) else r for r in records]
-    rows = [row for record in loaded for row in (_image_rows(record) if per_image else _scene_rows(record))]
+    rows = [row for record in loaded for row in (_image_rows(record) if per_image else scene_rows(record))]
     numbers = (*METRICS, *(() if per_image else COSTS))
-    columns = (*(_IMAGE if per_image else _SCENE), *numbers, *(() if per_image else _CONTEXT))
+    columns = (*_IMAGE, *METRICS) if per_image else SCENE_COLUMNS
     return pandas.DataFrame(rows, columns=list(columns)).astype(dict.fromkeys(numbers, float))
 
 
 _SCENE: Sequence[str] = ("method", "seed", "scene", "split", "status")
 _IMAGE: Sequence[str] = ("method", "seed", "scene", "split", "camera", "tick")
 _CONTEXT: Sequence[str] = ("budget", "device", "error")
+SCENE_COLUMNS: Sequence[str] = (*_SCENE, *METRICS, *COSTS, *_CONTEXT)
 
 
 def _names(record: Record, scene: str) -> dict[str, Any]:
@@ -47,7 +48,8 @@ def _names(record: Record, scene: str) -> dict[str, Any]:
     return {"method": method["name"], "seed": method["seed"], "scene": scene, "split": record["dataset"]["split"]}
 
 
-def _scene_rows(record: Record) -> Iterator[dict[str, Any]]:
+def scene_rows(record: Record) -> Iterator[dict[str, Any]]:
+    """Yield a row for each scene of a record, a value for each of `SCENE_COLUMNS`."""
     for scene, cell in record["scenes"].items():
         context = {key: cell[key] for key in ("status", *COSTS, *_CONTEXT)}
         yield {**_names(record, scene), **cell["metrics"], **context}

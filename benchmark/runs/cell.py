@@ -96,12 +96,14 @@ def run_job(
     """
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
+    check_protocol(job.method, type(job.method).__module__)
+    request = FitRequest(job.budget, job.device, job.seed, progress, checkpoint)
+    if warm_up := getattr(job.method, "warm_up", None):
+        warm_up(request)
     reset_peak_memory(job.device)
     clock = FitClock(work / "fit_clock.json", checkpoint)
     if clock.before > 0:
         note(f"resuming after {clock.before:.0f} s of fitting")
-    check_protocol(job.method, type(job.method).__module__)
-    request = FitRequest(job.budget, job.device, job.seed, progress, checkpoint)
     model = job.method.fit(job.scene.training, request)
     fit_seconds = clock.seconds()
     if isinstance(model, Savable):

@@ -1,6 +1,7 @@
 """`run-benchmark`: run methods on scenes, then write the table, the sheets and the leaderboard's entries.
 
-Besides what `run` keeps, OUT has sheet_SCENE.png, scatter.png, leaderboard/ and, for a table of the paper, table.*.
+Besides what `run` keeps, OUT has results.csv, sheet_SCENE.png, scatter.png, leaderboard/ and, for a table of the paper,
+table.*. Records that earlier runs left in OUT/results on the same scenes are in all of these.
 A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 
 Submitting a record and measuring images from spikes are the work of other rooms, which this one does not import: the
@@ -19,26 +20,34 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Method, find_methods, make_budget
 from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
 from spike4dgs.benchmark.reports.console import make_console, results_table
-from spike4dgs.benchmark.reports.paper_files import write_paper_table
+from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, TRACKS, PublishedTable, published, table_scenes
 from spike4dgs.benchmark.reports.scatter import write_scatter
 from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.results.record import Record
+from spike4dgs.benchmark.results.refinement import SUFFIX
+from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, write_results
 from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 
 
 class Submit(Protocol):
-    """Checks a result record and enters it into a leaderboard; raises UserError where it refuses the record."""
+    """Checks result records, enters them into a leaderboard and prints their ranks."""
 
     def __call__(
-        self, result: Path, *, predictions: Path | None, scenes: tuple[Path, ...], leaderboard: Path, replace: bool
+        self,
+        results: Mapping[Path, Path | None],
+        *,
+        scenes: tuple[Path, ...],
+        leaderboard: Path,
+        replace: bool,
+        allow_gaps: bool,
     ) -> int:
-        """Submit the record in the file `result`."""
+        """Submit the records in the files `results`, with their predictions; return how many were refused."""
         ...
 
 
@@ -69,6 +78,8 @@ class RunBenchmark:
         allow_gaps: bool = False,
     ) -> int:
         """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it was.
+
+        A run with other methods on the same scenes in the same folder adds them to the table and the sheets.
 
         Args:
             scenes: Scene folders.
@@ -102,26 +113,35 @@ class RunBenchmark:
         chosen = _choose_methods(methods, paper)
         console, common = make_console(), (seed, choose_device(device), make_budget(budget), metrics)
         splits = paper.splits if paper and paper.splits and split is None else (split,)
-        runs, refused = [], False
+        runs, submissions = [], []
         for name in splits:
             opened = open_scenes(scenes, allow_gaps, name)
             folder = out / name if name and not all(s.is_default_split for s in opened) else out
             settings = Settings(folder, *common)
             records = run_matrix(opened, chosen, settings, console)
-            console.print(results_table(records))
-            write_images(opened, records, folder)
-            _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png")
-            refused |= self._submit(records, scenes, settings, leaderboard, replace)
-            runs.append((opened, records))
+            earlier, left_out = earlier_records(folder / "results", records)
+            for line in left_out:
+                _say(console, f"not in the table: {line}")
+            console.print(results_table([*earlier, *records]))
+            write_images(opened, [*earlier, *records], folder)
+            write_results(folder / "results.csv", [*earlier, *records])
+            _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png; values: {folder}/results.csv")
+            submissions.append((records, settings))
+            rows = paper.rows if paper else ()
+            runs.append((opened, [*(r for r in earlier if plain_name(r) in rows), *records]))
         if paper:
             folder = out if len(runs) > 1 else folder
             worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
-            write_paper_table(paper, runs, worlds, select_metrics(metrics).metrics, folder)
+            write_paper_table(paper, in_every_split(runs), worlds, select_metrics(metrics).metrics, folder)
             _say(console, f"table {paper.number}: {folder}/table.md, .csv, .tex, .json")
-        failed = _failed_cells([r for _, records in runs for r in records])
+        refused = [
+            self._submit(records, scenes, settings, leaderboard, replace, allow_gaps)
+            for records, settings in submissions
+        ]
+        failed = _failed_cells([r for records, _ in submissions for r in records])
         if failed:
             print(f"failed: {', '.join(failed)}", file=sys.stderr)
-        return 1 if failed or refused else 0
+        return 1 if failed or any(refused) else 0
 
     def _measure_images(self, scenes: tuple[Path, ...], data: Path, profile: str, out: Path, allow_gaps: bool) -> int:
         """Make table 6, which compares images from spikes and fits no method."""
@@ -140,23 +160,18 @@ class RunBenchmark:
         settings: Settings,
         leaderboard: Path | None,
         replace: bool,
-    ) -> bool:
-        """Submit every record. Return whether the leaderboard refused one; the run's results remain."""
-        refused = False
-        for name in (r["method"]["name"] for r in records):
-            predictions = settings.out / "predictions" / name
-            try:
-                self.submit(
-                    settings.out / "results" / f"{name}.json",
-                    predictions=predictions if predictions.is_dir() else None,
-                    scenes=scenes,
-                    leaderboard=leaderboard or settings.out / "leaderboard",
-                    replace=replace or leaderboard is None,
-                )
-            except UserError as e:
-                print(f"error: {e}", file=sys.stderr)
-                refused = True
-        return refused
+        allow_gaps: bool,
+    ) -> int:
+        """Submit every record. Return how many the leaderboard refused; the run's results remain."""
+        names = [r["method"]["name"] for r in records]
+        folders = {name: settings.out / "predictions" / name for name in names}
+        return self.submit(
+            {settings.out / "results" / f"{n}.json": f if f.is_dir() else None for n, f in folders.items()},
+            scenes=scenes,
+            leaderboard=leaderboard or settings.out / "leaderboard",
+            replace=replace or leaderboard is None,
+            allow_gaps=allow_gaps,
+        )
 
 
 def make_run_benchmark(submit: Submit, measure_images: Callable[[Sequence[str]], int]) -> Callable[..., int]:
@@ -165,9 +180,10 @@ def make_run_benchmark(submit: Submit, measure_images: Callable[[Sequence[str]],
 
 
 def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
-    """Write sheet_SCENE.png for each scene, and scatter.png."""
+    """Write sheet_SCENE.png for each scene, and scatter.png. A method without its predictions is in no sheet."""
     for scene in scenes:
-        folders = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
+        of_all = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
+        folders = {name: of_all[name] for r in records if is_shown(r, scene, of_all[name := r["method"]["name"]])}
         write_sheet(out / f"sheet_{scene.id}.png", scene, folders, records)
     write_scatter(out / "scatter.png", records)
 
@@ -181,6 +197,11 @@ def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> lis
     if not known:
         raise problem("--methods", "an installed method", "none", "install a package that registers one")
     return [known[name] for name in dict.fromkeys(names or known)]
+
+
+def plain_name(record: Record) -> str:
+    """Return the name of a record's method, without the mark of refined held-out views."""
+    return str(record["method"]["name"]).removesuffix(SUFFIX)
 
 
 def _failed_cells(records: Sequence[Record]) -> list[str]:

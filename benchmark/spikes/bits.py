@@ -17,9 +17,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from spike4dgs.benchmark.compilation import cached_njit
 
 UInt8 = NDArray[np.uint8]
 UInt64 = NDArray[np.uint64]
@@ -31,7 +32,7 @@ _SMALL = 1 << 21  # bytes of input below which starting threads costs more than 
 
 def kernel(function: F) -> F:
     """Compile with numba: no GIL, cached on disk; 1 / 0 is infinity, as in numpy, because a test would stop vectors."""
-    return cast(F, numba.njit(nogil=True, cache=True, error_model="numpy")(function))
+    return cast(F, cached_njit(nogil=True, error_model="numpy")(function))
 
 
 def in_threads(function: Callable[..., None], n: int, *args: object, small: bool = False) -> None:

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import ModuleType
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import user_cache
 
 FAST, SAFE = "llvm_ad_rgb", "scalar_rgb"
 SUPPORTED = (FAST, SAFE, "cuda_ad_rgb")
@@ -100,7 +101,7 @@ def load_mitsuba() -> ModuleType:
 
 def _cached_probe() -> str:
     """Return why the fast variant fails ("" if it works), from the cache file or from a new probe."""
-    path = _cache_dir() / f"mitsuba-{_fingerprint()}.json"
+    path = user_cache() / f"mitsuba-{_fingerprint()}.json"
     try:
         return str(json.loads(path.read_text())["why_not"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -145,8 +146,3 @@ def _cpu_name() -> str:
     except OSError:
         return platform.processor()
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")
-
-
-def _cache_dir() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "spike4dgs"

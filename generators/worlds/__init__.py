@@ -1,11 +1,24 @@
-"""The worlds that the benchmark renders, each a function of (seed, variant, duration): one entry per world."""
+"""The worlds that the benchmark renders, each a function of (seed, variant, duration): one entry per world.
 
+Worlds of other packages come in by the entry-point group `spike4dgs.worlds`: each entry point names a mapping from
+world name to `World`. They are loaded when the table is first read.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene
 
-__all__ = ["WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene"]
+__all__ = ["OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene"]
 
-WORLDS: dict[str, World] = {
+GROUP = "spike4dgs.worlds"
+
+OURS: dict[str, World] = {
     world.name: world
     for world in (
         jaywalk.WORLD,
@@ -19,3 +32,37 @@ WORLDS: dict[str, World] = {
         bird.WORLD,
     )
 }
+
+
+class Worlds(Mapping[str, World]):
+    """The worlds of this package and of all that are installed beside it.
+
+    Raises UserError where a name is used twice, and where a package cannot be imported or registers something else.
+    """
+
+    @cached_property
+    def _all(self) -> dict[str, World]:
+        found = find_plugins(GROUP, "world", check_world, OURS)
+        return OURS | {name: plugin.value for name, plugin in found.items()}
+
+    def __getitem__(self, name: str) -> World:
+        return self._all[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+
+def check_world(name: str, world: Any, source: str) -> None:
+    """Raise UserError unless `world` is a `World` of that name, which can be part of a folder's name."""
+    where = f"world {name!r} of {source}"
+    if not isinstance(world, World):
+        raise problem(where, "a World of spike4dgs.generators.worlds", type(world).__name__, "correct the mapping")
+    if world.name != name or not re.fullmatch(r"\w+", name, re.ASCII):
+        expected = "its own name as the key, of letters, digits and _"
+        raise problem(where, expected, f"a world named {world.name!r}", "correct the name")
+
+
+WORLDS = Worlds()

@@ -15,6 +15,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from spike4dgs.benchmark.compilation import cached_njit
+
 
 @cache
 def _pool() -> ThreadPoolExecutor:
@@ -34,7 +36,7 @@ def _cell(u: np.float32, size: int) -> tuple[int, np.float32, np.float32]:
     return i, x - np.float32(i), slope
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@cached_njit(nogil=True, fastmath=True, error_model="numpy")
 def _forward(unit, space, lines, out):  # [N, 3], [3, R, R, F], [3, R, F], [N, F]
     size, features = lines.shape[1], lines.shape[2]
     for n in range(len(unit)):
@@ -54,7 +56,7 @@ def _forward(unit, space, lines, out):  # [N, 3], [3, R, R, F], [3, R, F], [N, F
             out[n, f] = xy * xz * yz * line
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@cached_njit(nogil=True, fastmath=True, error_model="numpy")
 def _backward(unit, space, lines, grad, grad_unit, grad_space, grad_lines):
     size, features = lines.shape[1], lines.shape[2]
     one = np.float32(1)

@@ -171,7 +171,7 @@ def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
     submitted: list[Path] = []
     measured: list[Sequence[str]] = []
     command = RunBenchmark(
-        submit=lambda result, **options: submitted.append(result) or 0,
+        submit=lambda results, **options: submitted.extend(results) or 0,
         measure_images=lambda arguments: measured.append(arguments) or 0,
     )
     monkeypatch.setattr("spike4dgs.benchmark.runs.run_command.find_methods", lambda: {"counts": CountMethod()})

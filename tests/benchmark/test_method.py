@@ -8,6 +8,7 @@ import pytest
 from dummy_methods import CountMethod
 
 from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
 
 
@@ -16,7 +17,7 @@ def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPa
         raise ImportError("no libfoo")
 
     entry = SimpleNamespace(name="theirs", value="theirs.recipes:METHODS", load=load)
-    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     with pytest.raises(UserError, match="entry point theirs: expected theirs.recipes:METHODS, found ImportError"):
         recipes.find_methods()
 
@@ -26,6 +27,6 @@ def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) ->
         return {"same": CountMethod("same")}
 
     entries = [SimpleNamespace(name=n, value=f"{n}:METHODS", dist=None, load=load) for n in "ab"]
-    monkeypatch.setattr(recipes, "entry_points", lambda group: entries)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: entries)
     with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
         recipes.find_methods()

@@ -16,6 +16,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 from torch import Tensor
 
+from spike4dgs.benchmark.compilation import cached_njit
 from spike4dgs.method.splat.kernels.vector_ir import Lanes, array_data, offset
 
 TAPS = 9
@@ -56,7 +57,7 @@ def _side(position: np.float32, size: int) -> tuple[int, int, np.float32, np.flo
 
 
 # flat [B, H, W, C], [B, H, W, G * 9 * 3], flat [B, H, W, 9, C]
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
+@cached_njit(nogil=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
 def _sample(x, found, columns, channels, first, step):
     batch, height, width, _ = found.shape
     groups = channels // GROUP

@@ -12,6 +12,8 @@ from typing import Any
 
 from numba import njit
 
+from spike4dgs.benchmark.compilation import cached_njit
+
 log = logging.getLogger(__name__)
 
 # No reassociation: results must not depend on how LLVM cuts a loop. No OpenMP: see threads.py.
@@ -26,11 +28,8 @@ _announced = False
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile on first call and keep the machine code in numba's cache.
-
-    The cache lies beside the source, or in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR.
-    """
-    return njit(cache=True, **_OPTIONS)(function)
+    """Compile on first call and keep the machine code; `benchmark/compilation.py` says where."""
+    return cached_njit(**_OPTIONS)(function)
 
 
 def helper(function: Callable[..., Any]) -> Any:
@@ -62,8 +61,13 @@ def announce_compilation(dispatcher: Any, what: str) -> None:
     if _announced or dispatcher.signatures:
         return
     with _lock:
-        folder = Path(dispatcher._cache.cache_path)
+        folder = dispatcher._cache.cache_path  # None where nothing is kept
         name = dispatcher.py_func.__qualname__.rsplit(".", 1)[-1]
-        if not _announced and not any(folder.glob(f"*{name}*.nbi")):
-            log.warning("compiling the %s kernels; this happens once and takes about 20 s (cache: %s)", what, folder)
+        if not _announced and not (folder and any(Path(folder).glob(f"*{name}*.nbi"))):
+            log.warning(
+                "compiling the %s kernels; this %s and takes about 20 s (cache: %s)",
+                what,
+                "happens once" if folder else "happens in every process",
+                folder or "none",
+            )
             _announced = True

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.runs import run_command
 from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
-COMMAND = RunBenchmark(submit=lambda result, **options: 0, measure_images=lambda arguments: 0)
+COMMAND = RunBenchmark(submit=lambda results, **options: 0, measure_images=lambda arguments: 0)
 VIEWS = tuple(f"views-{n}" for n in range(3, 9))
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from packages import install
 from skimage.metrics import peak_signal_noise_ratio
 from small_scenes import write_small_scene
 from toy_world import ToyWorld
@@ -26,14 +27,6 @@ from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
-
-
-def install(source: Path, target: Path) -> None:
-    """Build a package and install it into a folder of its own, by pip."""
-    offline = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check", "--quiet")
-    command = [sys.executable, "-m", "pip", "install", *offline, "--target", str(target), str(source)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -45,6 +45,30 @@ def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_p
     assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
 
 
+class WarmingMethod(CountMethod):
+    """Notes whether the clock of its fit runs, when it is warmed up and when it fits."""
+
+    def __init__(self, work: Path) -> None:
+        super().__init__()
+        self.work, self.clocks = work, []  # type: ignore[var-annotated]
+
+    def warm_up(self, request: FitRequest) -> None:
+        assert request.seed == 3
+        self.clocks.append(len(list(self.work.rglob("fit_clock.json"))))
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
+        self.clocks.append(len(list(self.work.rglob("fit_clock.json"))))
+        return super().fit(scene, request)
+
+
+def test_a_method_is_warmed_up_before_the_clock_of_its_fit(small_scene: Path, tmp_path: Path) -> None:
+    method = WarmingMethod(tmp_path / "out/work")
+    (record,) = run(tmp_path / "out", [small_scene], method, seed=3)
+    assert record["scenes"]["pattern-0"]["status"] == "ok" and method.clocks == [0, 1]
+    (plain,) = run(tmp_path / "plain", [small_scene], CountMethod(), seed=3)
+    assert plain["mean"] == record["mean"]
+
+
 @pytest.mark.parametrize(
     ("params", "settings"),
     [

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,8 +13,9 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
+from small_scenes import write_small_scene
 
-from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.cli import load
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
@@ -26,7 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
     methods["bad"] = FailingMethod("bad", ValueError("no luck"))
     entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-    monkeypatch.setattr(recipes, "entry_points", lambda group: [entry])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
 
 
 @pytest.mark.usefixtures("installed")
@@ -46,6 +50,85 @@ def test_run_benchmark_leaves_results_images_and_entries(
     assert [r["rank"] for r in rows] == [1, 2]
     record = json.loads((out / "results/counts.json").read_text())
     assert record["scenes"]["pattern-0"]["budget"] == 0.5
+
+
+@pytest.mark.usefixtures("installed")
+def test_ranks_are_printed_once_and_are_the_final_ones(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("counts", "quick+counts", "bad")
+    assert run_benchmark((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
+    text = capsys.readouterr().out
+    shown = dict(re.findall(r"^(\S+): .*, (rank \d of 3|not ranked) on pattern-0$", text, re.MULTILINE))
+    rows = json.loads((tmp_path / "out/leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
+    assert shown == {r["method"]: f"rank {r['rank']} of 3" if r["rank"] else "not ranked" for r in rows}
+    assert text.index("results.csv") < text.index("rank ") and text.count("rank ") == 2
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_run_with_another_method_adds_to_what_is_there(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+
+    def go(*methods: str, **options: Any) -> str:
+        assert run_benchmark((small_scene,), methods=methods, out=out, device="cpu", metrics=("psnr",), **options) == 0
+        return capsys.readouterr().out
+
+    def rows() -> list[dict[str, str]]:
+        return list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+
+    def width() -> int:
+        with Image.open(out / "sheet_pattern-0.png") as image:
+            return image.width
+
+    go("counts")
+    alone, one = rows(), width()
+    assert [r["method"] for r in alone] == ["counts"]
+    text = go("quick+counts")
+    assert [r["method"] for r in rows()] == ["counts", "quick+counts"] and rows()[0] == alone[0]
+    assert width() > 1.2 * one
+    table = text.partition("Results")[2].partition("images:")[0]
+    assert {"counts", "quick+counts"} <= set(table.split())
+    for row in rows():
+        record = json.loads((out / f"results/{row['method']}.json").read_text())
+        cell = record["scenes"]["pattern-0"]
+        assert (row["scene"], row["split"], row["status"]) == ("pattern-0", record["dataset"]["split"], "ok")
+        assert float(row["psnr"]) == cell["metrics"]["psnr"] and float(row["fit_seconds"]) == cell["fit_seconds"]
+        assert cell["metrics"]["niqe"] is None and row["niqe"] == ""
+    text = go("counts", seed=1)
+    assert [(r["method"], r["seed"]) for r in rows()] == [("quick+counts", "0"), ("counts", "1")], "replaced, not twice"
+
+
+@pytest.mark.usefixtures("installed")
+def test_records_that_do_not_belong_there_are_left_out_and_named(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, other = tmp_path / "out", write_small_scene(tmp_path / "other", seed=5)
+    for scene, method in ((other, "counts"), (small_scene, "quick+counts")):
+        (out / "results").mkdir(parents=True, exist_ok=True)
+        (out / "results/damaged.json").write_text("{")
+        run_benchmark((scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",))
+    text = " ".join(capsys.readouterr().out.split())
+    assert "results/counts.json: other scenes, revisions or split" in text
+    assert "results/damaged.json: expected a spike4dgs-result/1 record (JSON)" in text
+    assert [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())] == ["quick+counts"]
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_method_without_its_predictions_is_in_the_table_and_not_in_the_sheet(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    for method in ("counts", "quick+counts"):
+        assert run_benchmark((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",)) == 0
+        with Image.open(out / "sheet_pattern-0.png") as image:
+            width = image.width
+        shutil.rmtree(out / "predictions/counts", ignore_errors=True)
+    assert run_benchmark((small_scene,), methods=("quick+counts",), out=out, device="cpu", metrics=("psnr",)) == 0
+    with Image.open(out / "sheet_pattern-0.png") as image:
+        assert image.width == width
+    assert len((out / "results.csv").read_text().splitlines()) == 3
 
 
 @pytest.mark.usefixtures("installed")

@@ -1,0 +1,60 @@
+"""Compilation by numba with the machine code kept in the user's cache folder, never beside the sources.
+
+Files that numba leaves in an installed package outlive the package, and the folder that they keep alive then hides
+another install. The folder here is named by this package's version, and numba names a folder in it by the path of the
+sources: no install takes code from another.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numba
+from numba.core import config as numba_config
+
+from spike4dgs.benchmark.files import user_cache
+
+_lock = threading.Lock()
+config: Any = numba_config  # its names are made from environment variables
+
+
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles on the first call, with these options of numba, and keeps the machine code.
+
+    NUMBA_CACHE_DIR goes before the user's cache folder. Where the folder cannot be written to, nothing is kept.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        with _lock:  # the setting belongs to numba: another package must not see it
+            before, folder = config.CACHE_DIR, config.CACHE_DIR or _folder()
+            config.CACHE_DIR = folder
+            try:
+                return numba.njit(cache=_is_writable(folder), **options)(function)
+            finally:
+                config.CACHE_DIR = before
+
+    return decorate
+
+
+def _folder() -> str:
+    try:
+        found = version("spike4dgs")
+    except PackageNotFoundError:  # the sources alone
+        found = "sources"
+    return str(user_cache() / "numba" / found)
+
+
+@cache
+def _is_writable(folder: str) -> bool:
+    try:
+        os.makedirs(folder, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,57 @@
+"""The records that earlier runs left in the same folder, and all records as one CSV file."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.results.dataframe import SCENE_COLUMNS, scene_rows
+from spike4dgs.benchmark.results.predictions import open_predictions
+from spike4dgs.benchmark.results.record import Record, read_record
+from spike4dgs.benchmark.scene.scene import Scene
+
+
+def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+    """Return the other records in `folder` on the same scenes, revisions and split, oldest first; and what is left out.
+
+    What is left out is a file name and a reason each: other scenes, or no record that this version reads.
+    """
+    names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
+    found, left_out = [], []
+    for path in sorted(folder.glob("*.json")):
+        if path.stem in names:
+            continue
+        try:
+            record = read_record(path)
+        except UserError as e:
+            left_out.append(str(e))
+            continue
+        if record["dataset"] == dataset:
+            found.append(record)
+        else:
+            left_out.append(f"{path}: other scenes, revisions or split")
+    return sorted(found, key=lambda r: (r["created"], r["method"]["name"])), left_out
+
+
+def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
+    """Return whether a sheet can show a record's cell: a missing one, or one whose predictions `folder` still holds."""
+    cell = record["scenes"][scene.id]
+    if cell["status"] != "ok":
+        return True
+    try:
+        return open_predictions(folder, scene.targets).sha256 == str(cell["predictions_sha256"])
+    except UserError:
+        return False
+
+
+def write_results(path: Path, records: Sequence[Record]) -> None:
+    """Write a tidy CSV file: a row for each method and scene, a column for each metric and cost."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, SCENE_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row for record in records for row in scene_rows(record))
+    write_text(path, out.getvalue())

@@ -1,0 +1,83 @@
+"""Compiled code is kept in the user's cache folder, one folder an install, and never beside the sources."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+import spike4dgs.benchmark
+from spike4dgs.benchmark.compilation import cached_njit
+from spike4dgs.benchmark.files import user_cache
+
+COUNT = """
+import numpy as np
+from spike4dgs.benchmark.spikes import bits
+from spike4dgs.benchmark.spikes.stream import pack
+assert bits.__file__.startswith(FOLDER), bits.__file__
+spikes = np.ones((3, 4, 8), np.uint8)
+assert (bits.unpack(pack(spikes), 8, 4, True) == 1).all()
+"""
+
+
+@pytest.fixture
+def install(tmp_path: Path) -> Path:
+    """A copy of the room `benchmark` without compiled files, as an install of its own."""
+    source = Path(spike4dgs.benchmark.__file__).parent
+    shutil.copytree(source, tmp_path / "first/spike4dgs/benchmark", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "first"
+
+
+def unpack_in(install: Path, **variables: str) -> None:
+    """Call a kernel of an install in a process of its own."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    code = COUNT.replace("FOLDER", repr(str(install)))
+    command = [sys.executable, "-P", "-c", code]
+    done = subprocess.run(command, env=kept | {"PYTHONPATH": str(install)} | variables, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def compiled(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.nb[ic]"))
+
+
+def test_nothing_lands_beside_the_sources_and_two_installs_share_nothing(install: Path, tmp_path: Path) -> None:
+    second = shutil.copytree(install, tmp_path / "second")
+    cache = tmp_path / "cache"
+    unpack_in(install, XDG_CACHE_HOME=str(cache))
+    first = compiled(cache / "spike4dgs/numba")
+    unpack_in(second, XDG_CACHE_HOME=str(cache))
+    both = compiled(cache / "spike4dgs/numba")
+    assert first and len(both) == 2 * len(first)
+    assert not compiled(install) and not compiled(second)
+
+
+def test_numbas_variable_goes_before(install: Path, tmp_path: Path) -> None:
+    unpack_in(install, XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
+    assert compiled(tmp_path / "chosen") and not (tmp_path / "cache/spike4dgs/numba").exists()
+    assert not compiled(install)
+
+
+def test_without_a_folder_to_write_to_nothing_is_kept(install: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    unpack_in(install, XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert not compiled(tmp_path)
+
+
+def test_other_packages_keep_numbas_own_folder() -> None:
+    before = numba.config.CACHE_DIR
+    double = cached_njit(nogil=True)(lambda x: 2 * x)
+    assert double(4) == 8 and numba.config.CACHE_DIR == before
+
+
+def test_the_users_cache_folder_follows_the_standard(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert user_cache() == tmp_path / "spike4dgs"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert user_cache() == tmp_path / "home/.cache/spike4dgs"
