@@ -35,8 +35,8 @@ def stream_of(fired: np.ndarray) -> SpikeStream:
 
 def test_bad_pixels_are_found_and_no_others() -> None:
     report = examine("made", stream_of(steady()))
-    assert sorted(map(tuple, np.argwhere(report.dead))) == [(5, 7), (20, 30)]
-    assert list(map(tuple, np.argwhere(report.hot))) == [(11, 13)]
+    assert sorted(map(tuple, np.argwhere(report.bad.dead))) == [(5, 7), (20, 30)]
+    assert list(map(tuple, np.argwhere(report.bad.hot))) == [(11, 13)]
 
 
 def test_rates_equal_the_unpacked_mean() -> None:
@@ -65,7 +65,10 @@ def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.Ca
 
 def test_a_scene_is_inspected_camera_by_camera(small_scene: Path, tmp_path: Path) -> None:
     assert inspect(small_scene, out=tmp_path / "out") == 0
-    assert sorted(p.name for p in (tmp_path / "out" / "scene").iterdir()) == [f"cam_{i:02d}.png" for i in range(4)]
+    assert sorted(p.name for p in (tmp_path / "out" / "scene").iterdir()) == [
+        *(f"cam_{i:02d}.png" for i in range(4)),
+        "statistics.csv",
+    ]
 
 
 @pytest.mark.parametrize(
