@@ -66,7 +66,7 @@ def isolated(rate: Float64, n_ticks: int) -> BadPixels:
     is above its brightest neighbour by HOT_SHARE of that one's rate and by HOT_SIGMA robust standard deviations of the
     24 pixels around it.
     """
-    padded = np.pad(rate, 2, mode="edge")
+    padded = np.pad(rate, 2, mode="reflect")  # no pixel is its own neighbour
     dead, hot = np.zeros(rate.shape, np.bool_), np.zeros(rate.shape, np.bool_)
     for start in range(0, len(rate), _ROWS):
         rows = slice(start, min(start + _ROWS, len(rate)))
