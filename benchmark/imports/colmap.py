@@ -70,5 +70,5 @@ def _distortion(camera: Any, intrinsics: tuple[float, float, float, float]) -> D
 
 def _equal(a: FoundCamera, b: FoundCamera) -> bool:
     """Return whether two cameras have the same intrinsics and pose, and as much distortion."""
-    values = [np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), [f.distortion_px]]) for f in (a, b)]
-    return bool(np.allclose(*values, rtol=_SAME, atol=_SAME))
+    first, second = (np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), [f.distortion_px]]) for f in (a, b))
+    return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME))
