@@ -11,6 +11,7 @@ import numpy as np
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.imports.found_camera import Distort, Float64, FoundCamera, check_size, make_camera
 
+_POINT_BYTES = 43  # at least, in points3D.bin
 _SAME = 1e-9  # relative: images of one camera that have the same pose
 
 
@@ -25,9 +26,10 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
 
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise problem(folder, "a COLMAP model (cameras.bin or cameras.txt, ...)", "none", "give its folder: sparse/0")
+    _check_points(folder / "points3D.bin")
     try:
         model = pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, OSError, IndexError) as e:
+    except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as e:
         raise problem(folder, "a whole COLMAP model", f"a damaged one ({e})", "export it again") from None
     found: dict[str, FoundCamera] = {}
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
@@ -40,6 +42,15 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
             fix = "export a model in which each camera stands still and has one set of intrinsics"
             raise problem(folder, f"one camera and pose for all images of {name}", f"another in {image.name}", fix)
     return found
+
+
+def _check_points(path: Path) -> None:
+    """Raise UserError where the file is too small for its points: pycolmap would take memory for all that it claims."""
+    if path.is_file():
+        with open(path, "rb") as file:
+            count = int.from_bytes(file.read(8), "little")
+        if path.stat().st_size < 8 + _POINT_BYTES * count:
+            raise problem(path, f"{count} points", "a shorter file", "export the model again")
 
 
 def _stream_of(image: str, names: Collection[str]) -> str:

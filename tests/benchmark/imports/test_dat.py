@@ -213,6 +213,7 @@ def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
         (["--cameras", "large.yaml"], "large.yaml: expected 40x24 pixels for cam_00, as the streams have, found 8x8"),
         (["--cameras", "part.yaml"], "expected camera_model, intrinsics, distortion_model, distortion_coeffs"),
         (["--cameras", "cut"], "cut: expected a whole COLMAP model, found a damaged one"),
+        (["--cameras", "greedy"], "points3D.bin: expected 18446744073709551615 points, found a shorter file"),
         (["--cameras", "others"], "others: expected a camera for each stream, found none for cam_00 (it has a, b, c)"),
     ],
 )
@@ -234,6 +235,7 @@ def test_bad_input_is_one_line(
     Path("part.yaml").write_text("cam_00: {camera_model: pinhole}\n")
     cut = write_colmap(Path("cut")) / "cameras.bin"
     cut.write_bytes(cut.read_bytes()[:20])
+    (write_colmap(Path("greedy")) / "points3D.bin").write_bytes(b"\xff" * 200)
     write_colmap(Path("others"), names=["a.png", "b.png", "c.png"])
     given = {"--width": "40", "--height": "24", "--rate-hz": "20000", "--out": "out"} | {change[0]: change[1]}
     assert main(["import-dat", "in", *(text for item in given.items() for text in item)]) == 2
