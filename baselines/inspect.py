@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,18 +14,33 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, from_recordings, isolated, total_counts
 from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
-Mask = NDArray[np.bool_]
-HOT_SIGMA = 6.0  # robust standard deviations above the neighbours' median, from which a pixel is called hot
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
-_LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
 _TIMELINE_BINS = 400
+# Of the table of statistics, and how the console shows them.
+_COLUMNS = {
+    "stream": "",
+    "ticks": "",
+    "missing": "",
+    "mean": ".4f",
+    "median": ".4f",
+    "p1": ".4f",
+    "p99": ".4f",
+    "spikes/s": ".0f",
+    "dead": "",
+    "hot": "",
+    "bad from": "",
+    "two ISIs": ".1%",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,35 +49,23 @@ class StreamReport:
 
     name: str
     rate: NDArray[np.float64]
-    dead: Mask  # [H, W] never fires although its neighbours do
-    hot: Mask  # [H, W] fires far more than its neighbours
+    bad: BadPixels
     two_intervals: float  # share of pixels whose inter-spike intervals take at most two adjacent values
     rate_hz: float
     n_ticks: int
     missing: int  # ticks within gaps
 
 
-def examine(name: str, stream: SpikeStream) -> StreamReport:
-    """Return the statistics of a whole stream, and its bad pixels.
+def examine(name: str, stream: SpikeStream, recordings: Recordings | None = None) -> StreamReport:
+    """Return the statistics of a whole stream, and its bad pixels: from recordings, or by isolation without any.
 
-    A pixel is dead where it never fires while the median of its 5x5 neighbourhood would fire at least ten times. It is
-    hot where its rate is more than HOT_SIGMA robust standard deviations of (rate - neighbourhood median), and at least
-    half of that median, above it. Ticks within gaps count nowhere.
+    Ticks within gaps count nowhere.
     """
-    from scipy.ndimage import median_filter
-
-    counts = np.zeros((stream.height, stream.width), np.int64)
-    for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
-        counts += stream.counts(start, min(start + _LONGEST_WINDOW, stream.n_ticks))
     seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
-    rate = counts / seen
-    around = median_filter(rate, size=5, mode="nearest")
-    excess = rate - around
-    sigma = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
-    dead = (counts == 0) & (around * seen >= 10)
-    hot = (excess > HOT_SIGMA * max(sigma, 1 / seen)) & (excess > 0.5 * around)
+    rate = total_counts(stream) / seen
+    bad = from_recordings(recordings.flat, recordings.dark) if recordings else isolated(rate, seen)
     missing = sum(gap.ticks for gap in stream.gaps)
-    return StreamReport(name, rate, dead, hot, _two_intervals(stream), stream.rate_hz, stream.n_ticks, missing)
+    return StreamReport(name, rate, bad, _two_intervals(stream), stream.rate_hz, stream.n_ticks, missing)
 
 
 def _two_intervals(stream: SpikeStream) -> float:
@@ -146,47 +151,53 @@ def _plot_gaps(axis: Any, stream: SpikeStream) -> None:
 
 def _show_bad_pixels(axis: Any, report: StreamReport) -> None:
     axis.imshow(report.rate, cmap="gray")
-    for mask, color, what in ((report.dead, "tab:blue", "dead"), (report.hot, "tab:red", "hot")):
+    for mask, color, what in ((report.bad.dead, "tab:blue", "dead"), (report.bad.hot, "tab:red", "hot")):
         y, x = np.nonzero(mask)
         axis.scatter(x, y, s=12, facecolors="none", edgecolors=color, label=f"{len(x)} {what}")
     axis.legend(loc="lower right")
-    axis.set_title("Mean rate, bad pixels circled")
+    axis.set_title(f"Mean rate, bad pixels circled (from {report.bad.source})")
+
+
+def _row(r: StreamReport) -> dict[str, Any]:
+    """Return the values of a line of the table, in the order of _COLUMNS."""
+    low, middle, high = np.percentile(r.rate, (1, 50, 99))
+    rates = r.rate.mean(), middle, low, high, r.rate.mean() * r.rate_hz
+    bad = int(r.bad.dead.sum()), int(r.bad.hot.sum()), r.bad.source
+    return dict(zip(_COLUMNS, (r.name, r.n_ticks, r.missing, *rates, *bad, r.two_intervals), strict=True))
 
 
 def _print_reports(reports: list[StreamReport]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    table = Table("stream", "ticks", "missing", "mean", "median", "p1", "p99", "spikes/s", "dead", "hot", "two ISIs")
-    for r in reports:
-        p1, p50, p99 = (f"{v:.4f}" for v in np.percentile(r.rate, (1, 50, 99)))
-        per_second = f"{r.rate.mean() * r.rate_hz:.0f}"
-        bad = f"{r.dead.sum()}", f"{r.hot.sum()}"
-        table.add_row(
-            r.name,
-            f"{r.n_ticks}",
-            f"{r.missing}",
-            f"{r.rate.mean():.4f}",
-            p50,
-            p1,
-            p99,
-            per_second,
-            *bad,
-            f"{r.two_intervals:.1%}",
-        )
+    table = Table(*_COLUMNS)
+    for row in map(_row, reports):
+        table.add_row(*(escape(format(value, _COLUMNS[name])) for name, value in row.items()))
     console = Console()
+    if not console.is_terminal:  # a file or a pipe takes the whole table
+        console = Console(width=Console(width=10_000).measure(table).maximum)
     console.print(table)
     print("Rates are spikes per tick and pixel; 'two ISIs' is the share of pixels with only two adjacent intervals.")
     for r in reports:
-        for what, mask in (("dead", r.dead), ("hot", r.hot)):
+        for what, mask in (("dead", r.bad.dead), ("hot", r.bad.hot)):
             if mask.any():
                 first = ", ".join(f"({x}, {y})" for y, x in np.argwhere(mask)[:5])
                 print(f"{r.name}: {mask.sum()} {what} pixels, the first (x, y): {first}")
 
 
+def _write_csv(path: Path, reports: list[StreamReport]) -> None:
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(_COLUMNS), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(map(_row, reports))
+    write_text(path, out.getvalue())
+
+
 def _open(
     path: Path, width: int | None, height: int | None, fps: float | None, top_down: bool, allow_gaps: bool
-) -> dict[str, SpikeStream]:
+) -> dict[str, tuple[SpikeStream, Recordings | None]]:
+    """Return each camera's stream, and its recordings of uniform light and darkness where the scene has them."""
     size = {"--width": width, "--height": height, "--fps": fps}
     if path.is_dir():
         if given := [name for name, value in size.items() if value is not None]:
@@ -194,9 +205,9 @@ def _open(
                 ", ".join(given), "nothing for a folder, which states its own size", "values", "leave them out"
             )
         if (path / STREAM_FOLDER).is_file():
-            return open_stream_folder(path, allow_gaps)
+            return {camera: (stream, None) for camera, stream in open_stream_folder(path, allow_gaps).items()}
         scene = open_scene(path, allow_gaps)
-        return {camera: scene.stream(camera) for camera in scene.cameras}
+        return {camera: (scene.stream(camera), scene.recordings(camera)) for camera in scene.cameras}
     if not path.exists():
         raise problem(path, "a stream file or a scene folder", "no such file", "check the path")
     if width is None or height is None or fps is None:
@@ -206,7 +217,7 @@ def _open(
         )
     if fps <= 0:
         raise problem("--fps", "a positive rate", f"{fps:g}", "state the camera's")
-    return {path.stem: open_stream(path, width, height, fps, rows_bottom_up=not top_down)}
+    return {path.stem: (open_stream(path, width, height, fps, rows_bottom_up=not top_down), None)}
 
 
 def inspect(
@@ -221,23 +232,27 @@ def inspect(
 ) -> int:
     """Show a scene's streams, or one raw stream: rates, dead and hot pixels, interval statistics, TFP and TFI images.
 
+    Dead and hot pixels are those of the scene's recordings of uniform light and of darkness. Without them they are the
+    pixels that differ from all of their neighbours. The table is printed, and written as statistics.csv.
+
     Args:
         path: A scene folder, a folder of imported streams, or a headerless .dat file.
         width: Pixels per row of a .dat file.
         height: Rows of a .dat file.
         fps: Ticks per second of a .dat file.
         top_down: The first row of a .dat file is the top one (cameras of this kind store the bottom row first).
-        out: Folder for the images, one PNG per stream.
+        out: Folder for a folder of this name: one PNG per stream, and statistics.csv.
         allow_gaps: Accept recordings with gaps.
     """
-    reports = []
     streams = _open(path, width, height, fps, top_down, allow_gaps)
-    for name, stream in streams.items():
-        report = examine(name, stream)
-        write_image(out / f"{path.resolve().name if path.is_dir() else path.stem}" / f"{name}.png", report, stream)
-        reports.append(report)
+    folder = out / (path.resolve().name if path.is_dir() else path.stem)
+    reports = []
+    for name, (stream, recordings) in streams.items():
+        reports.append(examine(name, stream, recordings))
+        write_image(folder / f"{name}.png", reports[-1], stream)
     _print_reports(reports)
-    for gap in (gap for stream in streams.values() for gap in stream.gaps):
+    _write_csv(folder / "statistics.csv", reports)
+    for gap in (gap for stream, _ in streams.values() for gap in stream.gaps):
         print(f"{gap.camera}: no data in ticks [{gap.first_tick}, {gap.stop_tick}): {gap.ticks} ticks, {gap.reason}")
-    print(f"images: {out / (path.resolve().name if path.is_dir() else path.stem)}")
+    print(f"images and statistics.csv: {folder}")
     return 0

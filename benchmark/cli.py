@@ -120,6 +120,11 @@ COMMANDS: dict[str, Command] = {
         "check every file of a scene against its manifest",
         "verify data/car-0-small",
     ),
+    "import-dat": Command(
+        "spike4dgs.benchmark.imports.dat:import_dat",
+        "make a folder of streams or a scene from bare .dat files, with cameras of COLMAP, OpenCV or Kalibr",
+        "import-dat recordings --width 400 --height 250 --rate-hz 20000 --cameras camchain.yaml --out data/first",
+    ),
     "import-spikecv": Command(
         "spike4dgs.benchmark.scene.spikecv:import_spikecv",
         "make a scene folder from a SpikeCV folder",
@@ -139,6 +144,16 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
         "write a scene as nerfstudio's D-NeRF data: images, poses, times",
         "export-nerfstudio data/car-0-small --out car-nerfstudio",
+    ),
+    "export-colmap": Command(
+        "spike4dgs.baselines.export_colmap:export_colmap",
+        "write images from a scene's spikes with a COLMAP model beside them",
+        "export-colmap data/car-0-small --out car-colmap",
+    ),
+    "export-ply": Command(
+        "spike4dgs.method.viewing.export_ply:export_ply",
+        "write the Gaussians of a fitted model at several times as .ply files",
+        "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
     ),
     "tradeoff": Command(
         "spike4dgs.generators.reports.tradeoff:tradeoff",

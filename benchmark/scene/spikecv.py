@@ -83,7 +83,7 @@ def import_spikecv(
     if cameras is None:
         write_stream_folder(out, streams)
     else:
-        _write_scene(out, cameras, streams, radiance_gain, licence)
+        write_recorded_scene(out, cameras, streams, radiance_gain, licence, "spikecv")
     return 0
 
 
@@ -200,9 +200,18 @@ def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
     return tuple(cameras[name] for name in sorted(sources))
 
 
-def _write_scene(
-    out: Path, cameras: tuple[Camera, ...], streams: dict[str, SpikeStream], radiance_gain: float, licence: str
+def write_recorded_scene(
+    out: Path,
+    cameras: tuple[Camera, ...],
+    streams: dict[str, SpikeStream],
+    radiance_gain: float,
+    licence: str,
+    kind: str,
 ) -> None:
+    """Describe streams of one length, which are already in `out`, as a scene without truth; all cameras train.
+
+    `kind` is the source in scene.json.
+    """
     first = streams[cameras[0].id]
     name = out.resolve().name
     finish_scene(
@@ -219,7 +228,7 @@ def _write_scene(
             radiance_gain=radiance_gain,
             targets=(),
             sensor={"model": "unknown", "rows_bottom_up": first.rows_bottom_up},
-            source={"kind": "spikecv"},
+            source={"kind": kind},
             clock={"t0_ns": 0, "source": "unknown"},
             sync={"method": "unknown", "max_error_us": None},
         ),

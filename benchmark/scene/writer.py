@@ -140,14 +140,21 @@ def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -
     return {"camera": camera.id, "file_path": file_path, **timing, **to_nerfstudio(camera)}
 
 
-def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.float64]) -> None:
-    """Write cameras.bin, images.bin and points3D.bin with pycolmap: one PINHOLE camera and one image per view.
+def write_colmap(
+    folder: Path,
+    cameras: Sequence[Camera],
+    points: NDArray[np.float64],
+    images: Mapping[str, Sequence[str]] | None = None,
+) -> None:
+    """Write cameras.bin, images.bin and points3D.bin with pycolmap: a PINHOLE camera and its images for each view.
 
-    Raises UserError where the folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
+    `images` are the names of a camera's images; without them it has one, called like it. Raises UserError where the
+    folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction()
+    names = {c.id: [c.id] for c in cameras} if images is None else images
+    model, image_id = pycolmap.Reconstruction(), 0
     for i, c in enumerate(cameras, start=1):
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(
@@ -155,7 +162,10 @@ def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.flo
             )
         )
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
-        model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=c.id), pose)
+        for name in names[c.id]:
+            image_id += 1
+            image = pycolmap.Image(image_id=image_id, camera_id=i, name=name)
+            model.add_image_with_trivial_frame(image, pose)
     for p in points:
         model.add_point3D(p, pycolmap.Track(), np.full(3, 128, dtype=np.uint8))
     with writing(folder):
@@ -166,7 +176,7 @@ def write_colmap(folder: Path, cameras: Sequence[Camera], points: NDArray[np.flo
     except (ValueError, RuntimeError, OSError) as e:
         fix = "free some disk space, or choose another folder"
         raise problem(folder, "a folder that a whole COLMAP model can be written to", str(e), fix) from e
-    if (written.num_images(), written.num_points3D()) != (len(cameras), len(points)):
+    if (written.num_images(), written.num_points3D()) != (image_id, len(points)):
         raise problem(folder, "a whole COLMAP model", "a part of it", "free some disk space, or choose another folder")
 
 

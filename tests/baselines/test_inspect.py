@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ from small_scenes import shared_file
 
 from spike4dgs.baselines.inspect import examine, inspect
 from spike4dgs.benchmark.cli import main
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.calibration import Recordings
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream, pack
 
 
@@ -35,8 +40,46 @@ def stream_of(fired: np.ndarray) -> SpikeStream:
 
 def test_bad_pixels_are_found_and_no_others() -> None:
     report = examine("made", stream_of(steady()))
-    assert sorted(map(tuple, np.argwhere(report.dead))) == [(5, 7), (20, 30)]
-    assert list(map(tuple, np.argwhere(report.hot))) == [(11, 13)]
+    assert sorted(map(tuple, np.argwhere(report.bad.dead))) == [(5, 7), (20, 30)]
+    assert list(map(tuple, np.argwhere(report.bad.hot))) == [(11, 13)]
+
+
+def test_bright_lines_and_dark_ones_are_no_bad_pixels() -> None:
+    rate = np.full((24, 40), 0.2)
+    rate[10, :] = rate[np.arange(24), np.arange(24)] = 0.8
+    rate[:, 30], rate[5, 35], rate[15, 5] = 0.0, 0.8, 0.0
+    found = isolated(rate, 400)
+    assert list(map(tuple, np.argwhere(found.hot))) == [(5, 35)]
+    assert list(map(tuple, np.argwhere(found.dead))) == [(15, 5)]
+
+
+def test_large_images_are_compared_in_parts_without_seams() -> None:
+    rng = np.random.default_rng(0)
+    rate = rng.uniform(0.2, 0.22, (230, 50))
+    hot = [(98, 10), (99, 20), (100, 30), (199, 40), (229, 5), (229, 49)]
+    for y, x in hot:
+        rate[y, x] = 0.9
+    assert list(map(tuple, np.argwhere(isolated(rate, 1000).hot))) == hot
+
+
+def test_recordings_tell_bad_pixels_where_there_are_some() -> None:
+    rng = np.random.default_rng(4)
+    dark_rate = np.full((24, 40), 0.01)
+    dark_rate[3, 4:6] = 0.06  # two beside each other, which isolation would miss
+    light_rate = np.full((24, 40), 0.4)
+    light_rate[20, 7:9] = 0
+
+    def ideal(rate: np.ndarray) -> SpikeStream:
+        phase = np.arange(2001)[:, None, None] * rate + rng.random(rate.shape)
+        return stream_of(np.diff(np.floor(phase), axis=0) > 0)
+
+    clip = ideal(np.where(np.arange(40) == 20, 0.9, 0.1) * np.ones((24, 1)))
+    report = examine("made", clip, Recordings(ideal(light_rate), ideal(dark_rate), 0.7))
+    assert list(map(tuple, np.argwhere(report.bad.hot))) == [(3, 4), (3, 5)]
+    assert list(map(tuple, np.argwhere(report.bad.dead))) == [(20, 7), (20, 8)]
+    assert report.bad.source == "recordings"
+    with pytest.raises(UserError, match="expected 10 spikes of a usual pixel, found 0"):
+        from_recordings(ideal(light_rate * 0), ideal(dark_rate))
 
 
 def test_rates_equal_the_unpacked_mean() -> None:
@@ -65,7 +108,30 @@ def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.Ca
 
 def test_a_scene_is_inspected_camera_by_camera(small_scene: Path, tmp_path: Path) -> None:
     assert inspect(small_scene, out=tmp_path / "out") == 0
-    assert sorted(p.name for p in (tmp_path / "out" / "scene").iterdir()) == [f"cam_{i:02d}.png" for i in range(4)]
+    assert sorted(p.name for p in (tmp_path / "out" / "scene").iterdir()) == [
+        *(f"cam_{i:02d}.png" for i in range(4)),
+        "statistics.csv",
+    ]
+
+
+def test_the_table_is_whole_in_a_pipe_and_in_a_file(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    inspect(small_scene, out=tmp_path / "out")
+    line = next(line for line in capsys.readouterr().out.splitlines() if "cam_02" in line)
+    with open(tmp_path / "out" / "scene" / "statistics.csv", newline="") as file:
+        rows = {row["stream"]: row for row in csv.DictReader(file)}
+    stream = open_scene(small_scene).stream("cam_02")
+    rate = stream.window(0, stream.n_ticks).mean(axis=0)
+    row = rows["cam_02"]
+    assert sorted(rows) == [f"cam_{i:02d}" for i in range(4)]
+    assert (row["ticks"], row["missing"], row["bad from"]) == ("80", "0", "isolation")
+    assert float(row["mean"]) == pytest.approx(rate.mean(), abs=1e-12)
+    assert float(row["p99"]) == pytest.approx(np.percentile(rate, 99), abs=1e-12)
+    shown = [cell.strip() for cell in line.strip("│").split("│")]
+    share = f"{float(row['two ISIs']):.1%}"
+    assert len(shown) == len(row) and shown[3] == f"{rate.mean():.4f}" and shown[-1] == share
 
 
 @pytest.mark.parametrize(
@@ -106,6 +172,9 @@ def test_the_real_recording_is_upright_and_of_the_known_rate() -> None:
     stream = open_stream(path, 400, 250, 40_000.0)
     report = examine("car", stream)
     assert report.rate.mean() == pytest.approx(0.366, abs=5e-4)
+    # Three pixels fire at twice or three times the rate of all around them, in front of plain walls and a tyre.
+    assert list(map(tuple, np.argwhere(report.bad.hot))) == [(50, 378), (111, 340), (174, 0)]
+    assert not report.bad.dead.any()
     bits = np.unpackbits(np.fromfile(path, np.uint8), bitorder="little").reshape(-1, 250, 400)[:, ::-1]
     np.testing.assert_array_equal(stream.window(0, 200), bits)
     # Bits of the wrong order break up every edge: the right order is the smoother image.

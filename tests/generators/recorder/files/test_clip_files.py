@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import array_cameras
 
-from spike4dgs.baselines.inspect import _draw_gaps, examine, inspect
+from spike4dgs.baselines.inspect import _plot_gaps, examine, inspect
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -253,7 +253,7 @@ def test_inspect_plots_each_gap_at_its_ticks(tmp_path: Path, capsys: pytest.Capt
     profile = rig()
     root = write_clip(tmp_path / "clip", profile, streams(profile), ClipRecord(TICKS, GAPS, SYNC))
     axis = Figure().subplots()
-    _draw_gaps(axis, open_scene(root, allow_gaps=True).stream("cam_00"))
+    _plot_gaps(axis, open_scene(root, allow_gaps=True).stream("cam_00"))
     spans = [patch.get_window_extent().transformed(axis.transData.inverted()) for patch in axis.patches[1:]]
     assert [(round(s.x0, 6), round(s.x1, 6)) for s in spans] == [(4, 7), (28, 30)]
     texts = [text.get_text() for text in axis.get_legend().get_texts()]

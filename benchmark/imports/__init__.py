@@ -1,0 +1,1 @@
+"""Bare recordings and other programs' camera files become scene folders."""

@@ -1,0 +1,87 @@
+"""Dead and hot pixels: from recordings of uniform light and of darkness, or from any stream by isolation.
+
+A bright line is bright along itself, a hot pixel alone. Without recordings, a pixel is called bad where it differs from
+all of its neighbours: bad pixels that touch each other, and hot ones in bright light, are then not found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+
+Mask = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+FEWEST_SPIKES = 10  # fewer say nothing of a rate
+HOT_SIGMA = 6.0  # robust standard deviations of its surroundings that a hot pixel is above its brightest neighbour,
+HOT_SHARE = 0.5  # and share of that neighbour's rate: texture of one pixel seldom has more
+_LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
+_ROWS = 100  # compared with their surroundings at a time
+
+
+@dataclass(frozen=True, eq=False)
+class BadPixels:
+    """Masks [H, W], and their source: `recordings` or `isolation`."""
+
+    dead: Mask
+    hot: Mask
+    source: str
+
+
+def total_counts(stream: SpikeStream) -> NDArray[np.int64]:
+    """Return the spikes per pixel of a whole stream [H, W]."""
+    counts = np.zeros((stream.height, stream.width), np.int64)
+    for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
+        counts += stream.counts(start, min(start + _LONGEST_WINDOW, stream.n_ticks))
+    return counts
+
+
+def from_recordings(flat: SpikeStream, dark: SpikeStream) -> BadPixels:
+    """Return the pixels that never fire under uniform light, and those that fire too often in the dark.
+
+    A hot pixel's dark rate is at least `SENSOR.hot_factor` times the chip's median, in at least FEWEST_SPIKES spikes.
+    Raises UserError where the recordings are of two sizes, or the uniform one has too few spikes to tell.
+    """
+    light, dark_spikes = total_counts(flat), total_counts(dark)
+    if light.shape != dark_spikes.shape:
+        found = f"{flat.width}x{flat.height} and {dark.width}x{dark.height}"
+        raise problem("calibration", "two recordings of one size", found, "restore them")
+    if np.median(light) < FEWEST_SPIKES:
+        expected = f"{FEWEST_SPIKES} spikes of a usual pixel"
+        raise problem(flat.source, expected, f"{np.median(light):g}", "record uniform light for longer")
+    hot = dark_spikes >= max(SENSOR.hot_factor * float(np.median(dark_spikes)), FEWEST_SPIKES)
+    return BadPixels(light == 0, hot, "recordings")
+
+
+def isolated(rate: Float64, n_ticks: int) -> BadPixels:
+    """Return the pixels of a mean rate [H, W], over `n_ticks`, that differ from all of their eight neighbours.
+
+    A pixel is dead where it never fires although each neighbour fires at least FEWEST_SPIKES times. It is hot where it
+    is above its brightest neighbour by HOT_SHARE of that one's rate and by HOT_SIGMA robust standard deviations of the
+    24 pixels around it.
+    """
+    padded = np.pad(rate, 2, mode="reflect")  # no pixel is its own neighbour
+    dead, hot = np.zeros(rate.shape, np.bool_), np.zeros(rate.shape, np.bool_)
+    for start in range(0, len(rate), _ROWS):
+        rows = slice(start, min(start + _ROWS, len(rate)))
+        lowest, highest, spread = _surroundings(padded[rows.start : rows.stop + 4])
+        excess = rate[rows] - highest
+        dead[rows] = (rate[rows] == 0) & (lowest * n_ticks >= FEWEST_SPIKES)
+        hot[rows] = (excess > HOT_SHARE * highest) & (excess > HOT_SIGMA * np.maximum(spread, 1 / n_ticks))
+    return BadPixels(dead, hot, "isolation")
+
+
+def _surroundings(padded: Float64) -> tuple[Float64, Float64, Float64]:
+    """Return the lowest and highest of 8 neighbours, and the robust standard deviation of 24, of all inner pixels."""
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).reshape(len(padded) - 4, -1, 25)
+    around = np.delete(windows, 12, axis=-1)  # [H, W, 24], without the pixel itself
+    touching = windows[..., [6, 7, 8, 11, 13, 16, 17, 18]]
+    median = np.median(around, axis=-1, keepdims=True)
+    spread = 1.4826 * np.median(np.abs(around - median), axis=-1)
+    return touching.min(axis=-1), touching.max(axis=-1), spread

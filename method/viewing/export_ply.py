@@ -1,0 +1,98 @@
+"""`export-ply`: the Gaussians of a fitted model at several times, as `.ply` files in the layout of 3DGS.
+
+Floats, binary little endian, one row for each Gaussian (`FIELDS`): position in metres, normal (0), colour, opacity
+before the sigmoid, natural logarithms of the standard deviations, unit quaternion wxyz.
+
+Viewers show 0.5 + SH_C0 * f_dc as a display value, clipped to [0, 1]. So f_dc is that of the sRGB-encoded radiance, the
+same in all three channels. `srgb` is continued above 1 and below 0, so that no radiance is lost. Our renderer blends
+radiance and then encodes; a viewer blends what is encoded. Opaque surfaces look the same, half-transparent edges differ
+a little.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import check_new, write_bytes
+from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.splat import Splats
+from spike4dgs.method.splat.types import ALPHA_MIN
+from spike4dgs.method.tracking.model import TrackedModel
+
+Float32 = NDArray[np.float32]
+FIELDS = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the spherical harmonic of degree 0
+_MOST_OPAQUE = 1 - 1e-6  # whose logit is finite
+
+
+def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: str = "cpu") -> int:
+    """Write the Gaussians of a fitted model at equally spaced times as .ply files, which splat viewers open.
+
+    A file is named by its tick. Colour is the sRGB-encoded gray radiance at degree 0 of the spherical harmonics.
+    Gaussians that have faded away at a time are left out of its file. Radiance fields have no Gaussians, and colours
+    that a network decodes (the motion `spacetime`) have no place in a .ply: both are refused.
+
+    Args:
+        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        out: New folder to write.
+        times: Number of files, in the middles of so many equal parts of the clip.
+        device: cpu or cuda.
+    """
+    saved = load_model(model, device)
+    about, fitted = saved.provenance, saved.model
+    if not isinstance(fitted, FittedModel | TrackedModel):
+        fix = "`spike4dgs render` makes videos of it"
+        raise problem(model, "a model of Gaussians", f"{about.name}, a radiance field", fix)
+    if not 1 <= times <= about.n_ticks:
+        raise problem("--times", f"1 to {about.n_ticks}, the ticks of the clip", str(times), "correct it")
+    ticks = [(2 * i + 1) * about.n_ticks // (2 * times) for i in range(times)]
+    check_new(out)
+    for tick in ticks:
+        splats = fitted.splats(tick * 1e6 / about.rate_hz)
+        if splats.colors.shape[1] != 1:
+            found = f"{about.name}, whose colours a network decodes for each ray"
+            raise problem(model, "Gaussians with a gray value", found, "fit the motion spacetime-lite")
+        write_bytes(out / f"{tick:06d}.ply", to_ply(splats))
+    print(f"{out}: {times} files of the ticks {ticks[0]} to {ticks[-1]}, {about.rate_hz:g} ticks/s ({saved.title})")
+    return 0
+
+
+@torch.no_grad()
+def to_ply(splats: Splats) -> bytes:
+    """Return the file of gray Gaussians, without those that every rasteriser leaves out."""
+    kept = splats.opacities >= ALPHA_MIN
+
+    def of(values: torch.Tensor) -> NDArray[np.float64]:
+        return np.asarray(values[kept].double().cpu().numpy())
+
+    means, quats, scales = of(splats.means), of(splats.quats), of(splats.scales)
+    opacity = np.minimum(of(splats.opacities), _MOST_OPAQUE)
+    columns: list[Any] = [
+        means,
+        np.zeros_like(means),
+        np.repeat((srgb(of(splats.colors)) - 0.5) / SH_C0, 3, axis=1),
+        np.log(opacity / (1 - opacity))[:, None],
+        np.log(np.maximum(scales, np.finfo(np.float32).tiny)),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+    ]
+    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+    properties = [f"property float {name}" for name in FIELDS]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
+    return "\n".join(header).encode() + rows.tobytes()
+
+
+def srgb(radiance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sRGB encoding of linear radiance, continued beyond [0, 1]: linear below 0, the power above 1."""
+    power = 1.055 * np.maximum(radiance, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(radiance <= 0.0031308, 12.92 * radiance, power)
