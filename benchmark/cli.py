@@ -85,6 +85,11 @@ COMMANDS: dict[str, Command] = {
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
         needs=("spike4dgs.leaderboard.submit_command:submit", "spike4dgs.baselines.speed.images:images"),
     ),
+    "fit": Command(
+        "spike4dgs.baselines.fit_command.command:fit",
+        "fit a model to a recording without ground truth; write a video and a report",
+        "fit captures/turntable --out runs/turntable",
+    ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
         "score a predictions folder of any program",
