@@ -15,7 +15,8 @@ from spike4dgs.baselines.initialization.colmap import clip_means, map_views
 from spike4dgs.baselines.initialization.features import FOCAL_PRIOR
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file, sha256_json
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.metrics.pose_error import Sim3
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
@@ -96,13 +97,7 @@ def own_frame(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
 
     The origin is the mean centre, the unit of length the largest distance between two cameras.
     """
-    centers = np.stack([c.center for c in cameras])
-    forward, right = (np.mean([c.R[axis] for c in cameras], axis=0) for axis in (2, 0))
-    forward /= np.linalg.norm(forward)
-    right -= (right @ forward) * forward
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, forward, np.cross(right, forward)])  # [3, 3] to the own frame
+    W, centers = array_axes(cameras), np.stack([c.center for c in cameras])
     size = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
-    moved = (centers - centers.mean(axis=0)) @ turn.T / size
-    turned = [c.R @ turn.T for c in cameras]
-    return tuple(replace(c, R=R, t=-R @ x) for c, R, x in zip(cameras, turned, moved, strict=True))
+    frame = Sim3(1 / size, W, -W @ centers.mean(axis=0) / size)
+    return tuple(map(frame.camera, cameras))

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.reports.figure import new_figure
 from spike4dgs.benchmark.results.provenance import Provenance
-from spike4dgs.benchmark.scene.cameras import Camera, Float64
+from spike4dgs.benchmark.scene.cameras import Camera, Float64, array_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -155,14 +155,14 @@ def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
     """Return a PNG of the array from above and from behind; where the fit moved cameras, the given ones too."""
     figure = new_figure((9.0, 3.6))
     moved = [(c, g) for c, g in zip(cameras, given, strict=True) if not np.allclose(c.w2c, g.w2c, atol=1e-9)]
-    middle, axes_of_array = _mean_axes(given)
+    middle, frame = np.mean([c.center for c in given], axis=0), array_axes(given)
     above, behind = figure.subplots(1, 2)
-    for ax, (across, up), title in ((above, (0, 2), "from above"), (behind, (0, 1), "from behind")):
+    for ax, (across, up), title in ((above, (0, 1), "from above"), (behind, (0, 2), "from behind")):
         if moved:
-            _show(ax, given, middle, axes_of_array, (across, up), "0.6", "given")
+            _show(ax, given, middle, frame, (across, up), "0.6", "given")
         label = "estimated" if moved else "cameras"
-        _show(ax, cameras, middle, axes_of_array, (across, up), "tab:blue", label)
-        ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if up == 2 else "up")
+        _show(ax, cameras, middle, frame, (across, up), "tab:blue", label)
+        ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if up == 1 else "up")
         ax.margins(0.15)
         ax.grid(alpha=0.3)
     if moved:
@@ -173,16 +173,6 @@ def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def _mean_axes(cameras: Sequence[Camera]) -> tuple[Float64, Float64]:
-    """Return the array's mean centre, and its right, up and forward directions [3, 3]."""
-    forward, right = (np.mean([c.R[axis] for c in cameras], axis=0) for axis in (2, 0))
-    forward = forward / np.linalg.norm(forward)
-    right = right - (right @ forward) * forward
-    right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
-    return np.mean([c.center for c in cameras], axis=0), np.stack([right, up, forward])
 
 
 def _show(
@@ -200,6 +190,7 @@ def _show(
     length = 0.25 * float(np.linalg.norm(centers, axis=1).max() or 1.0)
     (x, y), (dx, dy) = centers[:, plane].T, length * ahead[:, plane].T
     ax.scatter(x, y, s=18, color=color, label=label)
+    ax.update_datalim(np.stack([x + dx, y + dy], axis=1))
     ax.quiver(x, y, dx, dy, color=color, angles="xy", scale_units="xy", scale=1, width=0.004)
     for camera, a, b in zip(cameras, x, y, strict=True):
         ax.annotate(camera.id, (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7, color=color)
