@@ -23,6 +23,8 @@ from spike4dgs.benchmark.scene.cameras import Camera, Float64, array_axes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+ABOVE, BEHIND = (0, 1), (0, 2)  # of right, forward and up, the axes that a plot shows
+
 _CSS = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
@@ -157,13 +159,13 @@ def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
     moved = [(c, g) for c, g in zip(cameras, given, strict=True) if not np.allclose(c.w2c, g.w2c, atol=1e-9)]
     middle, frame = np.mean([c.center for c in given], axis=0), array_axes(given)
     above, behind = figure.subplots(1, 2)
-    for ax, (across, up), title in ((above, (0, 1), "from above"), (behind, (0, 2), "from behind")):
+    for ax, plane, title in ((above, ABOVE, "from above"), (behind, BEHIND, "from behind")):
         if moved:
-            _show(ax, given, middle, frame, (across, up), "0.6", "given")
+            _show(ax, given, middle, frame, plane, "0.6", "given")
         label = "estimated" if moved else "cameras"
-        _show(ax, cameras, middle, frame, (across, up), "tab:blue", label)
-        ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if up == 1 else "up")
-        ax.margins(0.15)
+        _show(ax, cameras, middle, frame, plane, "tab:blue", label)
+        ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if plane == ABOVE else "up")
+        ax.margins(0.25)
         ax.grid(alpha=0.3)
     if moved:
         turn = max(float(angle_deg(c.R @ g.R.T)) for c, g in moved)
@@ -192,5 +194,5 @@ def _show(
     ax.scatter(x, y, s=18, color=color, label=label)
     ax.update_datalim(np.stack([x + dx, y + dy], axis=1))
     ax.quiver(x, y, dx, dy, color=color, angles="xy", scale_units="xy", scale=1, width=0.004)
-    for camera, a, b in zip(cameras, x, y, strict=True):
+    for camera, a, b in zip(cameras, x, y, strict=True) if plane == BEHIND else ():
         ax.annotate(camera.id, (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7, color=color)
