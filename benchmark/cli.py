@@ -90,6 +90,11 @@ COMMANDS: dict[str, Command] = {
         "list the installed methods: parts, package, description",
         "methods",
     ),
+    "fit": Command(
+        "spike4dgs.baselines.fit_command.command:fit",
+        "fit a model to a recording without ground truth; write a video and a report",
+        "fit captures/turntable --out runs/turntable",
+    ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
         "score a predictions folder of any program",

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,13 @@ def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: fl
     right = right / np.linalg.norm(right)
     R = np.stack([right, np.cross(forward, right), forward])
     return Camera(id, width, height, focal, focal, width / 2, height / 2, R, -R @ np.asarray(origin, dtype=np.float64))
+
+
+def array_axes(cameras: Sequence[Camera]) -> Float64:
+    """Return the directions right, forward and up [3, 3] of an array, the means of its cameras'."""
+    u, _, vt = np.linalg.svd(np.sum([c.R for c in cameras], axis=0))
+    right, down, forward = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return np.stack([right, forward, -down])
 
 
 def to_nerfstudio(camera: Camera) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def render(
     """Render a fitted model along a path of cameras, in slow motion, to a video or a folder of images.
 
     Args:
-        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        model: A model that run-benchmark has saved, OUT/models/METHOD/SCENE.safetensors, or fit, OUT/model.safetensors.
         path: orbit: an ellipse as large as the camera array, around its middle; rig: from training camera to training
             camera; still: one of them.
         camera: The training camera of `still`; the middle one if left out.

@@ -40,7 +40,7 @@ def view(
     """Show a fitted model in the browser: camera, time, and the spikes beside it. Ctrl-C ends it.
 
     Args:
-        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        model: A model that run-benchmark has saved, OUT/models/METHOD/SCENE.safetensors, or fit, OUT/model.safetensors.
         scene: The folder of its scene: also shows spike rates and errors at the training cameras.
         host: Address to serve at; 0.0.0.0 admits other machines.
         port: Port to serve at; the next free one where it is taken.

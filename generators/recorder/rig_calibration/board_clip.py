@@ -18,7 +18,9 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.benchmark.metrics.pose_error import Sim3
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes, look_at
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
@@ -89,6 +91,18 @@ def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M
         R = wobble @ c.R
         cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ center))
     return tuple(cameras)
+
+
+def in_front(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], float]:
+    """Return the cameras of any array in the board's frame, and the distance at which they see it as those of `array`.
+
+    Camera-to-camera poses are the array's own. The frame's origin is that far in front of the array's middle.
+    """
+    W, centers = array_axes(cameras), np.stack([c.center for c in cameras])
+    half_field = max(c.width / (2 * c.fx) for c in cameras)
+    distance_m = DISTANCE_M * math.tan(math.radians(FIELD_DEG) / 2) / half_field
+    frame = Sim3(1.0, W, -W @ centers.mean(axis=0) - [0.0, distance_m, 0.0])
+    return tuple(map(frame.camera, cameras)), distance_m
 
 
 def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:
@@ -237,8 +251,9 @@ def board_clip(
     rows: int = 5,
     square_m: float = 0.04,
     seed: int = 0,
+    like: Path | None = None,
 ) -> int:
-    """Simulate a chessboard that moves in front of an array of nine cameras: a scene for `record --emulate`.
+    """Simulate a chessboard that moves in front of an array of cameras: a scene for `record --emulate`.
 
     Args:
         out: Folder of the scene.
@@ -249,11 +264,14 @@ def board_clip(
         rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
         square_m: Side of a square in metres.
         seed: Seed of the array's mounting errors and of the sensors.
+        like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
     """
     n_ticks = round(seconds * RATE_HZ)
     if n_ticks < 1:
         raise problem("--seconds", f"at least {1 / RATE_HZ:g}, one tick", f"{seconds:g}", "ask for a longer clip")
-    cameras = array(width, height, seed)
-    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(), n_ticks, seed)
+    cameras, distance_m = array(width, height, seed), DISTANCE_M
+    if like is not None:
+        cameras, distance_m = in_front(tuple(open_scene(like).cameras.values()))
+    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(distance_m), n_ticks, seed)
     print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")
     return 0

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes
 from spike4dgs.generators.recorder.profile.profile import calibration_toml
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
@@ -86,14 +86,13 @@ def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Cam
 
     The origin is the mean position of the board: about the point that the array looks at.
     """
-    u, _, vt = np.linalg.svd(rig.R.sum(axis=0))
-    right, down, forward = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    W = np.stack([right, forward, -down])
-    frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
-    return tuple(
-        frame.camera(Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t))
+    cameras = [
+        Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t)
         for name, f, m, R, t in zip(names, rig.focal, rig.principal, rig.R, rig.t, strict=True)
-    )
+    ]
+    W = array_axes(cameras)
+    frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
+    return tuple(map(frame.camera, cameras))
 
 
 def differences(found: Sequence[Camera], stated: Mapping[str, Camera]) -> dict[str, float] | None:

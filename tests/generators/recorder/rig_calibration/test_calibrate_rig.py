@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -95,3 +96,16 @@ def test_a_board_clip_is_a_scene_and_overwrites_no_other(tmp_path, capsys):
     assert main(arguments) == 2
     assert main([*arguments[:2], str(tmp_path / "c"), "--seconds", "0.00001"]) == 2
     assert "at least 5e-05, one tick" in capsys.readouterr().err
+
+
+def test_any_array_films_the_board(small_scene, tmp_path):
+    out = tmp_path / "b"
+    assert main(["board-clip", "--out", str(out), "--seconds", "0.001", "--like", str(small_scene)]) == 0
+    found, like = open_scene(out).cameras, open_scene(small_scene).cameras
+    assert list(found) == list(like)
+    for first, second in itertools.combinations(like, 2):
+        a, b, x, y = found[first], found[second], like[first], like[second]
+        np.testing.assert_allclose(a.w2c @ np.linalg.inv(b.w2c), x.w2c @ np.linalg.inv(y.w2c), atol=1e-9)
+    for c in found.values():
+        (uv,), z = c.project(np.zeros((1, 3)))  # the board's middle
+        assert z[0] > 0.3 and 0 < uv[0] < c.width and 0 < uv[1] < c.height
