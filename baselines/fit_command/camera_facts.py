@@ -6,15 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.benchmark.scene.calibration import Recordings, estimate
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-
-DEAD_GAIN = 0.2  # of the mean sensitivity: a pixel below has no use; the spread of good ones is a few percent
-HOT_DARK = 5.0  # median dark rates: a pixel above is hot; a log-normal spread reaches it once in 5,000 pixels
-HOT_SPIKES = 5.0  # in the dark recording: fewer are chance
-_LONGEST_COUNT = 65535  # ticks
 
 
 @dataclass(frozen=True)
@@ -40,21 +36,11 @@ def camera_facts(scene: TrainingScene) -> list[CameraFacts]:
 
 
 def _facts(camera: str, stream: SpikeStream, recordings: Recordings | None) -> CameraFacts:
-    edges = [*range(0, stream.n_ticks, _LONGEST_COUNT), stream.n_ticks]
-    counts = sum(stream.counts(a, b).astype(np.int64) for a, b in zip(edges, edges[1:], strict=False))
     seen = int(present(stream.gaps, stream.n_ticks).sum())
-    rate = np.asarray(counts) / max(seen, 1)
+    rate = total_counts(stream) / max(seen, 1)
     low, high = np.percentile(rate, (1, 99))
-    bad = bad_pixels(recordings) if recordings else (None, None)
-    return CameraFacts(camera, stream.n_ticks - seen, float(rate.mean()), float(low), float(high), *bad)
-
-
-def bad_pixels(recordings: Recordings) -> tuple[int, int]:
-    """Return how many pixels are dead and hot, by the recordings under uniform light and in the dark.
-
-    Dead: less than `DEAD_GAIN` of the mean sensitivity. Hot: more than `HOT_DARK` times the median dark rate, and more
-    than `HOT_SPIKES` spikes.
-    """
-    found = estimate(recordings)
-    hot = (found.dark > HOT_DARK * np.median(found.dark)) & (found.dark * recordings.dark.n_ticks > HOT_SPIKES)
-    return int((found.gain < DEAD_GAIN).sum()), int(hot.sum())
+    dead = hot = None
+    if recordings:
+        bad = from_recordings(recordings.flat, recordings.dark)
+        dead, hot = int(bad.dead.sum()), int(bad.hot.sum())
+    return CameraFacts(camera, stream.n_ticks - seen, float(rate.mean()), float(low), float(high), dead, hot)

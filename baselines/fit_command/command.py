@@ -137,6 +137,8 @@ def _fitted(method: Method, recording: Recording, request: FitRequest, out: Path
     work = out / "work" / _key(about)[:16]
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
+    if warm_up := getattr(method, "warm_up", None):
+        warm_up(request)  # compiling is no part of the fit
     with RunDisplay(console, 1) as display, display.cell(f"{about.name} on {about.scene}") as shown:
         clock = FitClock(work / "fit_clock.json", checkpoint)
         if clock.before > 0:

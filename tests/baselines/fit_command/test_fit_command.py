@@ -20,7 +20,6 @@ from PIL import Image
 from small_scenes import write_small_scene
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
-from spike4dgs.baselines.fit_command.camera_facts import bad_pixels
 from spike4dgs.baselines.fit_command.command import MODEL, REPORT, SHEET, VIDEO
 from spike4dgs.baselines.fit_command.recording import open_recording, own_frame
 from spike4dgs.benchmark.cli import main
@@ -28,7 +27,6 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
-from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
@@ -210,15 +208,6 @@ def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
     write_stream_folder(tmp_path, dict.fromkeys("ab", dark))
     with pytest.raises(UserError, match="calibrate-rig"):
         open_recording(tmp_path)
-
-
-def test_bad_pixels_are_found_in_light_and_in_darkness() -> None:
-    rng = np.random.default_rng(0)
-    flat, dark = rng.random((400, 16, 16)) < 0.4, rng.random((2000, 16, 16)) < 0.01
-    flat[:, 3, 4] = flat[:, 9, 1] = dark[:, 3, 4] = False
-    dark[::5, 7, 7] = flat[::2, 7, 7] = True
-    streams = [SpikeStream(pack(spikes), 16, 16, RATE_HZ) for spikes in (flat, dark)]
-    assert bad_pixels(Recordings(streams[0], streams[1], 0.7)) == (2, 1)
 
 
 def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path: Path) -> None:
