@@ -35,6 +35,11 @@ def _seeded(start: Callable[[TrainingScene, int], Start]) -> Initialization:
     return Initialization(lambda r: start(r.scene, r.seed))
 
 
+def _network(start: Callable[[TrainingScene, int, str], Start]) -> Initialization:
+    """Return the entry of an initialisation by a network, which runs on the fit's device."""
+    return Initialization(lambda r: start(r.scene, r.seed, r.device))
+
+
 def _colmap(r: StartRequest) -> Start:
     return colmap(r.scene, r.seed, flat_field=r.settings.flat_field)
 
@@ -43,11 +48,11 @@ INITIALIZATIONS = {
     "rig": Initialization(lambda r: rig(r.scene, flat_field=r.settings.flat_field), RigSettings()),
     "colmap": Initialization(_colmap, ColmapSettings()),
     "colmap-uncalibrated": _seeded(colmap_uncalibrated),
-    "dust3r": _seeded(dust3r),
-    "dust3r-uncalibrated": _seeded(dust3r_uncalibrated),
-    "msdi": Initialization(lambda r: msdi(r.scene)),
-    "msdi-matched": _seeded(msdi_matched),
-    "msdi-uncalibrated": _seeded(msdi_uncalibrated),
+    "dust3r": _network(dust3r),
+    "dust3r-uncalibrated": _network(dust3r_uncalibrated),
+    "msdi": Initialization(lambda r: msdi(r.scene, r.device)),
+    "msdi-matched": _network(msdi_matched),
+    "msdi-uncalibrated": _network(msdi_uncalibrated),
 }
 PARTS = Parts(
     images=IMAGES,

@@ -120,6 +120,19 @@ COMMANDS: dict[str, Command] = {
         "show a fitted model in the browser",
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
+    "doctor": Command(
+        "spike4dgs.benchmark.doctor:make_doctor",
+        "say what this machine has, what it lacks, and what mends it",
+        "doctor",
+        needs=(
+            "spike4dgs.method.splat.kernels.vector_ir:host_lanes",
+            "spike4dgs.method.splat.kernels.threads:get_threads",
+            "spike4dgs.generators.rendering.mitsuba_variant:diagnose",
+            "spike4dgs.method.msdi.weights:check_weights",
+            "spike4dgs.baselines.spike_to_image.spk2img.weights:check_weights",
+            "spike4dgs.baselines.initialization.dust3r:weights_path",
+        ),
+    ),
     "verify": Command(
         "spike4dgs.benchmark.scene.verify:verify",
         "check every file of a scene against its manifest",

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.gpu import missing_rasterizer
 
 # The libraries whose version can change a score or a speed.
 _PACKAGES = (
@@ -30,7 +31,7 @@ def environment(device: str) -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "packages": {name: found for name in _PACKAGES.split() if (found := _version(name))},
-        "cpu": _cpu(),
+        "cpu": cpu_name(),
         "gpu": gpu,
         "cuda": cuda,
     }
@@ -64,8 +65,12 @@ def device_type(device: str) -> str:
     return device.partition(":")[0]
 
 
-def choose_device(device: str) -> str:
-    """Resolve `auto` and check that the device exists. Raises UserError where it does not."""
+def choose_device(device: str, *, rasterizes: bool = True) -> str:
+    """Resolve `auto` and check that the device exists. Raises UserError where it does not.
+
+    What `rasterizes` computes on CUDA only where gsplat works too. Without it `auto` is the CPU, and one line on stderr
+    says how to change that.
+    """
     kind = device_type(device)
     if kind not in ("auto", "cpu", "cuda"):
         raise problem("--device", "auto, cpu or cuda", repr(device), "choose one of them")
@@ -74,10 +79,20 @@ def choose_device(device: str) -> str:
     import torch
 
     if kind == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        if not torch.cuda.is_available():
+            return "cpu"
+        if rasterizes and (missing := missing_rasterizer()):
+            _say_once(
+                f"spike4dgs: computing on the CPU: PyTorch sees a CUDA device, but rendering on it needs "
+                f"{missing.expected}, found {missing.found}; {missing.fix}; or silence this with --device cpu"
+            )
+            return "cpu"
+        return "cuda"
     index = device.partition(":")[2] or "0"
     if not index.isdigit() or int(index) >= torch.cuda.device_count():
         raise problem("--device", "a CUDA device of this machine", repr(device), "use --device cpu")
+    if rasterizes and (missing := missing_rasterizer()):
+        raise problem(f"--device {device}", missing.expected, missing.found, f"{missing.fix}; or use --device cpu")
     return device
 
 
@@ -112,6 +127,11 @@ def peak_memory_mb(device: str) -> float | None:
     return int(found[1]) * 1024 / 1e6 if found else None
 
 
+@cache
+def _say_once(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
 def _version(package: str) -> str | None:
     try:
         return version(package)
@@ -119,7 +139,8 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _cpu() -> str:
+def cpu_name() -> str:
+    """Return the processor's model and the cores that this process may use."""
     try:
         found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
     except OSError:

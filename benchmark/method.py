@@ -117,10 +117,10 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Five attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
+    Six attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
     the data sets that learned parts have seen, `refines_views`: its models have `refine` (see `refinement`),
-    `description`, one line for `spike4dgs methods`, and `warm_up(request)`, which compiles what `fit` runs and is
-    called before the clock of a fit starts.
+    `description`, one line for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called
+    before the clock of a fit starts, and `rasterizes`: False lets it run on a GPU without gsplat.
     """
 
     name: str

@@ -66,6 +66,7 @@ class Algorithm:
     fit: Callable[[FitJob], Model]
     published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
     supervisions: tuple[str, ...] = ()
+    rasterizes: bool = True  # renders Gaussians, which on CUDA needs gsplat
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ class RecipeMethod:
         found = override(defaults, recipe.settings, f"recipe {recipe.name}")
         self.settings = follow_images(found, recipe.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
+        self.rasterizes = self.algorithm.rasterizes
         self.trained_on: tuple[str, ...] = ()
         if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
@@ -112,7 +114,7 @@ class RecipeMethod:
         check_device(request.device)
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
-        start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"]))
+        start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"], request.device))
         return self._fit(scene, start, settings, request)
 
     def warm_up(self, request: FitRequest) -> None:

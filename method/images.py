@@ -76,10 +76,16 @@ def choose_ticks(n_ticks: int, settings: ImageSettings) -> tuple[int, ...]:
     return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
 
 
+def on_device(make: ImageMaker, device: str) -> ImageMaker:
+    """Return a maker that computes on the device of a fit; one that has no choice of device as it is."""
+    return make.on(device) if hasattr(make, "on") else make
+
+
 def make_training_images(
     scene: TrainingScene, cameras: Sequence[Camera], make: ImageMaker, settings: ImageSettings, device: str
 ) -> TrainingImages:
     """Return images of all training views at the chosen times, as `cameras` see them."""
+    make = on_device(make, device)
     ticks = choose_ticks(scene.n_ticks, settings)
     gain, calibrations = scene.radiance_gain, scene.calibrations if settings.flat_field else None
     if calibrations:

@@ -28,6 +28,7 @@ class StartRequest:
     scene: TrainingScene
     seed: int
     settings: Any  # the initialisation's own, as the recipe overrides them
+    device: str = "cpu"  # of the fit
 
 
 @dataclass(frozen=True)

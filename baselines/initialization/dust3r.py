@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.baselines.initialization.colmap import clip_means
 from spike4dgs.baselines.initialization.dust3r_network import Dust3r, load_dust3r
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -46,6 +48,11 @@ LEAST_CONFIDENCE = 0.5  # quantile below which points of a view are left out
 MAX_POINTS = 10_000  # first Gaussians: about 0.4 per pixel of a view of 200x125
 
 
+def weights_path() -> Path:
+    """Return the weight file that users bring. Raises WeightsError where it is missing."""
+    return find_weights(WEIGHTS).path
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """The network's answer for two views: points [H, W, 3] in the first one's frame, confidence [H, W] >= 1."""
@@ -57,25 +64,26 @@ class Pair:
 Predict = Callable[[int], Pair]  # of view 0 beside view i
 
 
-def dust3r(scene: TrainingScene, seed: int) -> Start:
+def dust3r(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
     """Return poses and points with the calibrated intrinsics; see the module.
 
     Raises WeightsError where the weights are absent, UserError where they are others or a view gets no pose.
     """
-    return estimate(scene, clip_means(scene), seed, calibrated=True)
+    return estimate(scene, clip_means(scene), seed, device, calibrated=True)
 
 
-def dust3r_uncalibrated(scene: TrainingScene, seed: int) -> Start:
+def dust3r_uncalibrated(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
     """Return the same, with intrinsics unknown."""
-    return estimate(scene, clip_means(scene), seed, calibrated=False)
+    return estimate(scene, clip_means(scene), seed, device, calibrated=False)
 
 
-def estimate(scene: TrainingScene, images: Float32, seed: int, *, calibrated: bool) -> Start:
+def estimate(scene: TrainingScene, images: Float32, seed: int, device: str = "auto", *, calibrated: bool) -> Start:
     """Return poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
-    network = load_dust3r(find_weights(WEIGHTS).path)
+    network = load_dust3r(weights_path())
     views = [resized(camera, network.shape.patch) for camera in scene.cameras]
     shown = np.stack([_resize(p, v) for p, v in zip(images, views, strict=True)])
-    return solve(predictor(network, shown), views, shown, scene, seed, calibrated=calibrated)
+    predict = predictor(network, shown, choose_device(device, rasterizes=False))
+    return solve(predict, views, shown, scene, seed, calibrated=calibrated)
 
 
 def resized(camera: Camera, patch: int) -> Camera:
@@ -99,9 +107,8 @@ def _resize(image: Float32, view: Camera) -> Float32:
     return np.clip(cv2.warpAffine(encoded, back, size, flags=flags, borderMode=cv2.BORDER_REFLECT_101), 0, 1)
 
 
-def predictor(network: Dust3r, shown: Float32) -> Predict:
-    """Return the network on images [C, H, W] in [0, 1]; on the GPU where there is one."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+def predictor(network: Dust3r, shown: Float32, device: str = "cpu") -> Predict:
+    """Return the network on images [C, H, W] in [0, 1]."""
     network = network.to(device)
     inputs = torch.as_tensor(2 * shown - 1, device=device)[:, None].expand(-1, 3, -1, -1)
     with torch.inference_mode():

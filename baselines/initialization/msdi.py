@@ -70,12 +70,12 @@ class Estimate:
         return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
 
 
-def msdi(scene: TrainingScene) -> Start:
+def msdi(scene: TrainingScene, device: str = "auto") -> Start:
     """Return points at the calibrated poses; see the module.
 
     Raises WeightsError where there are no weights, UserError where all cameras have one centre.
     """
-    return _given(scene, infer(scene, calibrated=True))
+    return _given(scene, infer(scene, device, calibrated=True))
 
 
 def _given(scene: TrainingScene, estimate: Estimate) -> Start:
@@ -83,9 +83,9 @@ def _given(scene: TrainingScene, estimate: Estimate) -> Start:
     return filled(scene, completed(cloud, estimate), mean)
 
 
-def msdi_matched(scene: TrainingScene, seed: int) -> Start:
+def msdi_matched(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
     """Return poses by the network's points of view 0 and by matches, and points; raises as `matched_poses` too."""
-    estimate = infer(scene, calibrated=True)
+    estimate = infer(scene, device, calibrated=True)
     cameras = matched_poses(scene, estimate, seed).cameras
     small = tuple(shrunk(camera, estimate.factor) for camera in cameras)
     return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small))
@@ -101,14 +101,14 @@ def matched_poses(scene: TrainingScene, estimate: Estimate, seed: int) -> Mappin
     return bundle(scene, guess, estimate.factor, images, seed).of_all(scene, "MSDI")
 
 
-def msdi_uncalibrated(scene: TrainingScene, seed: int) -> Start:
+def msdi_uncalibrated(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
     """Return poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, infer(scene, calibrated=False), seed, calibrated=False)
+    return unposed(scene, infer(scene, device, calibrated=False), seed, calibrated=False)
 
 
-def infer(scene: TrainingScene, *, calibrated: bool) -> Estimate:
+def infer(scene: TrainingScene, device: str = "auto", *, calibrated: bool) -> Estimate:
     """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
-    device = choose_device("auto")
+    device = choose_device(device, rasterizes=False)
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
     spikes = np.stack([window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams])

@@ -40,6 +40,13 @@ def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], A
 
 
 @dataclass(frozen=True)
+class NetworkSettings(Settings):
+    """Where the network of an image maker runs."""
+
+    device: str = "auto"  # on a GPU if there is one; a fit has its own here
+
+
+@dataclass(frozen=True)
 class ImageMaker:
     """A named way from spikes to images.
 
@@ -62,13 +69,17 @@ class ImageMaker:
     rate: Callable[[SpikeStream, int, Any], Float32]  # of a stream, a tick and the settings
     settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
-    corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+    corrected: Callable[[SpikeStream, int, Any, Calibration], Float32] | None = None
 
     def with_settings(self, settings: Settings) -> ImageMaker:
         """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""
         if type(settings) is not type(self.settings):
             raise TypeError(f"{self.name} has {type(self.settings).__name__}, not {type(settings).__name__}")
         return replace(self, settings=settings)
+
+    def on(self, device: str) -> ImageMaker:
+        """Return the same maker with its network, if it has one, on `device`."""
+        return self.with_settings(NetworkSettings(device)) if isinstance(self.settings, NetworkSettings) else self
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
@@ -83,7 +94,7 @@ class ImageMaker:
             if not 0 <= tick < stream.n_ticks:
                 raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
             if self.corrected and camera:
-                image[:] = self.corrected(stream, tick, camera)
+                image[:] = self.corrected(stream, tick, self.settings, camera)
             else:
                 image[:] = self.rate(stream, tick, self.settings)
         if camera is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, learned_from
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, NetworkSettings, learned_from
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -16,13 +16,19 @@ if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Msdi
 
 
-def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
-    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use, on a GPU if there is one.
+def msdi_image(
+    stream: SpikeStream,
+    tick: int,
+    settings: NetworkSettings,
+    camera: Calibration | None = None,
+) -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use.
 
     With a calibration they are those of an ideal camera. Beyond its ends the clip is mirrored. Raises UserError where
     the weights are missing or damaged.
     """
-    return reconstruct(load_network(weights_path(), choose_device("auto")), stream, tick, camera)
+    device = choose_device(settings.device, rasterizes=False)
+    return reconstruct(load_network(weights_path(), device), stream, tick, camera)
 
 
 def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
@@ -46,7 +52,8 @@ MSDI = ImageMaker(
     name="msdi",
     definition="MSDI's image generator on the 41 ticks around tick t",
     source="Spike4DGS, eq. 12",
-    rate=lambda stream, tick, _: msdi_image(stream, tick),
+    rate=msdi_image,
+    settings=NetworkSettings(),
     learned=partial(learned_from, WEIGHTS.in_use, read_card),
     corrected=msdi_image,
 )

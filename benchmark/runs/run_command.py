@@ -111,7 +111,8 @@ class RunBenchmark:
             raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
         scenes = table_scenes(paper, data, profile) if paper else scenes
         chosen = _choose_methods(methods, paper)
-        console, common = make_console(), (seed, choose_device(device), make_budget(budget), metrics)
+        device = choose_device(device, rasterizes=any(getattr(m, "rasterizes", True) for m in chosen))
+        console, common = make_console(), (seed, device, make_budget(budget), metrics)
         splits = paper.splits if paper and paper.splits and split is None else (split,)
         runs, submissions = [], []
         for name in splits:

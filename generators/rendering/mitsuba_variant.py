@@ -14,6 +14,7 @@ import platform
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -70,6 +71,24 @@ def pick_variant() -> str:
         file=sys.stderr,
     )
     return SAFE
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The variant that `make-dataset` renders with, and why it is not the fast one ("" if it is, or was asked for)."""
+
+    name: str
+    why_not_fast: str
+    llvm: tuple[str, ...]  # the libLLVM files found, or the one that DRJIT_LIBLLVM_PATH names
+
+
+def diagnose() -> Variant:
+    """Return what `pick_variant` picks, without its line on stderr; raises as it does."""
+    llvm = tuple(_llvm_files())
+    if os.environ.get(OVERRIDE):
+        return Variant(pick_variant(), "", llvm)
+    why_not = _cached_probe()
+    return Variant(SAFE if why_not else FAST, why_not, llvm)
 
 
 def choose_device(device: str) -> None:
@@ -133,11 +152,14 @@ def _probe(timeout_s: float = 180.0) -> str:
 
 def _fingerprint() -> str:
     """Return a name for this Mitsuba, the libLLVM files that it would find, and the CPU."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH", "")
-    files = [named] if named else sorted({f for path in _LLVM_PATHS for f in glob.glob(path)})
-    stamps = [(f, os.stat(f).st_size if os.path.exists(f) else -1) for f in files]
+    stamps = [(f, os.stat(f).st_size if os.path.exists(f) else -1) for f in _llvm_files()]
     facts = (version("mitsuba"), version("drjit"), stamps, platform.machine(), _cpu_name())
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+
+
+def _llvm_files() -> list[str]:
+    named = os.environ.get("DRJIT_LIBLLVM_PATH", "")
+    return [named] if named else sorted({f for path in _LLVM_PATHS for f in glob.glob(path)})
 
 
 def _cpu_name() -> str:

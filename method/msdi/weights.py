@@ -63,6 +63,13 @@ def read_card(path: Path) -> Card:
     return card
 
 
+def check_weights() -> Path:
+    """Return the weight file in use, its card read. Raises UserError where it is missing, damaged or foreign."""
+    path = weights_path()
+    read_card(path)
+    return path
+
+
 @cache
 def load_network(path: Path, device: str) -> Msdi:
     """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""

@@ -163,4 +163,4 @@ SETTINGS = {
     "supervision": FieldSpikeSettings(),
     "occupancy": OccupancySettings(),
 }
-RADIANCE_FIELD = Algorithm(SETTINGS, fit_radiance_field, PUBLISHED, ("spike",))
+RADIANCE_FIELD = Algorithm(SETTINGS, fit_radiance_field, PUBLISHED, ("spike",), rasterizes=False)

@@ -6,25 +6,24 @@ camera in float64 before they are rounded.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.gpu import missing_rasterizer
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, require_finite
 
 
+@cache
 def _rasterization() -> Any:
-    try:
-        from gsplat import rasterization  # type: ignore[import-not-found, unused-ignore]
-    except ImportError as e:
-        raise problem(
-            "back end cuda",
-            "the package gsplat 1.5.3",
-            f"{e}",
-            "install spike4dgs[cuda], or move the tensors to the CPU",
-        ) from None
+    if missing := missing_rasterizer():
+        fix = f"{missing.fix}, or move the tensors to the CPU"
+        raise problem("back end cuda", missing.expected, missing.found, fix)
+    from gsplat import rasterization  # type: ignore[import-not-found, unused-ignore]
+
     return rasterization
 
 

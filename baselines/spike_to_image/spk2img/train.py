@@ -154,7 +154,7 @@ def train_spk2img(
         raise problem("--scenes", "scene folders", "none", "make some with `spike4dgs make-dataset --variant 1`")
     shortest = min(min(example.rate.shape) for example in examples)
     settings = TrainingSettings(width=width, steps=steps, patch=min(TrainingSettings.patch, shortest))
-    training = Training(examples, settings, choose_device(device), seed)
+    training = Training(examples, settings, choose_device(device, rasterizes=False), seed)
     names = tuple(sorted(f"{s.id}@{s.revision[:16]}" for s in opened))
     print(f"{len(examples)} images of {len(opened)} scenes, width {width}, {training.device}", flush=True)
     _run(training, kept, names, out)

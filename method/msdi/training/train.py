@@ -170,7 +170,7 @@ def train_msdi(
     if not learned:
         raise problem(data, "shards to train on", "hidden variants only", "make more with `spike4dgs make-msdi-data`")
     settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
-    training = Training(Bursts(learned), CONFIGS[config], settings, choose_device(device), seed)
+    training = Training(Bursts(learned), CONFIGS[config], settings, choose_device(device, rasterizes=False), seed)
     if start:
         start_from(training.network, start)
     key = checkpoint_key(settings, config, seed, sha256_file(start) if start else None)

@@ -1,0 +1,258 @@
+"""`doctor`: what this machine has for the benchmark, what it lacks, and the line that mends each."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from spike4dgs.benchmark.environment import cpu_name
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.gpu import PYTORCH, missing_rasterizer
+from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightsError, find_weights
+
+OK, MISSING, BROKEN, NOTE = "ok", "missing", "broken", "-"
+_STYLES = {OK: "green", MISSING: "yellow", BROKEN: "bold red", NOTE: "dim"}
+_UNATTENDED_WIDTH = 120  # where the output is no terminal
+
+# Package, the extra that installs it, and what needs it.
+OPTIONAL = (
+    ("viser", "viewer", "`view`"),
+    ("distributed", "cluster", "`--scheduler` on many machines"),
+    ("dask-jobqueue", "cluster", "`--scheduler slurm`"),
+    ("pandas", "pandas", "results as data frames"),
+)
+# Library, its Debian package, and what needs it.
+LIBRARIES = (
+    ("usb-1.0", "libusb-1.0-0", "`record` from cameras"),
+    ("umockdev", "umockdev", "the tests of `record`"),
+)
+
+METRIC_WEIGHTS = (("LPIPS alex", ALEXNET), ("LPIPS vgg", VGG16), ("LPIPS squeeze", SQUEEZENET), ("MetaIQA", METAIQA))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A part of the machine, its state, what was found, and the line that mends it."""
+
+    part: str
+    state: str
+    found: str
+    fix: str = ""
+
+
+Check = Callable[[], Iterator[Finding]]
+
+
+@dataclass(frozen=True)
+class OtherRooms:
+    """The functions of other rooms that tell about their parts."""
+
+    vector_lanes: Callable[[], int]  # floats in a vector of the CPU kernels
+    kernel_threads: Callable[[], int]
+    mitsuba: Callable[[], Any]  # the variant's `name`, `why_not_fast` and `llvm`, the libraries found
+    networks: tuple[tuple[str, Callable[[], Path]], ...]  # by name, what finds their weights or raises UserError
+
+
+def make_doctor(
+    vector_lanes: Callable[[], int],
+    kernel_threads: Callable[[], int],
+    mitsuba: Callable[[], Any],
+    msdi: Callable[[], Path],
+    spk2img: Callable[[], Path],
+    dust3r: Callable[[], Path],
+) -> Callable[[], int]:
+    """Return the command `doctor`, which calls these functions of other rooms."""
+    networks = (("MSDI", msdi), ("Spk2ImgNet", spk2img), ("DUSt3R", dust3r))
+    rooms = OtherRooms(vector_lanes, kernel_threads, mitsuba, networks)
+
+    def doctor() -> int:
+        """Say what this machine has, what it lacks, and what mends it. Nothing is installed or changed.
+
+        The exit code is 1 where something that every run needs is broken, and 0 otherwise.
+        """
+        return report(examine(rooms))
+
+    return doctor
+
+
+def examine(rooms: OtherRooms) -> list[Finding]:
+    """Return the findings of all checks."""
+    checks: dict[str, Check] = {
+        "processor": _processor,
+        "CPU kernels": partial(_kernels, rooms),
+        "packages": _packages,
+        "torch": _torch,
+        "mitsuba": partial(_mitsuba, rooms),
+        "GPU": _gpu,
+        "optional": _optional,
+        "metrics": _metrics,
+        "networks": partial(_networks, rooms),
+    }
+    return [finding for part, check in checks.items() for finding in _try(part, check)]
+
+
+def report(findings: list[Finding]) -> int:
+    """Print the findings and a verdict; return the exit code."""
+    console = Console(highlight=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = Console(highlight=False, width=_UNATTENDED_WIDTH)
+    indent = 2 + max(len(f.part) for f in findings)
+    for finding in findings:
+        _print(console, finding, indent)
+    broken = [f.part for f in findings if f.state == BROKEN]
+    missing = sum(f.state == MISSING for f in findings)
+    verdict = f"Broken: {', '.join(broken)}." if broken else "The benchmark runs here."
+    console.print(f"{verdict} Optional parts missing: {missing}.", markup=False)
+    return 1 if broken else 0
+
+
+def _try(part: str, check: Check) -> list[Finding]:
+    """Return what a check finds; where it fails, that is a finding, and the other checks still run."""
+    found: list[Finding] = []
+    try:
+        found.extend(check())
+    except UserError as e:
+        found.append(Finding(part, BROKEN, str(e)))
+    except Exception as e:  # a package that is damaged can raise anything
+        first = str(e).partition("\n")[0]
+        found.append(Finding(part, BROKEN, f"{type(e).__name__}: {first}", "pip install --force-reinstall spike4dgs"))
+    return found
+
+
+def _processor() -> Iterator[Finding]:
+    yield Finding("processor", OK, cpu_name())
+    try:
+        kilobytes = dict(re.findall(r"(\w+):\s+(\d+) kB", Path("/proc/meminfo").read_text()))
+    except OSError:
+        kilobytes = {}
+    if {"MemTotal", "MemAvailable"} <= kilobytes.keys():
+        free, total = (int(kilobytes[key]) / 2**20 for key in ("MemAvailable", "MemTotal"))
+        yield Finding("memory", OK, f"{free:.1f} of {total:.1f} GiB free")
+    disk = shutil.disk_usage(Path.cwd())
+    yield Finding("disk", OK, f"{disk.free / 2**30:.1f} of {disk.total / 2**30:.1f} GiB free in {Path.cwd()}")
+
+
+def _kernels(rooms: OtherRooms) -> Iterator[Finding]:
+    import llvmlite.binding
+
+    features = llvmlite.binding.get_host_cpu_features()
+    names = {"avx512f": "AVX-512", "avx2": "AVX2", "avx": "AVX", "neon": "NEON"}
+    widest = next((name for key, name in names.items() if features.get(key)), "no wide vectors")
+    found = f"{widest}, {rooms.vector_lanes()} floats a vector, threads: {rooms.kernel_threads()}"
+    yield Finding("CPU kernels", OK, found)
+
+
+def _packages() -> Iterator[Finding]:
+    required = [r for r in requires("spike4dgs") or () if "extra ==" not in r]
+    names = [re.split(r"[^\w.-]", r, maxsplit=1)[0] for r in required]
+    absent = [name for name in names if _version(name) is None]
+    if absent:
+        yield Finding("packages", BROKEN, f"not installed: {', '.join(absent)}", f"pip install {' '.join(absent)}")
+    else:
+        yield Finding("packages", OK, f"the {len(names)} that are required are installed")
+
+
+def _torch() -> Iterator[Finding]:
+    import torch
+
+    yield Finding("torch", OK, f"{torch.__version__}, threads: {torch.get_num_threads()}")
+
+
+def _mitsuba(rooms: OtherRooms) -> Iterator[Finding]:
+    variant, installed = rooms.mitsuba(), version("mitsuba")
+    numbers = [re.search(r"\d+", Path(path).name) for path in variant.llvm]
+    llvm = ", ".join(sorted({n[0] for n in numbers if n}, key=int)) or "not found"
+    if not variant.why_not_fast:
+        yield Finding("mitsuba", OK, f"{installed}, {variant.name}; LLVM {llvm}")
+        return
+    found = f"{installed}, {variant.name}, about 5 times slower than with LLVM: {variant.why_not_fast}"
+    if os.environ.get("DRJIT_LIBLLVM_PATH"):
+        fix = "unset DRJIT_LIBLLVM_PATH, or name a libLLVM 19 in it"
+    else:
+        fix = "apt-get install libllvm19, or name a libLLVM 19 in DRJIT_LIBLLVM_PATH"
+    yield Finding("mitsuba", MISSING, found, fix)
+
+
+def _gpu() -> Iterator[Finding]:
+    import torch
+
+    if not torch.cuda.is_available():
+        if ctypes.util.find_library("cuda"):
+            yield Finding("GPU", MISSING, f"an NVIDIA driver, but torch {torch.__version__} sees no device", PYTORCH)
+        else:
+            yield Finding("GPU", NOTE, "no CUDA device; everything runs on the CPU")
+        yield Finding("gsplat", NOTE, f"{_version('gsplat') or 'none'}; only a CUDA device needs it")
+        return
+    names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    yield Finding("GPU", OK, f"{', '.join(names)} (CUDA {torch.version.cuda})")
+    if missing := missing_rasterizer():
+        found = f"renders on the CPU: needs {missing.expected}, found {missing.found}"
+        yield Finding("gsplat", MISSING, found, missing.fix)
+    else:
+        yield Finding("gsplat", OK, f"{_version('gsplat')}; the first use may compile it")
+
+
+def _optional() -> Iterator[Finding]:
+    for name, extra, purpose in OPTIONAL:
+        found = _version(name)
+        fix = "" if found else f"pip install 'spike4dgs[{extra}]'"
+        yield Finding(name, OK if found else MISSING, f"{found or 'none'}, for {purpose}", fix)
+    for library, package, purpose in LIBRARIES:
+        found = ctypes.util.find_library(library)
+        fix = "" if found else f"apt-get install {package}"
+        yield Finding(package, OK if found else MISSING, f"{found or 'none'}, for {purpose}", fix)
+
+
+def _metrics() -> Iterator[Finding]:
+    for name, file in METRIC_WEIGHTS:
+        try:
+            yield Finding(name, OK, find_weights(file).path.name)
+        except WeightsError:
+            damaged = any(path.is_file() for path in file.candidates)
+            found = f"another or a damaged {file.name}" if damaged else f"no {file.name}"
+            yield Finding(name, MISSING, found, f"get {file.source} into {_short(file.candidates[0].parent)}")
+
+
+def _short(path: Path) -> str:
+    """Return a path with ~ for the home folder."""
+    return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else str(path)
+
+
+def _networks(rooms: OtherRooms) -> Iterator[Finding]:
+    for name, find in rooms.networks:
+        try:
+            yield Finding(name, OK, find().name)
+        except WeightsError as e:
+            yield Finding(name, MISSING, "no weights", str(e).rpartition("; ")[2])
+        except UserError as e:
+            yield Finding(name, BROKEN, str(e))
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _print(console: Console, finding: Finding, indent: int) -> None:
+    """Print a finding, and the line that mends it unbroken, so that it can be copied."""
+    lines = textwrap.wrap(finding.found, console.width - indent - 10) or [""]
+    line = Text(f"{finding.part:<{indent}}")
+    line.append(f"{finding.state:<9}", _STYLES[finding.state])
+    line.append(f"\n{'':<{indent + 9}}".join(lines))
+    console.print(line)
+    if finding.fix:
+        console.print(Text(f"    > {finding.fix}"), soft_wrap=True)
