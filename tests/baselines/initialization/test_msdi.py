@@ -143,7 +143,7 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     truth, depth, _ = world.trace(camera, 0.5)
     seen = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None]).astype(np.float64) / SCALE
     estimate = Estimate(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
-    monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.infer", lambda scene, calibrated: estimate)
+    monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.infer", lambda scene, device, calibrated: estimate)
     start = msdi_matched(scene, 0)
     for found, true in zip(start.cameras, scene.cameras, strict=True):
         assert angle_deg(found.R @ true.R.T) < 0.3 and found.fx == true.fx
