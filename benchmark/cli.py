@@ -121,7 +121,7 @@ COMMANDS: dict[str, Command] = {
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "doctor": Command(
-        "spike4dgs.benchmark.doctor:make_doctor",
+        "spike4dgs.benchmark.reports.doctor:make_doctor",
         "say what this machine has, what it lacks, and what mends it",
         "doctor",
         needs=(

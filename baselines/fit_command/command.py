@@ -70,7 +70,8 @@ def fit(
         device: auto, cpu or cuda.
         allow_gaps: Accept a recording with gaps.
     """
-    wanted, steps, on = get_method(method), make_budget(budget), choose_device(device)
+    wanted, steps = get_method(method), make_budget(budget)
+    on = choose_device(device, rasterizes=getattr(wanted, "rasterizes", True))
     console, times = make_console(), dict[str, float]()
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         with _timed(times, "opening"):

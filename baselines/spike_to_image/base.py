@@ -40,13 +40,6 @@ def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], A
 
 
 @dataclass(frozen=True)
-class NetworkSettings(Settings):
-    """Where the network of an image maker runs."""
-
-    device: str = "auto"  # on a GPU if there is one; a fit has its own here
-
-
-@dataclass(frozen=True)
 class ImageMaker:
     """A named way from spikes to images.
 
@@ -69,7 +62,8 @@ class ImageMaker:
     rate: Callable[[SpikeStream, int, Any], Float32]  # of a stream, a tick and the settings
     settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
-    corrected: Callable[[SpikeStream, int, Any, Calibration], Float32] | None = None
+    corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+    made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
 
     def with_settings(self, settings: Settings) -> ImageMaker:
         """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""
@@ -79,7 +73,7 @@ class ImageMaker:
 
     def on(self, device: str) -> ImageMaker:
         """Return the same maker with its network, if it has one, on `device`."""
-        return self.with_settings(NetworkSettings(device)) if isinstance(self.settings, NetworkSettings) else self
+        return self.made_on(device) if self.made_on else self
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
@@ -94,7 +88,7 @@ class ImageMaker:
             if not 0 <= tick < stream.n_ticks:
                 raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
             if self.corrected and camera:
-                image[:] = self.corrected(stream, tick, self.settings, camera)
+                image[:] = self.corrected(stream, tick, camera)
             else:
                 image[:] = self.rate(stream, tick, self.settings)
         if camera is None:

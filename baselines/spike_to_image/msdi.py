@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, NetworkSettings, learned_from
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -16,19 +16,14 @@ if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Msdi
 
 
-def msdi_image(
-    stream: SpikeStream,
-    tick: int,
-    settings: NetworkSettings,
-    camera: Calibration | None = None,
-) -> Float32:
+def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None, device: str = "auto") -> Float32:
     """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use.
 
     With a calibration they are those of an ideal camera. Beyond its ends the clip is mirrored. Raises UserError where
     the weights are missing or damaged.
     """
-    device = choose_device(settings.device, rasterizes=False)
-    return reconstruct(load_network(weights_path(), device), stream, tick, camera)
+    chosen = choose_device(device, rasterizes=False)
+    return reconstruct(load_network(weights_path(), chosen), stream, tick, camera)
 
 
 def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
@@ -48,12 +43,17 @@ def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibrati
     return rate
 
 
-MSDI = ImageMaker(
-    name="msdi",
-    definition="MSDI's image generator on the 41 ticks around tick t",
-    source="Spike4DGS, eq. 12",
-    rate=msdi_image,
-    settings=NetworkSettings(),
-    learned=partial(learned_from, WEIGHTS.in_use, read_card),
-    corrected=msdi_image,
-)
+def msdi_maker(device: str) -> ImageMaker:
+    """Return the image maker whose network runs on `device`."""
+    return ImageMaker(
+        name="msdi",
+        definition="MSDI's image generator on the 41 ticks around tick t",
+        source="Spike4DGS, eq. 12",
+        rate=lambda stream, tick, _: msdi_image(stream, tick, device=device),
+        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        corrected=partial(msdi_image, device=device),
+        made_on=msdi_maker,
+    )
+
+
+MSDI = msdi_maker("auto")

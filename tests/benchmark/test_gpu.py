@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +17,8 @@ from spike4dgs.benchmark import environment, gpu
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.gpu import Missing, missing_rasterizer
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.images import on_device
 
 # A PyTorch that claims a GPU, in an environment that has no gsplat.
 _CLAIM = """
@@ -27,7 +30,7 @@ importlib.util.find_spec = lambda name, *a: None if name == "gsplat" else found(
 _RUN = """
 from types import SimpleNamespace
 from spike4dgs.baselines.recipes import METHODS, PARTS
-from spike4dgs.benchmark import method
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.method import Recipe
 from spike4dgs.method.fit import RecipeMethod
@@ -35,7 +38,7 @@ steps = {"trainer.coarse_steps": 4, "trainer.fine_steps": 4, "images.time_spacin
 tiny = RecipeMethod(Recipe("tiny", "msdi", "rig", "static", "pixel", steps), PARTS)
 methods = {"tiny": tiny, "nearest-view": METHODS["nearest-view"]}
 entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-method.entry_points = lambda group: [entry]
+plugins.entry_points = lambda group: [entry]
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -97,10 +100,14 @@ def test_networks_take_the_gpu_without_gsplat(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("name", ["msdi", "spk2img"])
-def test_image_makers_with_a_network_follow_the_fit(name: str) -> None:
-    assert IMAGES[name].settings.device == "auto"  # type: ignore[attr-defined]
-    assert IMAGES[name].on("cuda:1").settings.device == "cuda:1"  # type: ignore[attr-defined]
-    assert IMAGES["tfp"].on("cuda:1") is IMAGES["tfp"]
+def test_image_makers_with_a_network_follow_the_fit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    stream = SpikeStream(pack(np.ones((50, 8, 8), np.uint8)), 8, 8, 20_000.0)
+    on_cpu = on_device(IMAGES[name], "cpu")
+    assert on_cpu.name == name and on_cpu(stream, [25], 1.0).shape == (1, 8, 8)
+    with pytest.raises(UserError, match="found 'cuda:7'"):
+        on_device(IMAGES[name], "cuda:7")(stream, [25], 1.0)
+    assert on_device(IMAGES["tfp"], "cuda:7") is IMAGES["tfp"]
 
 
 def executable(path: Path, text: str = "") -> Path:

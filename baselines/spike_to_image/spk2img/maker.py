@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, NetworkSettings, learned_from
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker, learned_from
 from spike4dgs.baselines.spike_to_image.spk2img.weights import WEIGHTS, load_network, read_card, weights_path
 from spike4dgs.baselines.spike_to_image.windows import WINDOW, window
 from spike4dgs.benchmark.environment import choose_device
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from spike4dgs.baselines.spike_to_image.spk2img.network import Spk2ImgNet
 
 
-def spk2img_image(stream: SpikeStream, tick: int, settings: NetworkSettings) -> Float32:
+def spk2img_image(stream: SpikeStream, tick: int, device: str = "auto") -> Float32:
     """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use.
 
     Beyond its ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
     """
-    return reconstruct(load_network(weights_path(), choose_device(settings.device, rasterizes=False)), stream, tick)
+    return reconstruct(load_network(weights_path(), choose_device(device, rasterizes=False)), stream, tick)
 
 
 def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
@@ -35,12 +35,17 @@ def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
     return rate
 
 
-SPK2IMG = ImageMaker(
-    name="spk2img",
-    definition=f"Spk2ImgNet on the {WINDOW} ticks around tick t",
-    source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike stream, "
-    "CVPR 2021",
-    rate=spk2img_image,
-    settings=NetworkSettings(),
-    learned=partial(learned_from, WEIGHTS.in_use, read_card),
-)
+def spk2img_maker(device: str) -> ImageMaker:
+    """Return the image maker whose network runs on `device`."""
+    return ImageMaker(
+        name="spk2img",
+        definition=f"Spk2ImgNet on the {WINDOW} ticks around tick t",
+        source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike "
+        "stream, CVPR 2021",
+        rate=lambda stream, tick, _: spk2img_image(stream, tick, device),
+        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        made_on=spk2img_maker,
+    )
+
+
+SPK2IMG = spk2img_maker("auto")

@@ -14,10 +14,20 @@ from typing import Any
 import pytest
 import torch
 
-from spike4dgs.benchmark import doctor
-from spike4dgs.benchmark.doctor import BROKEN, MISSING, NOTE, OK, Finding, OtherRooms, examine, make_doctor, report
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.gpu import Missing
+from spike4dgs.benchmark.reports import doctor
+from spike4dgs.benchmark.reports.doctor import (
+    BROKEN,
+    MISSING,
+    NOTE,
+    OK,
+    Finding,
+    OtherRooms,
+    examine,
+    make_doctor,
+    report,
+)
 from spike4dgs.benchmark.weights import WeightsError
 
 LLVM = SimpleNamespace(name="llvm_ad_rgb", why_not_fast="", llvm=("/usr/lib/libLLVM.so.19.1", "/usr/lib/libLLVM-15.so"))
