@@ -14,45 +14,54 @@ from typing import Any
 
 from spike4dgs.baselines.descriptions import describe
 from spike4dgs.baselines.held_out_pose import PosedRecipe
-from spike4dgs.baselines.initialization.colmap import ColmapSettings, colmap, colmap_uncalibrated
-from spike4dgs.baselines.initialization.dust3r import dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.initialization.msdi import msdi, msdi_matched, msdi_uncalibrated
+from spike4dgs.baselines.initialization.colmap import (
+    ColmapSettings,
+    UncalibratedSettings,
+    colmap,
+    colmap_uncalibrated,
+)
+from spike4dgs.baselines.initialization.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
+from spike4dgs.baselines.initialization.msdi import (
+    MsdiMatchedSettings,
+    MsdiSettings,
+    MsdiUncalibratedSettings,
+    msdi,
+    msdi_matched,
+    msdi_uncalibrated,
+)
 from spike4dgs.baselines.initialization.rig import RigSettings, rig
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.initialization import Initialization, Start, StartRequest
+from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.radiance_field import RADIANCE_FIELD
+from spike4dgs.method.settings import S
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.tracking.fit import TRACKING
 
 
-def _seeded(start: Callable[[TrainingScene, int], Start]) -> Initialization:
-    """Return the entry of an initialisation without settings."""
-    return Initialization(lambda r: start(r.scene, r.seed))
+def _seeded(start: Callable[[TrainingScene, int, S], Start], settings: S) -> Initialization:
+    """Return the entry of an initialisation with a seed."""
+    return Initialization(lambda r: start(r.scene, r.seed, r.settings), settings)
 
 
-def _network(start: Callable[[TrainingScene, int, str], Start]) -> Initialization:
-    """Return the entry of an initialisation by a network, which runs on the fit's device."""
-    return Initialization(lambda r: start(r.scene, r.seed, r.device))
-
-
-def _colmap(r: StartRequest) -> Start:
-    return colmap(r.scene, r.seed, flat_field=r.settings.flat_field)
+def _network(start: Callable[[TrainingScene, int, S, str], Start], settings: S) -> Initialization:
+    """Return the entry of an initialisation with a seed, by a network, which runs on the fit's device."""
+    return Initialization(lambda r: start(r.scene, r.seed, r.settings, r.device), settings)
 
 
 INITIALIZATIONS = {
-    "rig": Initialization(lambda r: rig(r.scene, flat_field=r.settings.flat_field), RigSettings()),
-    "colmap": Initialization(_colmap, ColmapSettings()),
-    "colmap-uncalibrated": _seeded(colmap_uncalibrated),
-    "dust3r": _network(dust3r),
-    "dust3r-uncalibrated": _network(dust3r_uncalibrated),
-    "msdi": Initialization(lambda r: msdi(r.scene, r.device)),
-    "msdi-matched": _network(msdi_matched),
-    "msdi-uncalibrated": _network(msdi_uncalibrated),
+    "rig": Initialization(lambda r: rig(r.scene, r.settings), RigSettings()),
+    "colmap": _seeded(colmap, ColmapSettings()),
+    "colmap-uncalibrated": _seeded(colmap_uncalibrated, UncalibratedSettings()),
+    "dust3r": _network(dust3r, Dust3rSettings()),
+    "dust3r-uncalibrated": _network(dust3r_uncalibrated, Dust3rSettings()),
+    "msdi": Initialization(lambda r: msdi(r.scene, r.settings, r.device), MsdiSettings()),
+    "msdi-matched": _network(msdi_matched, MsdiMatchedSettings()),
+    "msdi-uncalibrated": _network(msdi_uncalibrated, MsdiUncalibratedSettings()),
 }
 PARTS = Parts(
     images=IMAGES,

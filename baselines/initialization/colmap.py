@@ -24,11 +24,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.initialization.features import MIN_ANGLE_DEG, NOTHING, Mapping, find_features, in_scene
-from spike4dgs.baselines.initialization.rig import rig, window_means
+from spike4dgs.baselines.initialization.features import NOTHING, FeatureSettings, Mapping, find_features, in_scene
+from spike4dgs.baselines.initialization.rig import PointSettings, RigSettings, rig, swept, window_means
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.initialization import Start
-from spike4dgs.method.settings import Settings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,36 +35,53 @@ if TYPE_CHECKING:
 Float32 = NDArray[np.float32]
 
 WHO = "COLMAP"
-MIN_POINTS = 100  # fewer are no start for Gaussians: they come from a plane sweep with the estimated cameras
 
 
 @dataclass(frozen=True)
-class ColmapSettings(Settings):
-    """Images of the views (prefix `initialization`)."""
+class MappingSettings(FeatureSettings, PointSettings):
+    """Numbers of both initialisations by COLMAP: features, and the plane sweep that replaces few points."""
 
-    flat_field: bool = False  # correct them by each camera's calibration, if known, and sweep planes for the points
+    min_points: int = 100  # fewer are no start for Gaussians: they come from a plane sweep with the estimated cameras
 
 
-def colmap(scene: TrainingScene, seed: int, *, flat_field: bool = False) -> Start:
+@dataclass(frozen=True)
+class ColmapSettings(MappingSettings, RigSettings):
+    """Numbers of `colmap` (prefix `initialization`).
+
+    With `flat_field` all points come from a plane sweep.
+    """
+
+
+@dataclass(frozen=True)
+class UncalibratedSettings(MappingSettings):
+    """Numbers of `colmap-uncalibrated` (prefix `initialization`)."""
+
+    focal_prior: float = 1.2  # image widths, COLMAP's own
+
+
+DEFAULTS, UNCALIBRATED = ColmapSettings(), UncalibratedSettings()
+
+
+def colmap(scene: TrainingScene, seed: int, settings: ColmapSettings = DEFAULTS) -> Start:
     """Return poses and points with the calibrated intrinsics; see the module.
 
     Raises UserError unless all training views are registered.
     """
-    if flat_field:
+    if settings.flat_field:
         images = window_means(scene, 0, scene.n_ticks, flat_field=True)
-        found = map_views(scene, images, seed, calibrated=True).of_all(scene, WHO)
-        return rig(replace(scene, cameras=found.cameras), flat_field=True)
-    return _start(scene, map_views(scene, clip_means(scene), seed, calibrated=True), seed)
+        found = map_views(scene, images, seed, settings).of_all(scene, WHO)
+        return rig(replace(scene, cameras=found.cameras), settings)
+    return _start(scene, map_views(scene, clip_means(scene), seed, settings), settings)
 
 
-def colmap_uncalibrated(scene: TrainingScene, seed: int) -> Start:
+def colmap_uncalibrated(scene: TrainingScene, seed: int, settings: UncalibratedSettings = UNCALIBRATED) -> Start:
     """Return the same, with intrinsics unknown."""
-    return _start(scene, map_views(scene, clip_means(scene), seed, calibrated=False), seed)
+    return _start(scene, map_views(scene, clip_means(scene), seed, settings, settings.focal_prior), settings)
 
 
-def _start(scene: TrainingScene, found: Mapping, seed: int) -> Start:
-    if len(found.of_all(scene, WHO).points) < MIN_POINTS:
-        return rig(replace(scene, cameras=found.cameras))
+def _start(scene: TrainingScene, found: Mapping, settings: MappingSettings) -> Start:
+    if len(found.of_all(scene, WHO).points) < settings.min_points:
+        return swept(replace(scene, cameras=found.cameras), settings, flat_field=False)
     return Start(found.cameras, found.points.astype(np.float32), found.values)
 
 
@@ -76,29 +92,38 @@ def clip_means(scene: TrainingScene) -> Float32:
     return counts / np.float32(ticks * scene.radiance_gain)
 
 
-def map_views(scene: TrainingScene, images: Float32, seed: int, *, calibrated: bool) -> Mapping:
+def map_views(
+    scene: TrainingScene,
+    images: Float32,
+    seed: int,
+    settings: FeatureSettings = DEFAULTS,
+    focal_prior: float | None = None,
+) -> Mapping:
     """Return the structure from motion on one image of each training view [C, H, W], linear radiance.
 
+    Intrinsics are the calibrated ones; with `focal_prior`, in image widths, they are unknown and one is estimated.
     The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
     nothing can be aligned and the mapping is empty.
     """
     import pycolmap
 
-    with find_features(scene.cameras, images, seed, calibrated=calibrated) as found:
-        models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", _options(seed, calibrated))
+    with find_features(scene.cameras, images, seed, settings, focal_prior) as found:
+        options = _options(seed, settings.min_angle_deg, refine_focal=focal_prior is not None)
+        models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", options)
         if not models:
             return NOTHING
-        return in_scene(max(models.values(), key=lambda m: m.num_reg_images()), scene.cameras, found.names, images)
+        largest = max(models.values(), key=lambda m: m.num_reg_images())
+        return in_scene(largest, scene.cameras, found.names, images, settings.enlarge)
 
 
-def _options(seed: int, calibrated: bool) -> pycolmap.GlobalPipelineOptions:
+def _options(seed: int, min_angle_deg: float, *, refine_focal: bool) -> pycolmap.GlobalPipelineOptions:
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
     options.mapper.num_threads, options.mapper.random_seed = 1, seed
-    options.mapper.min_tri_angle_deg = MIN_ANGLE_DEG
-    options.mapper.retriangulation.min_angle = MIN_ANGLE_DEG
-    options.mapper.bundle_adjustment.refine_focal_length = not calibrated
+    options.mapper.min_tri_angle_deg = min_angle_deg
+    options.mapper.retriangulation.min_angle = min_angle_deg
+    options.mapper.bundle_adjustment.refine_focal_length = refine_focal
     options.mapper.bundle_adjustment.refine_extra_params = False
     return options

@@ -32,6 +32,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import NamedWeights, find_weights
 from spike4dgs.method.initialization import Start
 from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
+from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -42,10 +43,19 @@ WEIGHTS = NamedWeights(
     variable="SPIKE4DGS_DUST3R",
     fix="get the file and set SPIKE4DGS_DUST3R to its path",
 )
-LONG_SIDE = 512  # px, the size that the weights were trained at
-RANSAC_PX = 5.0  # of the network's image
-LEAST_CONFIDENCE = 0.5  # quantile below which points of a view are left out
-MAX_POINTS = 10_000  # first Gaussians: about 0.4 per pixel of a view of 200x125
+
+
+@dataclass(frozen=True)
+class Dust3rSettings(Settings):
+    """Numbers of `dust3r` and `dust3r-uncalibrated` (prefix `initialization`)."""
+
+    long_side_px: int = 512  # the size that the weights were trained at
+    ransac_px: float = 5.0  # of the network's image
+    least_confidence: float = 0.5  # quantile below which points of a view are left out
+    max_points: int = 10_000  # first Gaussians: about 0.4 per pixel of a view of 200x125
+
+
+DEFAULTS = Dust3rSettings()
 
 
 def weights_path() -> Path:
@@ -64,40 +74,50 @@ class Pair:
 Predict = Callable[[int], Pair]  # of view 0 beside view i
 
 
-def dust3r(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
+def dust3r(scene: TrainingScene, seed: int, settings: Dust3rSettings = DEFAULTS, device: str = "auto") -> Start:
     """Return poses and points with the calibrated intrinsics; see the module.
 
     Raises WeightsError where the weights are absent, UserError where they are others or a view gets no pose.
     """
-    return estimate(scene, clip_means(scene), seed, device, calibrated=True)
+    return estimate(scene, clip_means(scene), seed, settings, device, calibrated=True)
 
 
-def dust3r_uncalibrated(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
+def dust3r_uncalibrated(
+    scene: TrainingScene, seed: int, settings: Dust3rSettings = DEFAULTS, device: str = "auto"
+) -> Start:
     """Return the same, with intrinsics unknown."""
-    return estimate(scene, clip_means(scene), seed, device, calibrated=False)
+    return estimate(scene, clip_means(scene), seed, settings, device, calibrated=False)
 
 
-def estimate(scene: TrainingScene, images: Float32, seed: int, device: str = "auto", *, calibrated: bool) -> Start:
+def estimate(
+    scene: TrainingScene,
+    images: Float32,
+    seed: int,
+    settings: Dust3rSettings = DEFAULTS,
+    device: str = "auto",
+    *,
+    calibrated: bool,
+) -> Start:
     """Return poses and points from one image of each training view [C, H, W], linear radiance; raises as `dust3r`."""
     network = load_dust3r(weights_path())
-    views = [resized(camera, network.shape.patch) for camera in scene.cameras]
-    shown = np.stack([_resize(p, v) for p, v in zip(images, views, strict=True)])
+    views = [resized(camera, network.shape.patch, settings.long_side_px) for camera in scene.cameras]
+    shown = np.stack([_resize(p, v, settings.long_side_px) for p, v in zip(images, views, strict=True)])
     predict = predictor(network, shown, choose_device(device, rasterizes=False))
-    return solve(predict, views, shown, scene, seed, calibrated=calibrated)
+    return solve(predict, views, shown, scene, seed, settings, calibrated=calibrated)
 
 
-def resized(camera: Camera, patch: int) -> Camera:
-    """Return the view at the network's size: `LONG_SIDE` px the long way, cut to whole patches about the middle."""
-    scale = LONG_SIDE / max(camera.width, camera.height)
+def resized(camera: Camera, patch: int, long_side_px: int) -> Camera:
+    """Return the view at the network's size: `long_side_px` the long way, cut to whole patches about the middle."""
+    scale = long_side_px / max(camera.width, camera.height)
     width, height = (int(n * scale + 1e-9) // patch * patch for n in (camera.width, camera.height))
     cx = camera.cx * scale - (camera.width * scale - width) / 2
     cy = camera.cy * scale - (camera.height * scale - height) / 2
     return replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale, cx=cx, cy=cy)
 
 
-def _resize(image: Float32, view: Camera) -> Float32:
+def _resize(image: Float32, view: Camera, long_side_px: int) -> Float32:
     """Return linear radiance [H, W] as sRGB-encoded gray in [0, 1] at the network's size [h, w]."""
-    scale = LONG_SIDE / max(image.shape)
+    scale = long_side_px / max(image.shape)
     left, top = ((n * scale - m) / 2 for n, m in zip(image.shape[::-1], (view.width, view.height), strict=True))
     # From pixel indices of the result to those of the image; the centre of pixel i lies at i + 0.5.
     back = np.array([[1 / scale, 0, (left + 0.5) / scale - 0.5], [0, 1 / scale, (top + 0.5) / scale - 0.5]])
@@ -124,7 +144,14 @@ def predictor(network: Dust3r, shown: Float32, device: str = "cpu") -> Predict:
 
 
 def solve(
-    predict: Predict, views: Sequence[Camera], shown: Float32, scene: TrainingScene, seed: int, *, calibrated: bool
+    predict: Predict,
+    views: Sequence[Camera],
+    shown: Float32,
+    scene: TrainingScene,
+    seed: int,
+    settings: Dust3rSettings = DEFAULTS,
+    *,
+    calibrated: bool,
 ) -> Start:
     """Return cameras and points from the network's answers; `views` are the training cameras at the size of `shown`.
 
@@ -132,7 +159,7 @@ def solve(
     """
     pairs = [predict(i) for i in range(1, len(views))]
     confidence = np.mean([p.confidence[0] for p in pairs], axis=0)
-    sure = confidence >= np.quantile(confidence, LEAST_CONFIDENCE)
+    sure = confidence >= np.quantile(confidence, settings.least_confidence)
     first = pairs[0].points[0]
     scales = [_scale(first[sure], p.points[0][sure]) for p in pairs]
     shared = np.median([s * p.points[0] for s, p in zip(scales, pairs, strict=True)], axis=0)
@@ -145,18 +172,18 @@ def solve(
     known = [v if focal is None else replace(v, fx=focal, fy=focal, cx=v.width / 2, cy=v.height / 2) for v in views]
     posed, clouds = [replace(known[0], R=np.eye(3), t=np.zeros(3))], [(shared[sure], shown[0][sure])]
     for view, pair, scale, image in zip(known[1:], pairs, scales, shown[1:], strict=True):
-        chosen = pair.confidence[1] >= np.quantile(pair.confidence[1], LEAST_CONFIDENCE)
+        chosen = pair.confidence[1] >= np.quantile(pair.confidence[1], settings.least_confidence)
         points = scale * pair.points[1][chosen]
-        pose = solve_pose(points, _pixels(chosen), view.K, seed, reach_px=RANSAC_PX)
+        pose = solve_pose(points, _pixels(chosen), view.K, seed, reach_px=settings.ransac_px)
         if pose is None:
             fix = "use rig or colmap"
             raise problem(f"DUSt3R on {scene.id}", f"a pose for {view.id}", "no consistent points", fix)
         posed.append(replace(view, R=pose[0], t=pose[1]))
         clouds.append((points, image[chosen]))
-    cameras = [_at_size(p, c) for p, c in zip(posed, scene.cameras, strict=True)]
+    cameras = [_at_size(p, c, settings.long_side_px) for p, c in zip(posed, scene.cameras, strict=True)]
     move = align_cameras(cameras, scene.cameras)
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
-    few = np.random.default_rng(seed).permutation(len(points))[:MAX_POINTS]
+    few = np.random.default_rng(seed).permutation(len(points))[: settings.max_points]
     linear = np.asarray(_decode_srgb(values[few]), np.float32)
     return Start(tuple(move.camera(c) for c in cameras), move(points[few]).astype(np.float32), linear)
 
@@ -172,9 +199,9 @@ def _pixels(mask: NDArray[np.bool_]) -> Float64:
     return np.stack([u + 0.5, v + 0.5], axis=-1)
 
 
-def _at_size(view: Camera, camera: Camera) -> Camera:
+def _at_size(view: Camera, camera: Camera, long_side_px: int) -> Camera:
     """Return a posed view with the size of the scene's camera."""
-    scale = max(camera.width, camera.height) / LONG_SIDE
+    scale = max(camera.width, camera.height) / long_side_px
     cx = view.cx * scale + (camera.width - view.width * scale) / 2
     cy = view.cy * scale + (camera.height - view.height * scale) / 2
     return replace(camera, fx=view.fx * scale, fy=view.fy * scale, cx=cx, cy=cy, R=view.R, t=view.t)

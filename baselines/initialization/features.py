@@ -22,17 +22,22 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.settings import Settings
 
 if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
     import pycolmap
 
 Float32 = NDArray[np.float32]
 
-ENLARGE = 2  # of images 200 px wide; at their own size SIFT finds about 400 features a view, at twice it 2,700
-PEAK_THRESHOLD = 0.002  # of SIFT's contrast, a third of COLMAP's: gray images of dim scenes are soft
-PAIR_ERROR_PX = 2.0  # of a match in an enlarged image to its epipolar line
-MIN_ANGLE_DEG = 0.5  # between a point's rays: the array is narrow
-FOCAL_PRIOR = 1.2  # image widths, COLMAP's own
+
+@dataclass(frozen=True)
+class FeatureSettings(Settings):
+    """Numbers of features, matches and triangulation (prefix `initialization`)."""
+
+    enlarge: int = 2  # of images 200 px wide; at their own size SIFT finds about 400 features a view, at twice it 2,700
+    peak_threshold: float = 0.002  # of SIFT's contrast, a third of COLMAP's: gray images of dim scenes are soft
+    pair_error_px: float = 2.0  # of a match in an enlarged image to its epipolar line
+    min_angle_deg: float = 0.5  # between a point's rays: the array is narrow
 
 
 @dataclass(frozen=True)
@@ -65,45 +70,50 @@ NOTHING = Mapping((), np.zeros((0, 3)), np.zeros(0, np.float32))
 
 
 @contextmanager
-def find_features(cameras: Sequence[Camera], images: Float32, seed: int, *, calibrated: bool) -> Iterator[Features]:
+def find_features(
+    cameras: Sequence[Camera], images: Float32, seed: int, settings: FeatureSettings, focal_prior: float | None = None
+) -> Iterator[Features]:
     """Yield features and matches of images [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
 
-    All views share one camera: the calibrated one, or one whose focal length is a guess.
+    All views share one camera: the calibrated one, or one whose focal length is a guess, `focal_prior` image widths.
     """
     import pycolmap
 
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
-        names = _write_images(Path(folder), cameras, images)
+        names = _write_images(Path(folder), cameras, images, settings.enlarge)
         database = Path(folder) / "database.db"
         pycolmap.set_random_seed(seed)
-        _match(database, Path(folder), cameras[0], seed, calibrated)
+        _match(database, Path(folder), cameras[0], seed, settings, focal_prior)
         yield Features(Path(folder), database, tuple(names))
 
 
-def _write_images(folder: Path, cameras: Sequence[Camera], images: Float32) -> list[str]:
+def _write_images(folder: Path, cameras: Sequence[Camera], images: Float32, enlarge: int) -> list[str]:
     names = [f"{camera.id}.png" for camera in cameras]
     for name, image in zip(names, images, strict=True):
-        larger = cv2.resize(encode_srgb(image), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
+        larger = cv2.resize(encode_srgb(image), None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
         write_png(folder / name, np.asarray(larger, np.uint8))
     return names
 
 
-def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: bool) -> None:
+def _match(
+    database: Path, folder: Path, camera: Camera, seed: int, settings: FeatureSettings, focal_prior: float | None
+) -> None:
     """Write features and matches of all pairs into the database; all views share one camera."""
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
-    size = (camera.width * ENLARGE / 2, camera.height * ENLARGE / 2)
-    if calibrated:
+    enlarge = settings.enlarge
+    size = (camera.width * enlarge / 2, camera.height * enlarge / 2)
+    if focal_prior is None:
         reader.camera_model = "PINHOLE"
         intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
-        reader.camera_params = ",".join(repr(float(x) * ENLARGE) for x in intrinsics)
+        reader.camera_params = ",".join(repr(float(x) * enlarge) for x in intrinsics)
     else:
         reader.camera_model = "SIMPLE_PINHOLE"
-        reader.camera_params = f"{FOCAL_PRIOR * camera.width * ENLARGE},{size[0]},{size[1]}"
+        reader.camera_params = f"{focal_prior * camera.width * enlarge},{size[0]},{size[1]}"
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
-    extraction.sift.peak_threshold = PEAK_THRESHOLD
+    extraction.sift.peak_threshold = settings.peak_threshold
     cpu = pycolmap.Device.cpu
     pycolmap.extract_features(
         database,
@@ -116,12 +126,12 @@ def _match(database: Path, folder: Path, camera: Camera, seed: int, calibrated: 
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = 1
     verification.ransac.random_seed = seed
-    verification.ransac.max_error = PAIR_ERROR_PX
+    verification.ransac.max_error = settings.pair_error_px
     pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification, device=cpu)
 
 
 def in_scene(
-    model: pycolmap.Reconstruction, cameras: Sequence[Camera], names: Sequence[str], images: Float32
+    model: pycolmap.Reconstruction, cameras: Sequence[Camera], names: Sequence[str], images: Float32, enlarge: int
 ) -> Mapping:
     """Return the model's views and points, moved by the similarity that fits its views to the calibrated ones.
 
@@ -132,7 +142,7 @@ def in_scene(
     found = [k for k, name in enumerate(names) if name in posed]
     if len(found) < 2:
         return NOTHING
-    K = camera.calibration_matrix() / ENLARGE
+    K = camera.calibration_matrix() / enlarge
     estimated = [_camera(posed[names[k]], K, cameras[k]) for k in found]
     move = align_cameras(estimated, [cameras[k] for k in found])
     view = {posed[names[k]].image_id: k for k in found}
@@ -140,7 +150,7 @@ def in_scene(
     for point in model.points3D.values():
         points.append(point.xyz)
         seen = [(view[e.image_id], model.images[e.image_id].points2D[e.point2D_idx].xy) for e in point.track.elements]
-        values.append(np.mean([_at(images[k], xy / ENLARGE) for k, xy in seen]))
+        values.append(np.mean([_at(images[k], xy / enlarge) for k, xy in seen]))
     return Mapping(
         tuple(move.camera(c) for c in estimated),
         move(np.asarray(points, np.float64).reshape(-1, 3)),

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.initialization.features import (
-    ENLARGE,
-    MIN_ANGLE_DEG,
     NOTHING,
     Features,
+    FeatureSettings,
     Mapping,
     find_features,
     in_scene,
@@ -37,19 +36,29 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Pose = tuple[Float64, Float64]  # world to camera, R [3, 3] and t [3]
 
-GUESS_PX = 2.0  # of a guessed point to its feature, at the sensor's own size
-RESECT_PX = 1.0  # of a triangulated one
+
+@dataclass(frozen=True)
+class MatchSettings(FeatureSettings):
+    """Numbers of poses by matches (prefix `initialization`)."""
+
+    guess_px: float = 2.0  # of a guessed point to its feature, at the sensor's own size
+    resect_px: float = 1.0  # of a triangulated one
+    rough_error_px: float = 16.0  # of an observation of a point, in enlarged pixels, while poses are rough
+    rough_angle_deg: float = 4.0  # of its ray
+
+
+DEFAULTS = MatchSettings()
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The reach of an observation of a point, in enlarged pixels and degrees of its ray; COLMAP's own are 4 and 2."""
+    """The reach of an observation of a point, in enlarged pixels and degrees of its ray."""
 
     error_px: float
     angle_deg: float
 
 
-ROUGH, FINE = Tolerance(16.0, 4.0), Tolerance(4.0, 2.0)
+FINE = Tolerance(4.0, 2.0)  # COLMAP's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,30 +75,35 @@ class Seen:
         return (both[0], both[1]) if i < j else (both[1], both[0])
 
 
-def bundle(scene: TrainingScene, guess: Float64, factor: int, images: Float32, seed: int) -> Mapping:
+def bundle(
+    scene: TrainingScene, guess: Float64, factor: int, images: Float32, seed: int, settings: MatchSettings = DEFAULTS
+) -> Mapping:
     """Return poses of the training cameras, whose intrinsics are taken as given, and the points that they match.
 
     guess: [h, w, 3] points of the pixels of view 0, in view 0's frame, at any scale, NaN where unknown; a pixel is a
     block of `factor` x `factor` of the camera's. images: [C, H, W] linear radiance. The same seed gives the same
     poses. A view without a pose is left out.
     """
-    with find_features(scene.cameras, images, seed, calibrated=True) as found:
-        seen = _read(found)
+    with find_features(scene.cameras, images, seed, settings) as found:
+        seen = _read(found, settings.enlarge)
         intrinsics = [camera.K for camera in scene.cameras]
-        model = _adjust(found, seen, _first_poses(seen, guess, factor, intrinsics, seed), ROUGH)
+        first = _first_poses(seen, guess, factor, intrinsics, seed, settings.guess_px)
+        rough = Tolerance(settings.rough_error_px, settings.rough_angle_deg)
+        model = _adjust(found, seen, first, rough, settings.min_angle_deg)
         if model is None:
             return NOTHING
-        model = _adjust(found, seen, _poses_again(model, seen, intrinsics, seed), FINE)
-        return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images)
+        again = _poses_again(model, seen, intrinsics, seed, settings.resect_px)
+        model = _adjust(found, seen, again, FINE, settings.min_angle_deg)
+        return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images, settings.enlarge)
 
 
-def _read(found: Features) -> Seen:
+def _read(found: Features, enlarge: int) -> Seen:
     import pycolmap
 
     with pycolmap.Database.open(found.database) as database:
         number = {image.name: image.image_id for image in database.read_all_images()}
         ids = tuple(number[name] for name in found.names)
-        pixels = tuple(np.asarray(database.read_keypoints(i), np.float64)[:, :2] / ENLARGE for i in ids)
+        pixels = tuple(np.asarray(database.read_keypoints(i), np.float64)[:, :2] / enlarge for i in ids)
         same = {
             (i, j): np.asarray(database.read_two_view_geometry(ids[i], ids[j]).inlier_matches, np.int64).reshape(-1, 2)
             for i, j in combinations(range(len(ids)), 2)
@@ -98,7 +112,7 @@ def _read(found: Features) -> Seen:
 
 
 def _first_poses(
-    seen: Seen, guess: Float64, factor: int, intrinsics: Sequence[Float64], seed: int
+    seen: Seen, guess: Float64, factor: int, intrinsics: Sequence[Float64], seed: int, reach_px: float
 ) -> list[Pose | None]:
     """Return view 0's pose, the identity, and the others' by PnP on the guessed points of its features."""
     u, v = np.floor(seen.pixels[0] / factor).astype(np.int64).T
@@ -106,12 +120,12 @@ def _first_poses(
     poses: list[Pose | None] = [(np.eye(3), np.zeros(3))]
     for view in range(1, len(seen.ids)):
         first, other = seen.partners(0, view)
-        poses.append(_solve(points[first], seen.pixels[view][other], intrinsics[view], GUESS_PX, seed))
+        poses.append(_solve(points[first], seen.pixels[view][other], intrinsics[view], reach_px, seed))
     return poses
 
 
 def _poses_again(
-    model: pycolmap.Reconstruction, seen: Seen, intrinsics: Sequence[Float64], seed: int
+    model: pycolmap.Reconstruction, seen: Seen, intrinsics: Sequence[Float64], seed: int, reach_px: float
 ) -> list[Pose | None]:
     """Return each view's pose by the points of features that it has in common with the views of the model."""
     at = [_points_of(model, image, len(pixels)) for image, pixels in zip(seen.ids, seen.pixels, strict=True)]
@@ -122,7 +136,7 @@ def _poses_again(
             mine, theirs = seen.partners(view, other)
             points.append(at[other][theirs])
             pixels.append(seen.pixels[view][mine])
-        poses.append(_solve(np.concatenate(points), np.concatenate(pixels), intrinsics[view], RESECT_PX, seed))
+        poses.append(_solve(np.concatenate(points), np.concatenate(pixels), intrinsics[view], reach_px, seed))
     return poses
 
 
@@ -144,7 +158,7 @@ def _points_of(model: pycolmap.Reconstruction, image: int, count: int) -> Float6
 
 
 def _adjust(
-    found: Features, seen: Seen, poses: Sequence[Pose | None], tolerance: Tolerance
+    found: Features, seen: Seen, poses: Sequence[Pose | None], tolerance: Tolerance, min_angle_deg: float
 ) -> pycolmap.Reconstruction | None:
     """Return points triangulated from the views that have poses, then both adjusted; None for fewer than two views."""
     import pycolmap
@@ -160,7 +174,7 @@ def _adjust(
         view = pycolmap.Image(image_id=image, camera_id=camera.camera_id, name=name)
         model.add_image_with_trivial_frame(view, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
     model = pycolmap.triangulate_points(
-        model, found.database, found.folder, found.folder, options=_triangulation(tolerance)
+        model, found.database, found.folder, found.folder, options=_triangulation(tolerance, min_angle_deg)
     )
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = options.print_summary = False
@@ -174,13 +188,13 @@ def _adjust(
     return model
 
 
-def _triangulation(tolerance: Tolerance) -> pycolmap.IncrementalPipelineOptions:
+def _triangulation(tolerance: Tolerance, min_angle_deg: float) -> pycolmap.IncrementalPipelineOptions:
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.mapper.filter_max_reproj_error = tolerance.error_px
-    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = MIN_ANGLE_DEG
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = min_angle_deg
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.create_max_angle_error = tolerance.angle_deg
     options.triangulation.continue_max_angle_error = tolerance.angle_deg

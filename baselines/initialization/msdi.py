@@ -28,8 +28,17 @@ from scipy.spatial import cKDTree
 from torch.nn import functional
 
 from spike4dgs.baselines.initialization.features import Mapping
-from spike4dgs.baselines.initialization.matched_poses import bundle
-from spike4dgs.baselines.initialization.rig import HOLE_PX, Cloud, fill, filled, matched, thin, window_means
+from spike4dgs.baselines.initialization.matched_poses import MatchSettings, bundle
+from spike4dgs.baselines.initialization.rig import (
+    Cloud,
+    CloudSettings,
+    PointSettings,
+    fill,
+    filled,
+    matched,
+    thin,
+    window_means,
+)
 from spike4dgs.baselines.spike_to_image.windows import window
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
@@ -42,15 +51,40 @@ from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
 from spike4dgs.method.msdi.shrink import shrink
 from spike4dgs.method.msdi.weights import load_network, weights_path
+from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-TRAINED_PX = 104  # longer side of the training images
-LEAST_CONFIDENCE = 0.3  # quantile of a view's confidence below which its points are left out
-LEAST_MATCHES = 50  # for a line through inverse depths
-LINE_ROUNDS = 10
-FARTHEST = 2.0  # times the farthest match
+
+@dataclass(frozen=True)
+class EstimateSettings(Settings):
+    """Numbers of the network's estimate (prefix `initialization`)."""
+
+    trained_px: int = 104  # longer side of the training images
+    least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
+
+
+@dataclass(frozen=True)
+class MsdiSettings(EstimateSettings, PointSettings):
+    """Numbers of `msdi` (prefix `initialization`)."""
+
+    least_matches: int = 50  # for a line through inverse depths
+    line_rounds: int = 10  # of least squares until it no longer moves
+    farthest: float = 2.0  # times the farthest match: beyond it the line is no longer known
+
+
+@dataclass(frozen=True)
+class MsdiMatchedSettings(MsdiSettings, MatchSettings):
+    """Numbers of `msdi-matched` (prefix `initialization`)."""
+
+
+@dataclass(frozen=True)
+class MsdiUncalibratedSettings(EstimateSettings, CloudSettings):
+    """Numbers of `msdi-uncalibrated` (prefix `initialization`)."""
+
+
+DEFAULTS, MATCHED, UNCALIBRATED = MsdiSettings(), MsdiMatchedSettings(), MsdiUncalibratedSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,54 +97,61 @@ class Estimate:
     points: Float64  # [V, h, w, 3] in view 0's frame, at any scale
     confidence: Float64  # [V, h, w]
 
-    @property
-    def sure(self) -> NDArray[np.bool_]:
-        """Pixels [V, h, w] whose points are used."""
-        least = np.quantile(self.confidence, LEAST_CONFIDENCE, axis=(1, 2), keepdims=True)
+    def sure(self, settings: EstimateSettings) -> NDArray[np.bool_]:
+        """Return the pixels [V, h, w] whose points are used."""
+        least = np.quantile(self.confidence, settings.least_confidence, axis=(1, 2), keepdims=True)
         return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
 
 
-def msdi(scene: TrainingScene, device: str = "auto") -> Start:
+def msdi(scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = "auto") -> Start:
     """Return points at the calibrated poses; see the module.
 
     Raises WeightsError where there are no weights, UserError where all cameras have one centre.
     """
-    return _given(scene, infer(scene, device, calibrated=True))
+    return _given(scene, infer(scene, settings, device, calibrated=True), settings)
 
 
-def _given(scene: TrainingScene, estimate: Estimate) -> Start:
-    cloud, mean = matched(scene, flat_field=True)
-    return filled(scene, completed(cloud, estimate), mean)
+def _given(scene: TrainingScene, estimate: Estimate, settings: MsdiSettings) -> Start:
+    cloud, mean = matched(scene, settings, flat_field=True)
+    return filled(scene, completed(cloud, estimate, settings), mean, settings)
 
 
-def msdi_matched(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
+def msdi_matched(
+    scene: TrainingScene, seed: int, settings: MsdiMatchedSettings = MATCHED, device: str = "auto"
+) -> Start:
     """Return poses by the network's points of view 0 and by matches, and points; raises as `matched_poses` too."""
-    estimate = infer(scene, device, calibrated=True)
-    cameras = matched_poses(scene, estimate, seed).cameras
+    estimate = infer(scene, settings, device, calibrated=True)
+    cameras = matched_poses(scene, estimate, seed, settings).cameras
     small = tuple(shrunk(camera, estimate.factor) for camera in cameras)
-    return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small))
+    return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small), settings)
 
 
-def matched_poses(scene: TrainingScene, estimate: Estimate, seed: int) -> Mapping:
+def matched_poses(
+    scene: TrainingScene, estimate: Estimate, seed: int, settings: MsdiMatchedSettings = MATCHED
+) -> Mapping:
     """Return the training cameras, whose intrinsics are known, and the points that they match.
 
     Raises UserError unless all have poses.
     """
-    guess = np.where(estimate.sure[0][..., None], estimate.points[0], np.nan)
+    guess = np.where(estimate.sure(settings)[0][..., None], estimate.points[0], np.nan)
     images = window_means(scene, 0, scene.n_ticks, flat_field=True)
-    return bundle(scene, guess, estimate.factor, images, seed).of_all(scene, "MSDI")
+    return bundle(scene, guess, estimate.factor, images, seed, settings).of_all(scene, "MSDI")
 
 
-def msdi_uncalibrated(scene: TrainingScene, seed: int, device: str = "auto") -> Start:
+def msdi_uncalibrated(
+    scene: TrainingScene, seed: int, settings: MsdiUncalibratedSettings = UNCALIBRATED, device: str = "auto"
+) -> Start:
     """Return poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, infer(scene, device, calibrated=False), seed, calibrated=False)
+    return unposed(scene, infer(scene, settings, device, calibrated=False), seed, settings, calibrated=False)
 
 
-def infer(scene: TrainingScene, device: str = "auto", *, calibrated: bool) -> Estimate:
+def infer(
+    scene: TrainingScene, settings: EstimateSettings = DEFAULTS, device: str = "auto", *, calibrated: bool
+) -> Estimate:
     """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
     device = choose_device(device, rasterizes=False)
     network = load_network(weights_path(), device)
-    factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / TRAINED_PX))
+    factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / settings.trained_px))
     spikes = np.stack([window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams])
     small = shrink(torch.from_numpy(spikes), factor)[None]
     cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)
@@ -143,49 +184,57 @@ def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -
     return Sensors(small([c.gain for c in calibrations]), small([c.dark for c in calibrations]))
 
 
-def completed(cloud: Cloud, estimate: Estimate) -> Cloud:
+def completed(cloud: Cloud, estimate: Estimate, settings: MsdiSettings = DEFAULTS) -> Cloud:
     """Return the matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
-    camera, depth, sure = estimate.cameras[0], estimate.points[0, :, :, 2], estimate.sure[0]
+    camera, depth, sure = estimate.cameras[0], estimate.points[0, :, :, 2], estimate.sure(settings)[0]
     uv, z = camera.project(cloud.points)
     uv, z = uv[z > 0], z[z > 0]
-    line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z)
+    line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z, settings)
     if line is None:
         return cloud
     v, u = np.nonzero(sure & (depth > 0))
     at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
-    hole = (cKDTree(uv).query(at)[0] > HOLE_PX / estimate.factor) & (inverse * z.max() * FARTHEST > 1)
+    empty = cKDTree(uv).query(at)[0] > settings.hole_px / estimate.factor
+    hole = empty & (inverse * z.max() * settings.farthest > 1)
     points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
     return Cloud(points, np.concatenate([cloud.values, estimate.images[0, v[hole], u[hole]]]))
 
 
-def inverse_depth_line(depth: Float64, uv: Float64, z: Float64) -> Float64 | None:
+def inverse_depth_line(depth: Float64, uv: Float64, z: Float64, settings: MsdiSettings = DEFAULTS) -> Float64 | None:
     """Return (a, b) of the line a / depth + b that is closest to the inverse depths 1 / z of points at pixels uv.
 
     The sum of the absolute differences is made smallest, by least squares that the last residuals weigh. `depth` [h, w]
-    is NaN where nothing is known. None for fewer than `LEAST_MATCHES` points, or where the line does not rise.
+    is NaN where nothing is known. None for fewer than `least_matches` points, or where the line does not rise.
     """
     inside = (uv >= 0).all(axis=1) & (uv < depth.shape[::-1]).all(axis=1)
     u, v = uv[inside].astype(np.int64).T
     known = depth[v, u] > 0
-    if known.sum() < LEAST_MATCHES:
+    if known.sum() < settings.least_matches:
         return None
     x, y = 1 / depth[v, u][known], 1 / z[inside][known]
     if np.ptp(x) == 0:
         return None
     weights, line = np.ones(len(x)), np.zeros(2)
-    for _ in range(LINE_ROUNDS):
+    for _ in range(settings.line_rounds):
         line = np.polyfit(x, y, 1, w=np.sqrt(weights))
         weights = 1 / np.maximum(np.abs(np.polyval(line, x) - y), 1e-6 * y.mean())
     return line if line[0] > 0 else None
 
 
-def unposed(scene: TrainingScene, estimate: Estimate, seed: int, *, calibrated: bool) -> Start:
+def unposed(
+    scene: TrainingScene,
+    estimate: Estimate,
+    seed: int,
+    settings: MsdiUncalibratedSettings = UNCALIBRATED,
+    *,
+    calibrated: bool,
+) -> Start:
     """Return poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
 
     Raises UserError where a view has no pose.
     """
     first, f = scene.cameras[0], estimate.factor
-    cameras = list(scene.cameras) if calibrated else _one_focal(scene, estimate)
+    cameras = list(scene.cameras) if calibrated else _one_focal(scene, estimate, settings)
     K = np.stack([shrunk(camera, f).K for camera in cameras])
     poses = solve_poses(estimate.points, estimate.confidence, K, seed)
     if bad := [f"{c.id} ({p.reason})" for c, p in zip(estimate.cameras, poses, strict=True) if not p.found]:
@@ -195,17 +244,18 @@ def unposed(scene: TrainingScene, estimate: Estimate, seed: int, *, calibrated: 
     posed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
     move = align_cameras(posed, scene.cameras)
     moved = tuple(move.camera(c) for c in posed)
-    cloud = thin(moved, Cloud(move(estimate.points[estimate.sure]), estimate.images[estimate.sure]))
+    sure = estimate.sure(settings)
+    cloud = thin(moved, Cloud(move(estimate.points[sure]), estimate.images[sure]), settings)
     images = estimate.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
-    cloud = fill(moved, images, cloud)
+    cloud = fill(moved, images, cloud, settings)
     return Start(moved, cloud.points.astype(np.float32), cloud.values)
 
 
-def _one_focal(scene: TrainingScene, estimate: Estimate) -> list[Camera]:
+def _one_focal(scene: TrainingScene, estimate: Estimate, settings: EstimateSettings) -> list[Camera]:
     """Return the cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
     first, f = scene.cameras[0], estimate.factor
     middle = first.width / 2, first.height / 2
-    v, u = np.nonzero(estimate.sure[0])
+    v, u = np.nonzero(estimate.sure(settings)[0])
     offsets = np.stack([u + 0.5, v + 0.5], axis=-1) - np.divide(middle, f)
     focal = focal_from_points(estimate.points[0, v, u], offsets)
     if focal is None:

@@ -15,18 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WINDOW = 5  # px, side of the correlation window: small enough for thin things at 125x200
-NOISE = 4e-4  # variance of an image's noise, about (0.02 of white)^2: it keeps flat regions from matching by chance
-PARALLAX_STEP = 1.0  # px of parallax of the widest pair between planes; peaks are refined below it
-MAX_PARALLAX = 0.6  # of the image's width, of the widest pair: nearer things are seen by too few views to match
-MIN_SCORE = 0.4  # mean correlation over the other views below which a depth is not believed
-AGREE_PX = 1.5  # px of parallax between two views' depths of one point that still counts as agreement
-MIN_AGREE = 2  # other views that must agree
+
+@dataclass(frozen=True)
+class SweepSettings(Settings):
+    """Numbers of the plane sweep (prefix `initialization`)."""
+
+    window_px: int = 5  # side of the correlation window: small enough for thin things at 125x200
+    noise: float = 4e-4  # variance of an image's noise, about (0.02 of white)^2: else flat regions match by chance
+    parallax_step_px: float = 1.0  # of the widest pair between planes; peaks are refined below it
+    max_parallax: float = 0.6  # of the image's width, of the widest pair: nearer things are in too few views to match
+    min_score: float = 0.4  # mean correlation over the other views below which a depth is not believed
+    agree_px: float = 1.5  # parallax between two views' depths of one point that still counts as agreement
+    min_agree: int = 2  # other views that must agree
+
+
+DEFAULTS = SweepSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,28 +52,28 @@ def widest_baseline(cameras: Sequence[Camera]) -> float:
     return float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
 
 
-def inverse_depth_step(cameras: Sequence[Camera]) -> float:
-    """Return the difference of inverse depth, 1/m, that shifts a point by `PARALLAX_STEP` px in the widest pair."""
-    return PARALLAX_STEP / (cameras[0].fx * widest_baseline(cameras))
+def inverse_depth_step(cameras: Sequence[Camera], parallax_px: float = 1.0) -> float:
+    """Return the difference of inverse depth, 1/m, that shifts a point by so many px in the widest pair."""
+    return parallax_px / (cameras[0].fx * widest_baseline(cameras))
 
 
-def full_range(cameras: Sequence[Camera]) -> Float64:
-    """Return the inverse depths to sweep where nothing is known: from infinity to `MAX_PARALLAX`."""
-    step = inverse_depth_step(cameras)
-    planes = int(MAX_PARALLAX * cameras[0].width / PARALLAX_STEP)
+def full_range(cameras: Sequence[Camera], settings: SweepSettings = DEFAULTS) -> Float64:
+    """Return the inverse depths to sweep where nothing is known: from infinity to `max_parallax`."""
+    step = inverse_depth_step(cameras, settings.parallax_step_px)
+    planes = int(settings.max_parallax * cameras[0].width / settings.parallax_step_px)
     return step * np.arange(planes + 1, dtype=np.float64)
 
 
-def find_range(cameras: Sequence[Camera], images: Float32) -> Float64:
+def find_range(cameras: Sequence[Camera], images: Float32, settings: SweepSettings = DEFAULTS) -> Float64:
     """Return the inverse depths at which the scene lies: a sweep of the full range at half the size, and a margin.
 
     Everything is kept where nothing matches.
     """
-    planes, step = full_range(cameras), inverse_depth_step(cameras)
+    planes, step = full_range(cameras, settings), inverse_depth_step(cameras, settings.parallax_step_px)
     half = [half_size(c) for c in cameras]
     small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in images])
-    maps = [sweep(half, small, i, planes[::2]) for i in range(len(cameras))]
-    found = np.concatenate([m.inverse[agreed(half, maps, i)] for i, m in enumerate(maps)])
+    maps = [sweep(half, small, i, planes[::2], settings=settings) for i in range(len(cameras))]
+    found = np.concatenate([m.inverse[agreed(half, maps, i, settings)] for i, m in enumerate(maps)])
     if not len(found):
         return planes
     low, high = np.quantile(found, [0.002, 0.998])
@@ -90,17 +99,23 @@ def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> 
 
 
 def sweep(
-    cameras: Sequence[Camera], images: Float32, index: int, planes: Float64, pixels: Mask | None = None
+    cameras: Sequence[Camera],
+    images: Float32,
+    index: int,
+    planes: Float64,
+    pixels: Mask | None = None,
+    settings: SweepSettings = DEFAULTS,
 ) -> DepthMap:
     """Return the depth of view `index` from all other views; images [C, H, W], inverse depths `planes` ascending.
 
     With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
     """
-    top, left, bottom, right = _rectangle(pixels) if pixels is not None else (0, 0, *images.shape[1:])
+    window = settings.window_px
+    top, left, bottom, right = _rectangle(pixels, window) if pixels is not None else (0, 0, *images.shape[1:])
     reference = np.ascontiguousarray(images[index, top:bottom, left:right])
     height, width = reference.shape
-    mean = _box(reference)
-    variance = _box(reference * reference) - mean * mean
+    mean = _box(reference, window)
+    variance = _box(reference * reference, window) - mean * mean
     scores = np.zeros((len(planes), height, width), np.float32)
     here = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
     there = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # and back
@@ -115,7 +130,7 @@ def sweep(
                 images[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
             )
             inside = warped >= 0
-            total += np.maximum(_correlation(reference, mean, variance, warped), 0) * inside
+            total += np.maximum(_correlation(reference, mean, variance, warped, settings), 0) * inside
             seen += inside
         total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
     found = _peak(scores, planes)
@@ -124,24 +139,25 @@ def sweep(
     return whole
 
 
-def _rectangle(pixels: Mask) -> tuple[int, int, int, int]:
+def _rectangle(pixels: Mask, window: int) -> tuple[int, int, int, int]:
     """Return top, left, bottom, right of the smallest rectangle that holds a mask and a margin of one window."""
     rows, columns = np.nonzero(pixels.any(axis=1))[0], np.nonzero(pixels.any(axis=0))[0]
     if not len(rows):
         return 0, 0, 1, 1
-    top, left = max(0, int(rows[0]) - WINDOW), max(0, int(columns[0]) - WINDOW)
-    return top, left, int(rows[-1]) + 1 + WINDOW, int(columns[-1]) + 1 + WINDOW
+    top, left = max(0, int(rows[0]) - window), max(0, int(columns[0]) - window)
+    return top, left, int(rows[-1]) + 1 + window, int(columns[-1]) + 1 + window
 
 
-def _box(image: Float32) -> Float32:
-    return np.asarray(cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT), np.float32)
+def _box(image: Float32, window: int) -> Float32:
+    return np.asarray(cv2.boxFilter(image, -1, (window, window), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32) -> Float32:
-    mean_b = _box(b)
-    variance_b = _box(b * b) - mean_b * mean_b
-    both = _box(a * b) - mean_a * mean_b
-    return np.asarray(both / np.sqrt((variance_a + NOISE) * (variance_b + NOISE)), np.float32)
+def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32, settings: SweepSettings) -> Float32:
+    window, noise = settings.window_px, settings.noise
+    mean_b = _box(b, window)
+    variance_b = _box(b * b, window) - mean_b * mean_b
+    both = _box(a * b, window) - mean_a * mean_b
+    return np.asarray(both / np.sqrt((variance_a + noise) * (variance_b + noise)), np.float32)
 
 
 def _peak(scores: Float32, planes: Float64) -> DepthMap:
@@ -167,13 +183,13 @@ def lift(camera: Camera, inverse: Float32, pixels: Mask) -> Float64:
     return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
 
 
-def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> Mask:
-    """Return the pixels [H, W] of view `index` on whose depth at least `MIN_AGREE` other views agree."""
+def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int, settings: SweepSettings = DEFAULTS) -> Mask:
+    """Return the pixels [H, W] of view `index` on whose depth at least `min_agree` other views agree."""
     camera, own = cameras[index], maps[index]
-    believed = (own.score > MIN_SCORE) & (own.inverse > 0)
+    believed = (own.score > settings.min_score) & (own.inverse > 0)
     points = lift(camera, own.inverse, believed)
     votes = np.zeros(len(points), np.int64)
-    tolerance = AGREE_PX / PARALLAX_STEP * inverse_depth_step(cameras)
+    tolerance = settings.agree_px * inverse_depth_step(cameras)
     for other, other_map in enumerate(maps):
         if other == index:
             continue
@@ -182,5 +198,5 @@ def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int) -> M
         u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
         inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
         votes += inside & (np.abs(other_map.inverse[v, u] - inverse) < tolerance)
-    believed[believed] = votes >= MIN_AGREE
+    believed[believed] = votes >= settings.min_agree
     return believed

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from spike4dgs.baselines.initialization.plane_sweep import (
     DepthMap,
     Mask,
+    SweepSettings,
     agreed,
     find_range,
     inverse_depth_step,
@@ -38,17 +39,32 @@ from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
 
-WINDOW_TICKS = 40  # 2 ms at 20 kHz: a window within which things count as static
-CELL_PX = 1.6  # one point per cell of this size: about 0.4 points per pixel
-HOLE_PX = 2.0  # from the nearest point: further away it is empty
-NEIGHBOURS = 5  # points that tell the depth where there are none
+
+@dataclass(frozen=True)
+class CloudSettings(Settings):
+    """Numbers of thinning and filling a cloud of points (prefix `initialization`)."""
+
+    cell_px: float = 1.6  # one point per cell of this size: about 0.4 points per pixel
+    cell_parallax_px: float = 2.0  # a cell's depth, as parallax of the widest pair: about its size
+    hole_px: float = 2.0  # from the nearest point: further away it is empty
+    neighbours: int = 5  # points that tell the depth where there are none
 
 
 @dataclass(frozen=True)
-class RigSettings(Settings):
-    """Images of the plane sweep (prefix `initialization`)."""
+class PointSettings(CloudSettings, SweepSettings):
+    """Numbers of points by plane sweep (prefix `initialization`)."""
 
-    flat_field: bool = False  # correct them by each camera's calibration, if known
+    window_ticks: int = 40  # 2 ms at 20 kHz: a window within which things count as static
+
+
+@dataclass(frozen=True)
+class RigSettings(PointSettings):
+    """Numbers of `rig` (prefix `initialization`)."""
+
+    flat_field: bool = False  # correct images by each camera's calibration, if known
+
+
+DEFAULTS = RigSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,41 +75,47 @@ class Cloud:
     values: Float32
 
 
-def rig(scene: TrainingScene, *, flat_field: bool = False) -> Start:
+def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS) -> Start:
     """Return the calibrated poses and first points of a scene; see the module.
 
     Raises UserError where all cameras have one centre.
     """
-    return filled(scene, *matched(scene, flat_field))
+    return swept(scene, settings, settings.flat_field)
 
 
-def matched(scene: TrainingScene, flat_field: bool) -> tuple[Cloud, Float32]:
+def swept(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> Start:
+    """Return the same, with corrected images or not."""
+    return filled(scene, *matched(scene, settings, flat_field), settings)
+
+
+def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> tuple[Cloud, Float32]:
     """Return the points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} at one position"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
     mean = window_means(scene, 0, scene.n_ticks, flat_field)
-    windows = _windows(scene.n_ticks)
+    windows = _windows(scene.n_ticks, settings.window_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
     moving = [_moving(np.stack(c)) for c in counts]
-    planes = find_range(scene.cameras, mean)
-    maps = [sweep(scene.cameras, mean, i, planes) for i in range(len(scene.cameras))]
-    clouds = [_points(scene.cameras, maps, mean, [~m for m in moving])]
+    planes = find_range(scene.cameras, mean, settings)
+    maps = [sweep(scene.cameras, mean, i, planes, settings=settings) for i in range(len(scene.cameras))]
+    clouds = [_points(scene.cameras, maps, mean, [~m for m in moving], settings)]
     middle, last = len(windows) // 2, len(windows) - 1
     for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[at]
         images = window_means(scene, start, stop, flat_field)
         near = slice(max(0, at - 1), at + 2)
         quiet = [~_moving(np.stack(c[near])) | (at == middle) for c in counts]
-        short = [sweep(scene.cameras, images, i, planes, m) for i, m in enumerate(moving)]
-        clouds.append(_points(scene.cameras, short, images, [m & q for m, q in zip(moving, quiet, strict=True)]))
+        short = [sweep(scene.cameras, images, i, planes, m, settings) for i, m in enumerate(moving)]
+        pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
+        clouds.append(_points(scene.cameras, short, images, pixels, settings))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
-    return thin(scene.cameras, Cloud(points, values)), mean
+    return thin(scene.cameras, Cloud(points, values), settings), mean
 
 
-def filled(scene: TrainingScene, cloud: Cloud, mean: Float32) -> Start:
+def filled(scene: TrainingScene, cloud: Cloud, mean: Float32, settings: CloudSettings) -> Start:
     """Return the start from a cloud, filled where the image is empty, with gray of the clip's means [C, H, W]."""
-    cloud = fill(scene.cameras, mean, cloud)
+    cloud = fill(scene.cameras, mean, cloud, settings)
     return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
 
 
@@ -112,9 +134,9 @@ def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
     return np.asarray(total / (stop - start), np.float32)
 
 
-def _windows(n_ticks: int) -> list[tuple[int, int]]:
-    count = max(1, n_ticks // WINDOW_TICKS)
-    return [(i * WINDOW_TICKS, min((i + 1) * WINDOW_TICKS, n_ticks)) for i in range(count)]
+def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
+    count = max(1, n_ticks // length)
+    return [(i * length, min((i + 1) * length, n_ticks)) for i in range(count)]
 
 
 def _moving(counts: NDArray[np.int64]) -> Mask:
@@ -124,12 +146,16 @@ def _moving(counts: NDArray[np.int64]) -> Mask:
 
 
 def _points(
-    cameras: Sequence[Camera], maps: Sequence[DepthMap], images: Float32, pixels: Sequence[Mask]
+    cameras: Sequence[Camera],
+    maps: Sequence[DepthMap],
+    images: Float32,
+    pixels: Sequence[Mask],
+    settings: SweepSettings,
 ) -> tuple[NDArray[np.float64], Float32]:
     """Return world points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
     points, values = [], []
     for i, camera in enumerate(cameras):
-        chosen = agreed(cameras, maps, i) & pixels[i]
+        chosen = agreed(cameras, maps, i, settings) & pixels[i]
         points.append(lift(camera, maps[i].inverse, chosen))
         values.append(images[i][chosen])
     return np.concatenate(points), np.concatenate(values)
@@ -144,12 +170,12 @@ def middle_camera(cameras: Sequence[Camera]) -> Camera:
     return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
 
 
-def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
-    """Return one point, the mean, per cell of `CELL_PX` px and about as many px of parallax in the middle camera."""
+def thin(cameras: Sequence[Camera], cloud: Cloud, settings: CloudSettings) -> Cloud:
+    """Return one point, the mean, per cell of `cell_px` px and `cell_parallax_px` in the middle camera."""
     uv, z = middle_camera(cameras).project(cloud.points)
-    step = inverse_depth_step(cameras) * 2  # 2 px of parallax in the widest pair
+    step = inverse_depth_step(cameras, settings.cell_parallax_px)
     keep = z > 0
-    cells = np.column_stack([np.floor(uv[keep] / CELL_PX), np.floor(1 / (z[keep] * step))]).astype(np.int64)
+    cells = np.column_stack([np.floor(uv[keep] / settings.cell_px), np.floor(1 / (z[keep] * step))]).astype(np.int64)
     _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     inverse = inverse.reshape(-1)
 
@@ -161,7 +187,7 @@ def thin(cameras: Sequence[Camera], cloud: Cloud) -> Cloud:
     return Cloud(merged[believed], mean(cloud.values[keep])[believed].astype(np.float32))
 
 
-def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
+def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: CloudSettings) -> Cloud:
     """Return the cloud and points where the middle camera sees none, at the nearest points' median inverse depth.
 
     Fewer points than that are chance: all of the image is then laid far away.
@@ -172,11 +198,11 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud) -> Cloud:
     margin = 0.1 * np.array([camera.width, camera.height])
     axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    if len(cloud.points) < NEIGHBOURS:
+    if len(cloud.points) < settings.neighbours:
         far = 1 / inverse_depth_step(cameras)
         return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32))
-    distance, nearest = cKDTree(uv).query(grid, k=NEIGHBOURS)
-    empty = distance[:, 0] > HOLE_PX
+    distance, nearest = cKDTree(uv).query(grid, k=settings.neighbours)
+    empty = distance[:, 0] > settings.hole_px
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
     added = camera.unproject(grid[empty], depth)
     seen = np.stack([_look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras
 
-from spike4dgs.baselines.initialization.rig import rig
+from spike4dgs.baselines.initialization.rig import RigSettings, rig
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -63,6 +63,6 @@ def test_without_recordings_images_stay_as_they_are(scene):
 
 def test_first_points_take_the_corrected_gray(scene):
     """The gradient is one surface at no definite depth: what counts is that no point is brighter than the light."""
-    plain, flat = rig(scene).values, rig(scene, flat_field=True).values
+    plain, flat = rig(scene).values, rig(scene, RigSettings(flat_field=True)).values
     assert plain.max() > 0.85 and flat.max() < 0.82
-    np.testing.assert_array_equal(rig(replace(scene, recordings=()), flat_field=True).values, plain)
+    np.testing.assert_array_equal(rig(replace(scene, recordings=()), RigSettings(flat_field=True)).values, plain)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.initialization import colmap as module
-from spike4dgs.baselines.initialization.colmap import Mapping, clip_means, colmap, map_views
-from spike4dgs.baselines.initialization.rig import rig
+from spike4dgs.baselines.initialization.colmap import ColmapSettings, Mapping, clip_means, colmap, map_views
+from spike4dgs.baselines.initialization.rig import RigSettings, rig
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.calibration import Recordings
@@ -25,7 +25,7 @@ WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
 
 @pytest.fixture(scope="module")
 def mapping() -> Mapping:
-    return map_views(WORLD.training, clip_means(WORLD.training), 0, calibrated=True)
+    return map_views(WORLD.training, clip_means(WORLD.training), 0)
 
 
 def test_means_are_the_radiance_of_what_stands_still() -> None:
@@ -60,7 +60,7 @@ def test_the_same_seed_gives_the_same_poses_and_nothing_stays_behind(
     mapping: Mapping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    again = map_views(WORLD.training, clip_means(WORLD.training), 0, calibrated=True)
+    again = map_views(WORLD.training, clip_means(WORLD.training), 0)
     for a, b in zip(again.cameras, mapping.cameras, strict=True):
         assert np.array_equal(a.w2c, b.w2c)
     assert not os.listdir(tmp_path)
@@ -81,20 +81,20 @@ def test_a_failure_says_how_many_views_are_registered(monkeypatch: pytest.Monkey
 def test_few_points_are_replaced_by_a_plane_sweep_with_the_estimated_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = WORLD.training
     moved = tuple(replace(c, t=c.t + [0.0, 0.0, 0.01]) for c in scene.cameras)
-    for count in (module.MIN_POINTS - 1, module.MIN_POINTS):
+    for count in (ColmapSettings().min_points - 1, ColmapSettings().min_points):
         found = Mapping(moved, np.ones((count, 3)), np.ones(count, np.float32))
         monkeypatch.setattr(module, "map_views", lambda *a, found=found, **k: found)
         start = colmap(scene, 0)
         assert start.cameras == moved
-        assert (len(start.points) > 500) == (count < module.MIN_POINTS)
+        assert (len(start.points) > 500) == (count < ColmapSettings().min_points)
 
 
 def test_points_of_corrected_images_come_from_a_plane_sweep_at_the_estimated_poses() -> None:
     scene = WORLD.training
-    start = colmap(scene, 0, flat_field=True)
+    start = colmap(scene, 0, ColmapSettings(flat_field=True))
     summary = pose_errors(start.cameras, scene.cameras).summary()
     assert 0 < summary["rotation_max_deg"] < 0.5 and summary["translation_of_array"] < 0.05, summary
-    given = rig(scene, flat_field=True)
+    given = rig(scene, RigSettings(flat_field=True))
     assert len(start.points) > 0.8 * len(given.points) > 500
     assert not np.array_equal(start.points[:100], given.points[:100])
 
@@ -125,12 +125,12 @@ def test_features_are_sought_in_images_without_the_pixels_pattern(monkeypatch: p
     scene = replace(world.training, recordings=tuple(world.recordings(c) for c in world.training.cameras))
     seen: list[NDArray[np.float32]] = []
 
-    def watched(scene: TrainingScene, images: NDArray[np.float32], seed: int, *, calibrated: bool) -> Mapping:
+    def watched(scene: TrainingScene, images: NDArray[np.float32], seed: int, settings: ColmapSettings) -> Mapping:
         seen.append(images)
-        return map_views(scene, images, seed, calibrated=calibrated)
+        return map_views(scene, images, seed, settings)
 
     monkeypatch.setattr(module, "map_views", watched)
-    assert len(colmap(scene, 0, flat_field=True).cameras) == 8
+    assert len(colmap(scene, 0, ColmapSettings(flat_field=True)).cameras) == 8
     truth = np.stack([even.trace(camera, 0.5)[0] for camera in scene.cameras])
     corrected, plain = (np.sqrt(np.mean((p - truth) ** 2)) for p in (seen[0], clip_means(scene)))
     assert corrected < 0.012 < 0.03 < plain

@@ -13,7 +13,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines.initialization import dust3r as module
 from spike4dgs.baselines.initialization.colmap import clip_means
-from spike4dgs.baselines.initialization.dust3r import Pair, dust3r, predictor, resized, solve
+from spike4dgs.baselines.initialization.dust3r import Dust3rSettings, Pair, dust3r, predictor, resized, solve
 from spike4dgs.baselines.initialization.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
@@ -23,6 +23,7 @@ from spike4dgs.method.msdi.pose import solve_pose
 from spike4dgs.method.msdi.transformer import rotate
 
 TINY = Dust3rShape(2, 32, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
+SMALL = Dust3rSettings(long_side_px=96)
 WORLD = ToyWorld(width=100, height=62, n_ticks=40, travel=0.0, seed=2)
 
 
@@ -143,9 +144,8 @@ def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(
     save_file(tiny().state_dict(), tmp_path / "tiny.safetensors")
     monkeypatch.setenv("SPIKE4DGS_DUST3R", str(tmp_path / "tiny.safetensors"))
     monkeypatch.setattr(module, "load_dust3r", lambda path: load_dust3r(path, TINY))
-    monkeypatch.setattr(module, "LONG_SIDE", 96)
     try:
-        start = dust3r(WORLD.training, 0)
+        start = dust3r(WORLD.training, 0, SMALL)
     except UserError as e:  # random points seldom have a pose
         assert "found no consistent points" in str(e) or "cameras at different positions" in str(e)
     else:
@@ -173,27 +173,24 @@ def test_pnp_without_a_pose_says_so() -> None:
 
 def test_resized_view_sees_the_same_scene() -> None:
     camera = WORLD.cameras[1]
-    view = resized(camera, 16)
+    view = resized(camera, 16, 512)
     assert (view.width, view.height) == (512, 304)
     points = camera.unproject(np.array([[10.0, 20.0], [50.0, 31.0]]), np.array([2.0, 3.0]))
     middle, half = np.array([256, 152]), np.array([50, 31])
     assert np.allclose(view.project(points)[0] - middle, 5.12 * (camera.project(points)[0] - half))
     v, u = np.mgrid[:62, :100] + 0.5
     image = (0.2 + 0.005 * u + 0.003 * v).astype(np.float32)
-    shown = module._decode_srgb(module._resize(image, view))[8:-8, 8:-8]
+    shown = module._decode_srgb(module._resize(image, view, 512))[8:-8, 8:-8]
     y, x = np.mgrid[8:296, 8:504] + 0.5
     expected = 0.2 + 0.005 * (50 + (x - 256) / 5.12) + 0.003 * (31 + (y - 152) / 5.12)
     assert np.abs(shown - expected).max() < 0.005 and abs((shown - expected).mean()) < 5e-4  # 8 bits; 0.1 px
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_perfect_points_at_scales_of_their_own_give_the_poses(
-    calibrated: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "LONG_SIDE", 96)
+def test_perfect_points_at_scales_of_their_own_give_the_poses(calibrated: bool) -> None:
     scene, rng = WORLD.training, np.random.default_rng(0)
-    views = [resized(c, 16) for c in scene.cameras]
-    shown = np.stack([module._resize(p, v) for p, v in zip(clip_means(scene), views, strict=True)])
+    views = [resized(c, 16, SMALL.long_side_px) for c in scene.cameras]
+    shown = np.stack([module._resize(p, v, SMALL.long_side_px) for p, v in zip(clip_means(scene), views, strict=True)])
 
     def seen(i: int) -> np.ndarray:
         v, u = np.mgrid[: views[0].height, : views[0].width] + 0.5
@@ -206,7 +203,7 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(
         points = [scale * (seen(i) + 1e-3 * rng.normal(size=seen(i).shape)) for i in (0, other)]
         return Pair((points[0], points[1]), (sure, sure))
 
-    start = solve(predict, views, shown, scene, 0, calibrated=calibrated)
+    start = solve(predict, views, shown, scene, 0, SMALL, calibrated=calibrated)
     summary = pose_errors(start.cameras, scene.cameras).summary()
     assert summary["rotation_max_deg"] < 0.1 and summary["translation_of_array"] < 0.01
     assert start.cameras[4].fx == pytest.approx(scene.cameras[4].fx, rel=1e-9 if calibrated else 2e-3)

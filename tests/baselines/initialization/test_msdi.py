@@ -14,6 +14,7 @@ from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.initialization.msdi import (
     Estimate,
+    MsdiSettings,
     block_means,
     completed,
     infer,
@@ -23,7 +24,7 @@ from spike4dgs.baselines.initialization.msdi import (
     shrunk,
     unposed,
 )
-from spike4dgs.baselines.initialization.rig import Cloud, matched, rig
+from spike4dgs.baselines.initialization.rig import Cloud, RigSettings, matched, rig
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
@@ -121,9 +122,9 @@ def test_without_a_rising_line_the_matched_points_are_all(perfect: Estimate) -> 
 
 
 def test_the_start_is_that_of_corrected_images_where_views_match(random_network: Path) -> None:
-    start, flat = msdi(SCENE), rig(SCENE, flat_field=True)
+    start, flat = msdi(SCENE), rig(SCENE, RigSettings(flat_field=True))
     assert start.cameras is SCENE.cameras
-    n = len(matched(SCENE, flat_field=True)[0].points)
+    n = len(matched(SCENE, MsdiSettings(), flat_field=True)[0].points)
     np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 
@@ -143,7 +144,9 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     truth, depth, _ = world.trace(camera, 0.5)
     seen = points_of(depth[None].astype(np.float32), camera.K[None], np.eye(4)[None]).astype(np.float64) / SCALE
     estimate = Estimate(1, scene.cameras, truth[None].astype(np.float32), seen, np.full((1, 76, 120), 9.0))
-    monkeypatch.setattr("spike4dgs.baselines.initialization.msdi.infer", lambda scene, device, calibrated: estimate)
+    monkeypatch.setattr(
+        "spike4dgs.baselines.initialization.msdi.infer", lambda scene, settings, device, calibrated: estimate
+    )
     start = msdi_matched(scene, 0)
     for found, true in zip(start.cameras, scene.cameras, strict=True):
         assert angle_deg(found.R @ true.R.T) < 0.3 and found.fx == true.fx

@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import cv2
 import numpy as np
 import pytest
@@ -12,9 +14,14 @@ from spike4dgs.baselines.initialization.plane_sweep import (
     plane_homography,
     sweep,
 )
-from spike4dgs.baselines.initialization.rig import middle_camera, rig
+from spike4dgs.baselines.initialization.rig import RigSettings, middle_camera, rig
+from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.initialization import StartRequest
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
 
@@ -127,3 +134,31 @@ def test_scene_without_any_texture_still_gives_points(spikes):
     streams = tuple(SpikeStream(packed, 20, 12, RATE_HZ) for _ in cameras)
     start = rig(TrainingScene("flat", "flat", cameras, streams, RATE_HZ, 40, GAIN))
     assert len(start.points) > 20 and np.isfinite(start.points).all() and np.isfinite(start.values).all()
+
+
+def test_a_recipe_overrides_the_cell_size_and_its_record_shows_it(start):
+    overrides = {"initialization.cell_px": 4.0}
+    method = RecipeMethod(Recipe("mine", "tfp", "rig", "static", "pixel", overrides), PARTS)
+    wide = method.settings["initialization"]
+    coarse = method.initialization.start(StartRequest(WORLD.training, 0, wide))
+    assert len(coarse.points) < 0.7 * len(start.points)
+    assert method.params["settings"]["initialization"] == {**asdict(RigSettings()), "cell_px": 4.0}
+
+
+@pytest.mark.parametrize(
+    ("initialization", "name", "listed"),
+    [
+        ("rig", "min_points", "cell_px"),  # COLMAP's
+        ("dust3r", "cell_px", "ransac_px"),
+        ("colmap", "focal_prior", "min_points"),  # the focal length is known
+        ("msdi", "flat_field", "trained_px"),  # always corrected
+    ],
+)
+def test_a_number_of_a_part_that_does_not_run_is_refused(initialization: str, name: str, listed: str):
+    recipe = Recipe("mine", "tfp", initialization, "static", "pixel", {f"initialization.{name}": 1})
+    with pytest.raises(UserError, match=f"among .*initialization.{listed}.*found 'initialization.{name}'"):
+        RecipeMethod(recipe, PARTS)
+
+
+def test_no_initialization_has_more_than_25_numbers():
+    assert max(len(asdict(part.settings)) for part in PARTS.initialization.values()) <= 25
