@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 from tyro.conf import Positional
 
-from spike4dgs.baselines.initialization.colmap import UncalibratedSettings, clip_means, map_views
+from spike4dgs.baselines.initialization.colmap import UNCALIBRATED, clip_means, map_views
 from spike4dgs.baselines.initialization.dust3r import estimate as estimate_dust3r
 from spike4dgs.baselines.initialization.msdi import infer, matched_poses, unposed
 from spike4dgs.baselines.initialization.rig import rig, window_means
@@ -49,7 +49,7 @@ def _rig(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> 
 
 
 def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    focal = None if calibrated else UncalibratedSettings().focal_prior
+    focal = None if calibrated else UNCALIBRATED.focal_prior
     found = map_views(scene, images, seed, focal_prior=focal)
     return Estimate(found.cameras, len(found.points))
 

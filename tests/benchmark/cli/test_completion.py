@@ -11,7 +11,7 @@ from typing import get_args
 import pytest
 
 from spike4dgs.benchmark.cli import COMMANDS, SPEED, main
-from spike4dgs.benchmark.completion import Shell, script
+from spike4dgs.benchmark.cli.completion import Shell, script
 
 
 def completed(folder: Path, *words: str) -> list[str]:
