@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from spike4dgs.benchmark.cli import main
+from spike4dgs.benchmark.cli.dispatch import main
 
 if __name__ == "__main__":
     sys.exit(main())
