@@ -70,8 +70,8 @@ class MsdiSettings(EstimateSettings, PointSettings):
     """Numbers of `msdi` (prefix `initialization`)."""
 
     least_matches: int = 50  # for a line through inverse depths
-    line_rounds: int = 10  # of least squares until it no longer moves
-    farthest: float = 2.0  # times the farthest match: beyond it the line is no longer known
+    line_rounds: int = 10  # of reweighted least squares
+    farthest: float = 2.0  # times the farthest match: points beyond it are left out
 
 
 @dataclass(frozen=True)
