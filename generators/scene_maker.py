@@ -57,7 +57,9 @@ Watch = Callable[[str, Iterable[T], int], Iterator[T]]  # (stage, steps, number 
 class Maker:
     """Makes one scene below `out`; `watch` shows the progress of the stages, `run` does the rendering.
 
-    >>> Maker(job, Path("data"), watch).make()  # doctest: +SKIP
+    For example::
+
+        Maker(job, Path("data"), watch).make()
     """
 
     job: Job

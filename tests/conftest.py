@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+# Workers share the cores: OpenMP's threads must sleep while they wait, or they take the cores from other workers.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import subprocess
 import sys
 from pathlib import Path

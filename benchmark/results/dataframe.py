@@ -21,7 +21,9 @@ def records_to_dataframe(*records: Record | Path | str, per_image: bool = False)
     `render_fps`, `peak_memory_mb`, `model_mb`), `budget`, `device` and `error`. A value that does not exist is NaN.
     With `per_image` a row is one scored image: `camera` and `tick` follow `split`, and costs are left out.
 
-    >>> records_to_dataframe("runs/small/results/tfp+4dgs.json")[["method", "scene", "psnr"]]  # doctest: +SKIP
+    For example::
+
+        records_to_dataframe("runs/small/results/tfp+4dgs.json")[["method", "scene", "psnr"]]
 
     Raises UserError where pandas is not installed, and for a file that is no result record.
     """

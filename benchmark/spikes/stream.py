@@ -127,8 +127,10 @@ class SpikeWriter:
 
     Raises UserError where the system cannot write it (disk full, no permission, ...); nothing stays behind then.
 
-    >>> with SpikeWriter(Path("cam.dat"), 8, 2) as w:  # doctest: +SKIP
+    >>> with SpikeWriter(Path("cam.dat"), 8, 2) as w:
     ...     w.write(np.zeros((100, 2), np.uint8))
+    >>> Path("cam.dat").stat().st_size
+    200
     """
 
     def __init__(self, path: Path, width: int, height: int) -> None:

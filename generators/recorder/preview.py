@@ -27,8 +27,10 @@ _BAR = 20  # characters for one spike per tick
 class Watch:
     """Shows a capture: a line for each state, or with `live` a table that follows the cameras' rates.
 
-    >>> with Watch(profile, live=True) as watch:  # doctest: +SKIP
-    ...     clip = capture(profile, links, 0.5, on_state=watch.state, on_rate=watch.rates)
+    For example::
+
+        with Watch(profile, live=True) as watch:
+            clip = capture(profile, links, 0.5, on_state=watch.state, on_rate=watch.rates)
     """
 
     def __init__(self, profile: RigProfile, live: bool, console: Console | None = None) -> None:

@@ -35,11 +35,13 @@ class Clip(NamedTuple):
 class KeyStore:
     """The key frames of a set of views in a folder.
 
-    >>> store = KeyStore(Path("keys"))  # doctest: +SKIP
-    >>> store.set_static(renderer.static())  # doctest: +SKIP
-    >>> for tick in store.missing(plan):  # doctest: +SKIP
-    ...     store.put(tick, renderer.key_arrays(tick, plan))
-    >>> clip = store.view(0, plan)  # doctest: +SKIP
+    For example::
+
+        store = KeyStore(Path("keys"))
+        store.set_static(renderer.static())
+        for tick in store.missing(plan):
+            store.put(tick, renderer.key_arrays(tick, plan))
+        clip = store.view(0, plan)
     """
 
     def __init__(self, folder: Path) -> None:

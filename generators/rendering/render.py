@@ -68,8 +68,10 @@ class StaticViews:
 class MultiViewRenderer(Visibility):
     """Renders all `cameras` (one resolution) of a world together: one launch per time. Images are [C, H, W] float32.
 
-    >>> renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
-    >>> images = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
+    For example::
+
+        renderer = MultiViewRenderer(world, cameras(world, 200, 125), seed=0, spp=64, background_spp=256)
+        images = [renderer.keys(t_s) for t_s in np.arange(0, 0.02, 0.0005)]
     """
 
     def __init__(

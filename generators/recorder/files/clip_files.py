@@ -32,10 +32,12 @@ class StreamFiles:
     `write` is the sink of `capture`. Each camera's ticks ascend. A file that the system cannot write ends alone: its
     later ticks are dropped and become a gap of reason "disk". Only `finish` leaves files behind.
 
-    >>> with StreamFiles(out, profile, n_ticks) as files:  # doctest: +SKIP
-    ...     clip = capture(profile, links, seconds, sink=files.write)
-    ...     clip = clip.without(files.flush(clip.n_ticks))
-    ...     files.finish(ClipRecord(clip.n_ticks, gaps, sync))
+    For example::
+
+        with StreamFiles(out, profile, n_ticks) as files:
+            clip = capture(profile, links, seconds, sink=files.write)
+            clip = clip.without(files.flush(clip.n_ticks))
+            files.finish(ClipRecord(clip.n_ticks, gaps, sync))
     """
 
     def __init__(self, out: Path, profile: RigProfile, n_ticks: int) -> None:

@@ -32,11 +32,13 @@ class TickCounter:
     `origin`: the counter of tick 0, where the layout has counters and the cameras have agreed on one; frames before it
     are dropped. Without it, the first whole frame is tick 0.
 
-    >>> counter = TickCounter(layout, "cam_00")  # doctest: +SKIP
-    >>> for data in transfers:
-    ...     for run in counter.feed(data):
-    ...         write(run.first_tick, run.frames)
-    >>> gaps = counter.finish(n_ticks)
+    For example::
+
+        counter = TickCounter(layout, "cam_00")
+        for data in transfers:
+            for run in counter.feed(data):
+                write(run.first_tick, run.frames)
+        gaps = counter.finish(n_ticks)
     """
 
     def __init__(self, layout: Layout, camera: str, origin: int | None = None) -> None:

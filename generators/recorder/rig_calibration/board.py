@@ -26,8 +26,8 @@ _SMALL = 640  # px; a smaller image is enlarged by two for the detector
 class Board:
     """A chessboard of (columns + 1) x (rows + 1) squares. Raises UserError where half a turn would not change it.
 
-    >>> Board(4, 3, 0.1).corners[:2].tolist()
-    [[-0.15000000000000002, -0.1, 0.0], [-0.05000000000000002, -0.1, 0.0]]
+    >>> Board(4, 3, 0.1).corners[:2].round(3).tolist()
+    [[-0.15, -0.1, 0.0], [-0.05, -0.1, 0.0]]
     """
 
     columns: int = 8  # inner corners from left to right

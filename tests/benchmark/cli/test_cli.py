@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, run
 
-from spike4dgs.benchmark.cli import dispatch as cli
 from spike4dgs.benchmark.cli import COMMANDS, SPEED, Command, main
+from spike4dgs.benchmark.cli import dispatch as cli
 from spike4dgs.benchmark.results.record import read_record
 from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.runs.score_command import score

@@ -100,7 +100,8 @@ def test_kernel_equals_the_plain_twin_in_value_and_gradient(seed, size, features
         (out * weight).sum().backward()
         results.append([out.detach().float(), *(x.grad for x in leaves)])
     for fast, slow in zip(*results, strict=True):
-        scale = float(slow.abs().max()) + 1e-6 if slow.numel() else 1.0
+        # A point's gradient is a difference of larger terms, which float32 rounds: 1e-4 is their least size.
+        scale = float(slow.abs().max()) + 1e-4 if slow.numel() else 1.0
         assert float((fast - slow).abs().max() if slow.numel() else 0) <= 2e-5 * scale
 
 
