@@ -1,4 +1,4 @@
-"""Whether gsplat, which renders Gaussians on CUDA, works here, judged without importing or building it.
+"""The judgement whether gsplat, which renders Gaussians on CUDA, works here, without importing or building it.
 
 gsplat's wheel on PyPI has sources only. The first import compiles them with a CUDA toolkit, a C++ compiler and ninja,
 and every later import looks for these again. Its authors also publish wheels that are compiled already.

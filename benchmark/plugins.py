@@ -1,4 +1,4 @@
-"""What installed packages register by entry points: each entry point of a group names a mapping from name to value."""
+"""Objects that installed packages register by entry points: each names a mapping from name to value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report says of each camera: its rates, its gaps, and its bad pixels."""
+"""Facts about each camera for a report: rates, gaps, and bad pixels."""
 
 from __future__ import annotations
 

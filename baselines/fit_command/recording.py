@@ -29,7 +29,7 @@ WHITE_PERCENTILE = 99.0  # of the mean rates; the rate of white is not known wit
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What is fitted, and what a report says about it."""
+    """The data of a fit, and the facts for its report."""
 
     training: TrainingScene
     split: str
