@@ -33,7 +33,7 @@ from spike4dgs.benchmark.method import FitRequest, Method, get_method, make_budg
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.results.predictions import MethodInfo
 from spike4dgs.benchmark.results.provenance import Provenance, Savable
-from spike4dgs.benchmark.runs.cell import FitClock
+from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.saved_model import SavedModel, load_model
@@ -136,19 +136,13 @@ def _fitted(method: Method, recording: Recording, request: FitRequest, out: Path
         _say(console, "the model is there: only sheet, video and report are made again")
         return saved
     work = out / "work" / _key(about)[:16]
-    work.mkdir(parents=True, exist_ok=True)
-    checkpoint = work / "checkpoint.safetensors"
-    if warm_up := getattr(method, "warm_up", None):
-        warm_up(request)  # compiling is no part of the fit
     with RunDisplay(console, 1) as display, display.cell(f"{about.name} on {about.scene}") as shown:
-        clock = FitClock(work / "fit_clock.json", checkpoint)
-        if clock.before > 0:
-            shown.note(f"resuming after {clock.before:.0f} s of fitting")
-        model = method.fit(recording.training, replace(request, progress=shown.progress, checkpoint=checkpoint))
+        watched = replace(request, progress=shown.progress)
+        model, fit_seconds = timed_fit(method, recording.training, watched, work, shown.note)
     if not isinstance(model, Savable):
         raise problem(f"method {method.name}", "a method whose models can be saved", "none", "choose another --method")
     cameras = _fitted_cameras(model, about.cameras)
-    about = replace(about, cameras=cameras, fit_seconds=clock.seconds(), created=utc_now())
+    about = replace(about, cameras=cameras, fit_seconds=fit_seconds, created=utc_now())
     model.save(path, about)
     shutil.rmtree(out / "work")
     return SavedModel(model, about)

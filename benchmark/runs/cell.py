@@ -31,7 +31,7 @@ from spike4dgs.benchmark.results.provenance import Provenance, Savable
 from spike4dgs.benchmark.results.record import PROTOCOL
 from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,8 @@ def run_job(
     They go to `folders`; `work` holds the checkpoint until these are whole. Only the fit sees `scene.training`;
     held-out cameras appear only in the calls to render, and refined ones are found after the fit.
     """
-    work.mkdir(parents=True, exist_ok=True)
-    checkpoint = work / "checkpoint.safetensors"
-    check_protocol(job.method, type(job.method).__module__)
-    request = FitRequest(job.budget, job.device, job.seed, progress, checkpoint)
-    if warm_up := getattr(job.method, "warm_up", None):
-        warm_up(request)
-    reset_peak_memory(job.device)
-    clock = FitClock(work / "fit_clock.json", checkpoint)
-    if clock.before > 0:
-        note(f"resuming after {clock.before:.0f} s of fitting")
-    model = job.method.fit(job.scene.training, request)
-    fit_seconds = clock.seconds()
+    request = FitRequest(job.budget, job.device, job.seed, progress)
+    model, fit_seconds = timed_fit(job.method, job.scene.training, request, work, note)
     if isinstance(model, Savable):
         model.save(model_path, _provenance(job, fit_seconds))
     cameras = job.scene.cameras
@@ -114,6 +104,27 @@ def run_job(
             cameras = {**cameras, **refined_cameras(cast(Refinable, model), job.scene)}
         _predict(job, method, model, cameras, fit_seconds, folder)
     shutil.rmtree(work)
+
+
+def timed_fit(
+    method: Method, scene: TrainingScene, request: FitRequest, work: Path, note: Callable[[str], None]
+) -> tuple[Model, float]:
+    """Return a fitted model and the seconds of its fit, all parts of a killed one included.
+
+    `work` holds the checkpoint, from which a killed fit resumes. Compiling is no part of the fit.
+    """
+    work.mkdir(parents=True, exist_ok=True)
+    checkpoint = work / "checkpoint.safetensors"
+    check_protocol(method, type(method).__module__)
+    request = replace(request, checkpoint=checkpoint)
+    if warm_up := getattr(method, "warm_up", None):
+        warm_up(request)
+    reset_peak_memory(request.device)
+    clock = FitClock(work / "fit_clock.json", checkpoint)
+    if clock.before > 0:
+        note(f"resuming after {clock.before:.0f} s of fitting")
+    model = method.fit(scene, request)
+    return model, clock.seconds()
 
 
 def _predict(
