@@ -21,8 +21,8 @@ MAY_IMPORT = {
 }
 # The modules and folders of each room, low to high: each imports only those before it.
 ORDER = {
-    "benchmark": "errors lazy plugins files compilation locks schemas gpu environment weights spikes scene imports "
-    "metrics method results reports runs cli speed",
+    "benchmark": "errors lazy plugins files compilation locks schemas gpu environment weights array spikes scene "
+    "imports metrics method results reports runs cli speed",
     "generators": "profiles sensor worlds rig conventional events recorder rendering bursts streams tasks ground_truth "
     "audit reports scene_maker make_dataset",
     "method": "torch_state settings model_files splat speed observations gaussians motion supervision checkpoint msdi "

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.camera_state import PERFECT, CameraState
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate
@@ -61,6 +62,11 @@ class TrainingScene:
     recordings: tuple[Recordings | None, ...] = ()  # calibration recordings of each camera, if there are any
     found_frames: Mapping[str, Frames] = field(default_factory=dict)  # by camera; see `frames`
     found_events: Mapping[str, EventStream] = field(default_factory=dict)  # by camera; see `events`
+    states: Mapping[str, CameraState] = field(default_factory=dict)  # by camera; see `state`
+
+    def state(self, camera: str) -> CameraState:
+        """Return a camera's clock, gain and bad pixels, as far as they were estimated."""
+        return self.states.get(camera, PERFECT)
 
     def frames(self, camera: str) -> Frames:
         """Return the conventional camera's frames beside a training camera, as `Scene.frames` does."""

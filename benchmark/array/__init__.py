@@ -1,0 +1,1 @@
+"""Imperfections of a real array: clocks that drift apart, unequal gains, bad pixels."""
