@@ -15,10 +15,12 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
+from spike4dgs.generators.recorder.emulation.imperfections import PERFECT, Imperfections
 from spike4dgs.generators.recorder.files.clip_files import StreamFiles
 from spike4dgs.generators.recorder.files.clip_record import ClipRecord
 from spike4dgs.generators.recorder.frames.clip import Clip, Sink
@@ -54,6 +56,9 @@ def record(
     flat: Path | None = None,
     dark: Path | None = None,
     flat_radiance: float | None = None,
+    worse: Imperfections = PERFECT,
+    worse_truth: Path | None = None,
+    seed: int = 0,
 ) -> int:
     """Record all cameras of an array at once: OUT is a scene folder, or streams without poses before the calibration.
 
@@ -71,8 +76,13 @@ def record(
         flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
         dark: The corresponding recording in the dark.
         flat_radiance: Radiance of that light, 1 is white.
+        worse: Imperfections of an emulated array. Such a capture holds nothing of the scene's truth.
+        worse_truth: JSON file outside OUT for what was done to each camera, for reports to compare with.
+        seed: Seed of the imperfections. A clip and its flat and dark recordings need the same one.
     """
-    source = _source(rig, emulate, mode)
+    source = _source(rig, emulate, mode, worse, worse_truth, seed)
+    if worse_truth is not None and out.resolve() in (worse_truth.resolve(), *worse_truth.resolve().parents):
+        raise problem("--worse-truth", f"a file outside {out}", str(worse_truth), "choose another place")
     profile = source.profile if mode == CLIP else _without_poses(source.profile)
     light = _light(profile, flat, dark, flat_radiance)
     length = source.seconds if seconds is None else seconds
@@ -94,17 +104,27 @@ def record(
         files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
         if preview:
             _write_preview(out)
+    if worse_truth is not None:
+        write_json(worse_truth, source.worse_truth)
     _print(clip, sync, continuous)
     for failure in failures.values():
         print(f"error: {failure}; what it held before is kept", file=sys.stderr)
     print(f"written {'past' if direct else 'through'} the page cache")
     print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
+    if worse_truth is not None:
+        print(f"imperfections: {worse_truth}")
     return 0 if clip.complete else LOST_DATA
 
 
-def _source(rig: Path | None, emulate: Path | None, mode: str) -> Source:
+def _source(
+    rig: Path | None, emulate: Path | None, mode: str, worse: Imperfections, worse_truth: Path | None, seed: int
+) -> Source:
+    if worse_truth is not None and worse == PERFECT:
+        raise problem("--worse-truth", "imperfections, such as --worse.gain 0.02", "none", "add them, or leave it out")
     if emulate is not None:
-        return emulated_source(emulate, rig, mode)
+        return emulated_source(emulate, rig, mode, worse, seed)
+    if worse != PERFECT:
+        raise problem("--worse", "--emulate SCENE: no real array is made worse", "none", "add it, or leave out --worse")
     if rig is None:
         fix = "name the array's profile, or try `spike4dgs record --emulate SCENE`"
         raise problem("record", "a rig profile", "none", fix)

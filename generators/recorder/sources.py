@@ -13,7 +13,16 @@ from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
-from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8, make_layout
+from spike4dgs.generators.recorder.emulation.imperfections import (
+    PERFECT,
+    Imperfections,
+    draw,
+    dropped_ticks,
+    truth_record,
+    with_wrong_poses,
+)
+from spike4dgs.generators.recorder.emulation.retiming import worse_stream
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.profile.profile import PACKET_BYTES, RigProfile, load_profile
 
@@ -31,12 +40,14 @@ class Source:
     """An array to record. `backend` is pyusb's, None for the system's own; `seconds` is its default length of a clip.
 
     `scene` is the scene that an emulated array shows, if its cameras are the scene's own: then the truth is known.
+    `worse_truth` is what was done to the cameras of an array with imperfections, which is no part of a recording.
     """
 
     profile: RigProfile
     backend: Any | None = None
     seconds: float = SECONDS
     scene: Scene | None = None
+    worse_truth: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,25 +68,47 @@ def real_source(rig: Path) -> Source:
     return Source(load_profile(rig))
 
 
-def emulated_source(path: Path, rig: Path | None, mode: str) -> Source:
+def emulated_source(path: Path, rig: Path | None, mode: str, worse: Imperfections = PERFECT, seed: int = 0) -> Source:
     """Return an emulated array that sends a scene's streams at their rate, or its recordings for `FLAT` and `DARK`.
 
-    Its cameras are those of the profile `rig`, or made from the scene. Raises UserError where the scene cannot be read,
-    has no such recordings, or does not go with the profile.
+    Its cameras are those of the profile `rig`, or made from the scene; `worse` gives them imperfections. Raises
+    UserError where the scene cannot be read, has no such recordings, or does not go with the profile.
     """
     scene = open_scene(path)
     streams = scene_streams(scene) if mode == CLIP else _calibration_streams(scene, mode)
-    profile = _scene_profile(scene) if rig is None else load_profile(rig)
+    profile = _scene_profile(scene, TAGGED_ROWS if worse.dropped else PLAIN) if rig is None else load_profile(rig)
     ticks = min(len(packed) for packed in streams.values())
+    if worse != PERFECT:
+        return _worse_source(profile, streams, ticks, mode, worse, seed)
     array = EmulatedArray(profile, streams)
     return Source(profile, EmulatedBackend(array), ticks / profile.fps, scene if rig is None and mode == CLIP else None)
 
 
-def _scene_profile(scene: Scene) -> RigProfile:
+def _worse_source(
+    profile: RigProfile, streams: Mapping[str, UInt8], ticks: int, mode: str, worse: Imperfections, seed: int
+) -> Source:
+    """Return an array with imperfections. It shows nothing of a scene's truth, which it would contradict.
+
+    Uniform light and darkness are recorded until nothing is lost: only a clip misses ticks.
+    """
+    cameras = draw(worse, profile, ticks, seed)
+    size = profile.width, profile.height
+    sent = {name: worse_stream(streams[name], *size, camera, seed, name, mode) for name, camera in cameras.items()}
+    array = EmulatedArray(
+        profile,
+        sent,
+        faults=dropped_ticks(cameras, profile) if mode == CLIP else (),
+        ppm={name: camera.clock.drift_ppm for name, camera in cameras.items()},
+    )
+    done = truth_record(worse, seed, cameras, profile.width)
+    return Source(with_wrong_poses(profile, cameras), EmulatedBackend(array), ticks / profile.fps, None, done)
+
+
+def _scene_profile(scene: Scene, layout: str) -> RigProfile:
     """Return a profile whose reads take about a millisecond, as 256 KiB of 400x250 do, also for small scenes."""
     size = make_layout(PLAIN, int(scene.meta["width"]), int(scene.meta["height"])).frame_bytes
     packets = math.ceil(size * scene.rate_hz * _READ_S / PACKET_BYTES)
-    return scene_profile(scene, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
+    return scene_profile(scene, layout=layout, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
 
 
 def truth(scene: Scene | None, n_ticks: int) -> Truth:
