@@ -25,7 +25,7 @@ from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 
-SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, views_per_step=3)
+SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, piece_steps=3, views_per_step=3)
 SMALL = {"hexplane": {"mlp_width": 8, "features": 4}}  # of the motion
 FEW = ImageSettings(time_spacing_ticks=20, max_times=4, flat_field=True)
 HEIGHT, WIDTH, TICKS = 40, 64, 120

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from spike4dgs.benchmark.scene.cameras import (
     to_nerfstudio,
 )
 from spike4dgs.benchmark.scene.writer import read_colmap, write_colmap
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 
 
 @st.composite
@@ -92,10 +95,19 @@ def test_mitsuba_poses_mean_its_axes(camera: Camera) -> None:
     assert np.abs(np.stack([u, v * camera.height], 1) - camera.project(points)[0]).max() < 0.01
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_ray_of_mitsubas_sensor_hits_our_pixel(seed: int) -> None:
-    mi = pytest.importorskip("mitsuba")
+@pytest.fixture
+def scalar_mitsuba() -> Iterator[ModuleType]:
+    """Mitsuba, one ray at a time; tests that follow in this process get the variant that they had."""
+    mi = load_mitsuba()
+    before = mi.variant()
     mi.set_variant("scalar_rgb")
+    yield mi
+    mi.set_variant(before)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_ray_of_mitsubas_sensor_hits_our_pixel(scalar_mitsuba: ModuleType, seed: int) -> None:
+    mi = scalar_mitsuba
     rng = np.random.default_rng(seed)
     width, height = 64, 40
     camera = look_at(
