@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-# Workers share the cores. OpenMP's threads must sleep while they wait, or they take the cores from other workers; and of
-# two threads on a busy core one waits for the other at every step of an optimiser.
+# Workers share the cores. OpenMP's threads must sleep while they wait, or they take the cores from other workers; and
+# of two threads on a busy core one waits for the other at every step of an optimiser.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
