@@ -25,9 +25,15 @@ config: Any = numba_config  # its names are made from environment variables
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles on the first call, with these options of numba, and keeps the machine code.
+    """Return a decorator that compiles for the CPU, see `cached_jit`."""
+    return cached_jit(numba.njit, **options)
 
-    NUMBA_CACHE_DIR goes before the user's cache folder. Where the folder cannot be written to, nothing is kept.
+
+def cached_jit(jit: Callable[..., Any], **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles on the first call, with these options of `jit`, and keeps the machine code.
+
+    `jit` is numba.njit or numba.cuda.jit. NUMBA_CACHE_DIR goes before the user's cache folder. Where the folder cannot
+    be written to, nothing is kept.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -35,7 +41,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             before, folder = config.CACHE_DIR, config.CACHE_DIR or _folder()
             config.CACHE_DIR = folder
             try:
-                return numba.njit(cache=_is_writable(folder), **options)(function)
+                return jit(cache=_is_writable(folder), **options)(function)
             finally:
                 config.CACHE_DIR = before
 

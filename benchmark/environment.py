@@ -20,7 +20,7 @@ from spike4dgs.benchmark.gpu import missing_rasterizer
 # The libraries whose version can change a score or a speed.
 _PACKAGES = (
     "spike4dgs torch numpy scipy numba mitsuba drjit OpenEXR scikit-image"
-    " opencv-contrib-python-headless pycolmap gsplat"
+    " opencv-contrib-python-headless pycolmap numba-cuda"
 )
 
 
@@ -68,7 +68,7 @@ def device_type(device: str) -> str:
 def choose_device(device: str, *, rasterizes: bool = True) -> str:
     """Resolve `auto` and check that the device exists. Raises UserError where it does not.
 
-    What `rasterizes` computes on CUDA only where gsplat works too. Without it `auto` is the CPU, and one line on stderr
+    What `rasterizes` computes on CUDA only where numba-cuda works too. Without it `auto` is the CPU, and one line on stderr
     says how to change that.
     """
     kind = device_type(device)

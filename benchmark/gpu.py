@@ -1,21 +1,16 @@
-"""The judgement whether gsplat, which renders Gaussians on CUDA, works here, without importing or building it.
+"""The judgement whether Gaussians can be rendered on CUDA here: by numba-cuda, which compiles kernels without a toolkit.
 
-gsplat's wheel on PyPI has sources only. The first import compiles them with a CUDA toolkit, a C++ compiler and ninja,
-and every later import looks for these again. Its authors also publish wheels that are compiled already.
+The compiler comes with the package's extra for a version of CUDA. Whether it, the driver and PyTorch go together is
+known only from a trial, so one is made: a kernel of one line, compiled and run on a tensor.
 """
 
 from __future__ import annotations
 
-import os
-import re
-import shutil
-import subprocess
-import sysconfig
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
+from typing import Any
 
-EXTRA = "pip install 'spike4dgs[cuda]'"
 PYTORCH = "install PyTorch with CUDA from pytorch.org"
 
 
@@ -28,52 +23,42 @@ class Missing:
     fix: str
 
 
-def missing_rasterizer() -> Missing | None:
-    """Return the first part that gsplat lacks here; None where it is compiled or can be. A device is not looked for."""
+def install_line() -> str:
+    """Return the line that installs numba-cuda with the compiler for PyTorch's version of CUDA."""
     import torch
 
-    spec = find_spec("gsplat")
-    if spec is None or not spec.submodule_search_locations:
-        return Missing("the package gsplat", "none", f"{EXTRA}, which also needs a CUDA toolkit")
+    extra = "cuda12" if (torch.version.cuda or "").startswith("12.") else "cuda"
+    return f"pip install 'spike4dgs[{extra}]'"
+
+
+def missing_rasterizer() -> Missing | None:
+    """Return the first part that rendering on CUDA lacks here; None where it works. PyTorch must see a device."""
+    import torch
+
+    if find_spec("numba_cuda") is None:
+        return Missing("the package numba-cuda", "none", install_line())
     if torch.version.cuda is None:
         return Missing("a PyTorch with CUDA", f"torch {torch.__version__}", PYTORCH)
-    if any(found for place in spec.submodule_search_locations for found in Path(place).glob("csrc.*")):
-        return None
-    return _missing_compiler(torch.version.cuda)
-
-
-def _missing_compiler(cuda: str) -> Missing | None:
-    """Return what compiling kernels for PyTorch's CUDA version lacks."""
-    toolkit = f"the CUDA toolkit {cuda}"
-    advice = f"install {toolkit} with nvcc on PATH, or a compiled wheel from docs.gsplat.studio/whl"
-    nvcc = _nvcc()
-    if nvcc is None:
-        return Missing(f"{toolkit}, to compile gsplat", "no nvcc", advice)
-    release = _release(nvcc)
-    if release is None or release.partition(".")[0] != cuda.partition(".")[0]:
-        return Missing(f"{toolkit}, to compile gsplat", f"{nvcc} of {release or 'an unknown version'}", advice)
-    compiler = os.environ.get("CXX", "c++")
-    if shutil.which(compiler) is None:
-        return Missing("a C++ compiler, to compile gsplat", f"no {compiler}", "install one (Debian: apt install g++)")
-    if not Path(sysconfig.get_paths()["include"], "Python.h").is_file():
-        return Missing("Python's headers, to compile gsplat", "no Python.h", "install them (Debian: python3-dev)")
-    if shutil.which("ninja") is None:
-        return Missing("ninja on PATH, to compile gsplat", "none", f"activate the environment, or {EXTRA}")
+    failure = trial()
+    if failure:
+        return Missing("a numba-cuda that works with the driver", failure, f"{install_line()}, or update the driver")
     return None
 
 
-def _nvcc() -> str | None:
-    """Return the compiler that PyTorch would call: of CUDA_HOME or CUDA_PATH, else on PATH, else the usual folder's."""
-    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
-    places = (f"{home}/bin/nvcc",) if home else ("nvcc", "/usr/local/cuda/bin/nvcc")
-    return next(filter(None, map(shutil.which, places)), None)
+@cache
+def trial() -> str:
+    """Compile a kernel and run it on a tensor of the first device; return what fails, or nothing."""
+    import torch
 
-
-def _release(nvcc: str) -> str | None:
-    """Return the toolkit's version, such as 12.8."""
     try:
-        text = subprocess.run([nvcc, "--version"], capture_output=True, text=True, timeout=20).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    found = re.search(r"release (\d+\.\d+)", text)
-    return found[1] if found else None
+        from numba import cuda
+
+        def add_one(a: Any) -> None:
+            a[0] += 1
+
+        one = torch.ones(1, device="cuda")
+        cuda.jit(add_one)[1, 1](cuda.as_cuda_array(one))
+        cuda.synchronize()
+        return "" if one.item() == 2 else "a wrong sum"
+    except Exception as e:  # the driver, the compiler and their bindings each have their own
+        return f"{type(e).__name__}: {str(e).strip().partition(chr(10))[0]}"

@@ -120,7 +120,7 @@ class Method(Protocol):
     Six attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
     the data sets that learned parts have seen, `refines_views`: its models have `refine` (see `refinement`),
     `description`, one line for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called
-    before the clock of a fit starts, and `rasterizes`: False lets it run on a GPU without gsplat.
+    before the clock of a fit starts, and `rasterizes`: False lets it run on a GPU without numba-cuda.
     """
 
     name: str

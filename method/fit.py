@@ -66,7 +66,7 @@ class Algorithm:
     fit: Callable[[FitJob], Model]
     published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
     supervisions: tuple[str, ...] = ()
-    rasterizes: bool = True  # renders Gaussians, which on CUDA needs gsplat
+    rasterizes: bool = True  # renders Gaussians, which on CUDA needs numba-cuda
 
 
 @dataclass(frozen=True)

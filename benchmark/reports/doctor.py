@@ -193,15 +193,17 @@ def _gpu() -> Iterator[Finding]:
             yield Finding("GPU", MISSING, f"an NVIDIA driver, but torch {torch.__version__} sees no device", PYTORCH)
         else:
             yield Finding("GPU", NOTE, "no CUDA device; everything runs on the CPU")
-        yield Finding("gsplat", NOTE, f"{_version('gsplat') or 'none'}; only a CUDA device needs it")
+        yield Finding(
+            "CUDA kernels", NOTE, f"numba-cuda {_version('numba-cuda') or 'none'}; only a CUDA device needs it"
+        )
         return
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     yield Finding("GPU", OK, f"{', '.join(names)} (CUDA {torch.version.cuda})")
     if missing := missing_rasterizer():
         found = f"renders on the CPU: needs {missing.expected}, found {missing.found}"
-        yield Finding("gsplat", MISSING, found, missing.fix)
+        yield Finding("CUDA kernels", MISSING, found, missing.fix)
     else:
-        yield Finding("gsplat", OK, f"{_version('gsplat')}; the first use may compile it")
+        yield Finding("CUDA kernels", OK, f"numba-cuda {_version('numba-cuda')}; a kernel was compiled and run")
 
 
 def _optional() -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Gaussian splatting: one `render` call over a float64 reference, a CPU kernel and gsplat on CUDA."""
+"""Gaussian splatting: one `render` call over a float64 reference, CPU kernels and CUDA kernels."""
 
 from spike4dgs.method.splat.api import render
 from spike4dgs.method.splat.kernels.threads import set_threads

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat.cpu import render_cpu
-from spike4dgs.method.splat.gsplat_cuda import render_cuda
+from spike4dgs.method.splat.cuda.render import render_cuda
 from spike4dgs.method.splat.reference import render_reference
 from spike4dgs.method.splat.types import EPS2D, NEAR, RenderOutput, Splats, Views
 
@@ -43,8 +43,8 @@ def render(
         antialiased: dim Gaussians that the pixel filter enlarges, so that their total light stays.
         near: Gaussians whose centre is nearer than this (in world units) are not rendered.
         eps2d: variance of the pixel filter, px^2.
-        backend: "reference" (float64, tiny scenes), "cpu" (numba), "cuda" (gsplat); "auto" chooses by the
-            device.
+        backend: "reference" (float64, tiny scenes), "cpu" (numba), "cuda" (numba-cuda); "auto" chooses by
+            the device.
 
     Raises:
         UserError: for wrong shapes, non-finite values, or a back end that is not installed.

@@ -9,14 +9,16 @@ at once gives, to the bit. No gradient flows to the background.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat import api, cpu
+from spike4dgs.method.splat import cpu
+from spike4dgs.method.splat.cuda.background import Layer as DeviceLayer
+from spike4dgs.method.splat.cuda.background import make_layer, render_over
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.project import Geometry
@@ -42,6 +44,7 @@ class Background:
         self.splats = Splats(*(t.detach() for t in (*splats.geometry, splats.colors)))
         self.views = views
         self._layers: dict[int, _Layer] = {}
+        self._on_device: DeviceLayer | None = None
 
     def __len__(self) -> int:
         return len(self.splats)
@@ -51,16 +54,15 @@ class Background:
 
         `radii` and `means2d` are those of `splats` alone. Raises UserError for values that are not finite.
         """
-        views = Views(self.views.w2c[list(chosen)], self.views.K[list(chosen)], self.views.width, self.views.height)
         if splats.means.device.type != "cpu":
-            out = api.render(join(self.splats, splats), views)
-            return replace(out, radii=out.radii[:, len(self) :])
+            self._on_device = self._on_device or make_layer(self.splats, self.views)
+            return render_over(self._on_device, splats, chosen)
         if not torch.isfinite(splats.colors.detach().sum()):
             cpu.require_finite(splats)
         tensors = _tensors(splats)
         wanted = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-        means2d = torch.zeros(len(views), len(splats), 2, requires_grad=wanted)
-        radii = torch.zeros(len(views), len(splats))
+        means2d = torch.zeros(len(chosen), len(splats), 2, requires_grad=wanted)
+        radii = torch.zeros(len(chosen), len(splats))
         image, alpha = _Over.apply(*(t.float() for t in tensors), means2d, self, tuple(chosen), radii)
         return RenderOutput(image.permute(0, 2, 3, 1), alpha, None, radii, means2d)
 

@@ -13,6 +13,8 @@ with m the blurred images, q the blurred squares and product. This is the traini
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,7 +40,7 @@ _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean SSIM of images [B, H, W] against targets [B, H, W], differentiable in `image`.
 
-    CPU tensors go through the kernels in float32, others through `ssim_reference`.
+    CPU tensors go through the kernels in float32, others through torch: the same formula with the window as a matrix.
     Raises UserError for other shapes, or for a target that wants a gradient, which the kernels do not give.
     """
     if image.ndim != 3 or image.shape != target.shape or image.numel() == 0:
@@ -47,19 +49,43 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     if target.requires_grad:
         raise problem("ssim", "a target without gradient", "requires_grad", "pass the rendered image first")
     if image.device.type != "cpu":
-        return ssim_reference(image, target)
+        return _mean_ssim(image, target, _banded)
     value: Tensor = _FusedSsim.apply(image, target)  # type: ignore[no-untyped-call]
     return value
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean SSIM by plain torch, in the precision of the inputs: the twin of the kernels."""
-    window = torch.as_tensor(_WINDOW, dtype=image.dtype, device=image.device)
+    return _mean_ssim(image, target, _convolved)
 
-    def blur(x: Tensor) -> Tensor:
-        rows = functional.conv2d(x[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
-        return functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
 
+def _convolved(x: Tensor) -> Tensor:
+    """Return images [B, H, W] blurred by two convolutions."""
+    window = torch.as_tensor(_WINDOW, dtype=x.dtype, device=x.device)
+    rows = functional.conv2d(x[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
+    return functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
+
+
+def _banded(x: Tensor) -> Tensor:
+    """Return images [B, H, W] blurred by two matrix products.
+
+    On a GPU torch rounds the inputs of float32 convolutions to 10 bits by default (TF32). SSIM subtracts the square of
+    a mean from a mean of squares, which leaves nothing of that. Matrix products stay in float32.
+    """
+    down, across = (_band(size, x.dtype, x.device) for size in x.shape[1:])
+    return down @ x @ across
+
+
+@cache
+def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the symmetric matrix [size, size] that blurs a line. It is made once: a fit asks for it in every step."""
+    line = torch.arange(size)
+    away = (line[:, None] - line).abs()
+    inside = torch.as_tensor(_WINDOW)[(RADIUS + away).clamp(max=2 * RADIUS)]
+    return torch.where(away <= RADIUS, inside, 0.0).to(device, dtype)
+
+
+def _mean_ssim(image: Tensor, target: Tensor, blur: Callable[[Tensor], Tensor]) -> Tensor:
     m1, m2 = blur(image), blur(target)
     q1, q2, q12 = blur(image * image), blur(target * target), blur(image * target)
     numerator = (2 * m1 * m2 + C1) * (2 * (q12 - m1 * m2) + C2)

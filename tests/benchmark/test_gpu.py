@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import stat
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +20,12 @@ from spike4dgs.benchmark.gpu import Missing, missing_rasterizer
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images import on_device
 
-# A PyTorch that claims a GPU, in an environment that has no gsplat.
+# A PyTorch that claims a GPU, in an environment that has no numba-cuda.
 _CLAIM = """
 import importlib.util, sys, torch
 torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 1
 found = importlib.util.find_spec
-importlib.util.find_spec = lambda name, *a: None if name == "gsplat" else found(name, *a)
+importlib.util.find_spec = lambda name, *a: None if name == "numba_cuda" else found(name, *a)
 """
 _RUN = """
 from types import SimpleNamespace
@@ -49,7 +49,7 @@ def claimed(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_gpu_without_gsplat_means_the_cpu_and_one_line(small_scene: Path, tmp_path: Path) -> None:
+def test_a_gpu_without_kernels_means_the_cpu_and_one_line(small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     methods = ("nearest-view", "tiny")
     arguments = ("--methods", *methods, "--metrics", "psnr", "--out", str(out))
@@ -66,14 +66,14 @@ def test_a_gpu_without_gsplat_means_the_cpu_and_one_line(small_scene: Path, tmp_
         assert prediction["device"] == "cpu"
 
 
-def test_asking_for_the_gpu_without_gsplat_is_one_error_before_any_fit(small_scene: Path, tmp_path: Path) -> None:
+def test_asking_for_the_gpu_without_kernels_is_one_error_before_any_fit(small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ("run-benchmark", str(small_scene), "--methods", "tiny", "--device", "cuda", "--out", str(out))
     done = claimed(_RUN, *arguments)
     assert done.returncode == 2 and not out.exists()
     assert done.stderr == (
-        "error: --device cuda: expected the package gsplat, found none; pip install 'spike4dgs[cuda]', which also "
-        "needs a CUDA toolkit; or use --device cpu\n"
+        "error: --device cuda: expected the package numba-cuda, found none; pip install 'spike4dgs[cuda]'; or use "
+        "--device cpu\n"
     )
 
 
@@ -87,13 +87,13 @@ for device in ("cpu", "auto", "auto"):
     assert [line for line in lines if line != "cpu"] == [lines[1]] and lines[0] == "cpu" and len(lines) == 4
 
 
-def test_networks_take_the_gpu_without_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks_take_the_gpu_without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(environment, "missing_rasterizer", lambda: Missing("gsplat", "none", "install it"))
+    monkeypatch.setattr(environment, "missing_rasterizer", lambda: Missing("numba", "none", "install it"))
     assert choose_device("auto", rasterizes=False) == "cuda"
     assert choose_device("cuda:0", rasterizes=False) == "cuda:0"
-    with pytest.raises(UserError, match="--device cuda:0: expected gsplat, found none; install it; or use"):
+    with pytest.raises(UserError, match="--device cuda:0: expected numba, found none; install it; or use"):
         choose_device("cuda:0")
     monkeypatch.setattr(environment, "missing_rasterizer", lambda: None)
     assert choose_device("auto") == "cuda" and choose_device("cuda") == "cuda"
@@ -110,63 +110,39 @@ def test_image_makers_with_a_network_follow_the_fit(name: str, monkeypatch: pyte
     assert on_device(IMAGES["tfp"], "cuda:7") is IMAGES["tfp"]
 
 
-def executable(path: Path, text: str = "") -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!/bin/sh\necho '{text}'\n")
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    return path
-
-
 @pytest.fixture
-def gsplat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An installed gsplat without a compiled extension, under a PyTorch for CUDA 12.8, and nothing on PATH."""
-    package = tmp_path / "site/gsplat"
-    package.mkdir(parents=True)
-    (package / "__init__.py").write_text("raise AssertionError('imported')")
-    monkeypatch.syspath_prepend(str(package.parent))
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba-cuda beside a PyTorch for CUDA 12.8, and a trial that succeeds."""
+    found = gpu.find_spec
+    monkeypatch.setattr(gpu, "find_spec", lambda name: found("numba") if name == "numba_cuda" else found(name))
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    for name in ("CUDA_PATH", "CXX"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "cuda"))
-    monkeypatch.setattr(gpu.sysconfig, "get_paths", lambda: {"include": str(tmp_path / "include")})
-    return package
+    monkeypatch.setattr(gpu, "trial", lambda: "")
 
 
-def test_a_compiled_gsplat_is_enough(gsplat: Path) -> None:
-    (gsplat / "csrc.cpython-312-x86_64-linux-gnu.so").touch()
+@pytest.mark.usefixtures("installed")
+def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert missing_rasterizer() is None
-
-
-def test_each_part_that_compiling_needs_is_named(gsplat: Path, tmp_path: Path) -> None:
-    def found() -> tuple[str, str]:
-        missing = missing_rasterizer()
-        assert missing and missing.fix
-        return missing.expected, missing.found
-
-    assert found() == ("the CUDA toolkit 12.8, to compile gsplat", "no nvcc")
-    nvcc = executable(tmp_path / "cuda/bin/nvcc", "Cuda compilation tools, release 11.8, V11.8.89")
-    assert found() == ("the CUDA toolkit 12.8, to compile gsplat", f"{nvcc} of 11.8")
-    executable(nvcc, "Cuda compilation tools, release 12.4, V12.4.131")
-    assert found() == ("a C++ compiler, to compile gsplat", "no c++")
-    executable(tmp_path / "bin/c++")
-    assert found() == ("Python's headers, to compile gsplat", "no Python.h")
-    (tmp_path / "include").mkdir()
-    (tmp_path / "include/Python.h").touch()
-    assert found() == ("ninja on PATH, to compile gsplat", "none")
-    executable(tmp_path / "bin/ninja")
-    assert missing_rasterizer() is None
-
-
-def test_nvcc_is_found_on_the_path_too(gsplat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CUDA_HOME")
-    nvcc = executable(tmp_path / "bin/nvcc", "release 13.0")
+    monkeypatch.setattr(gpu, "trial", lambda: "CudaAPIError: the driver is too old")
     missing = missing_rasterizer()
-    assert missing and missing.found == f"{nvcc} of 13.0"
-
-
-@pytest.mark.usefixtures("gsplat")
-def test_gsplat_needs_a_pytorch_with_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert missing and missing.found == "CudaAPIError: the driver is too old"
+    assert missing.fix == "pip install 'spike4dgs[cuda12]', or update the driver"
     monkeypatch.setattr(torch.version, "cuda", None)
     missing = missing_rasterizer()
     assert missing and missing.expected == "a PyTorch with CUDA" and "pytorch.org" in missing.fix
+    monkeypatch.setattr(gpu, "find_spec", lambda name: None)
+    missing = missing_rasterizer()
+    assert missing and missing.expected == "the package numba-cuda" and missing.fix == "pip install 'spike4dgs[cuda]'"
+
+
+@pytest.mark.parametrize(("cuda", "extra"), [("12.6", "cuda12"), ("13.0", "cuda"), (None, "cuda")])
+def test_the_extra_is_that_of_pytorchs_cuda(cuda: str | None, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    assert gpu.install_line() == f"pip install 'spike4dgs[{extra}]'"
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert extra in project["optional-dependencies"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_a_trial_without_a_device_fails_in_one_line() -> None:
+    failure = gpu.trial()
+    assert failure and "\n" not in failure

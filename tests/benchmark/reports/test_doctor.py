@@ -124,18 +124,21 @@ def test_optional_packages_and_libraries_come_with_their_line(monkeypatch: pytes
     assert found("libnothing0").fix == "apt-get install libnothing0"
 
 
-def test_a_gpu_without_gsplat_is_optional_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_without_kernels_is_optional_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor.ctypes.util, "find_library", lambda name: None)
-    assert found("GPU").state == found("gsplat").state == NOTE
+    assert found("GPU").state == found("CUDA kernels").state == NOTE
     monkeypatch.setattr(doctor.ctypes.util, "find_library", lambda name: f"lib{name}.so.1")
     assert found("GPU").state == MISSING and "pytorch.org" in found("GPU").fix
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda i: f"Toy {i}")
-    monkeypatch.setattr(doctor, "missing_rasterizer", lambda: Missing("nvcc", "none", "install it"))
+    monkeypatch.setattr(doctor, "missing_rasterizer", lambda: Missing("numba", "none", "install it"))
     assert found("GPU").found.startswith("Toy 0")
-    assert found("gsplat") == Finding("gsplat", MISSING, "renders on the CPU: needs nvcc, found none", "install it")
+    wanted = Finding("CUDA kernels", MISSING, "renders on the CPU: needs numba, found none", "install it")
+    assert found("CUDA kernels") == wanted
+    monkeypatch.setattr(doctor, "missing_rasterizer", lambda: None)
+    assert found("CUDA kernels").state == OK
 
 
 def test_the_command_takes_no_arguments() -> None:

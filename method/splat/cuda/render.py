@@ -1,0 +1,179 @@
+"""Back end "cuda": torch projects and sorts, the kernels composite, and all of it is on the tensors' device.
+
+The results are those of `reference.py`: projected in float64, composited in float32. Equal inputs give equal bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.gpu import missing_rasterizer
+from spike4dgs.method.splat.cuda.launch import launch, simulated
+from spike4dgs.method.splat.cuda.lists import TILE, Grid, Lists, all_tiles, make_pairs, sort_pairs
+from spike4dgs.method.splat.cuda.project import Seen, project
+from spike4dgs.method.splat.types import RenderOutput, Splats, Views, require_finite
+
+THREADS = TILE * TILE  # of a block: one for each pixel
+MAX_CHANNELS = 4  # of one kernel call, which keeps them in registers
+
+
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """What the rows of a render lie in front of: B rows without gradient, and the images where nothing else is."""
+
+    records: Tensor  # [B, 6] float64
+    layers: Tensor  # [B, F] float32
+    image: Tensor  # [C, F, H, W]
+    alpha: Tensor  # [C, H, W]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What the kernels need beside the M differentiable rows, which follow those of `behind`."""
+
+    lists: Lists
+    starts: Tensor  # [M + 1], see Pairs
+    behind: Behind | None = None
+
+
+class _Blend(torch.autograd.Function):
+    """Records [M, 6] float64 and layers [M, F] float32 in, image [C, F, H, W] and alpha [C, H, W] out."""
+
+    @staticmethod
+    def forward(ctx: Any, records: Tensor, layers: Tensor, job: Job) -> tuple[Tensor, Tensor]:
+        grid, lists, behind = job.lists.grid, job.lists, job.behind
+        records, layers = records.detach().contiguous(), layers.detach().contiguous()
+        channels, size = layers.shape[1], (grid.height, grid.width)
+        if behind is None:
+            image, alpha = layers.new_empty(grid.views, channels, *size), layers.new_empty(grid.views, *size)
+        else:
+            records, layers = torch.cat([behind.records, records]), torch.cat([behind.layers, layers])
+            image, alpha = behind.image.clone(memory_format=torch.contiguous_format), behind.alpha.clone()
+        forward, _ = _kernels(channels)
+        arguments = (records, layers, lists.rows, lists.offsets, lists.tiles, grid.across, grid.down, image, alpha)
+        launch(forward, len(lists.tiles), THREADS, records.device, *arguments)
+        ctx.save_for_backward(records, layers, image, alpha)
+        ctx.job = job
+        return image, alpha
+
+    @staticmethod
+    def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+        records, layers, image, alpha = ctx.saved_tensors
+        lists, starts = ctx.job.lists, ctx.job.starts
+        _, backward = _kernels(layers.shape[1])
+        values = 6 + layers.shape[1]
+        sums = layers.new_zeros(max(int(lists.slots.shape[0]), 1), values)
+        launch(
+            backward, len(lists.tiles), THREADS, records.device, records, layers, lists.rows, lists.slots,
+            lists.offsets, lists.tiles, lists.grid.across, lists.grid.down, image, alpha, d_image.contiguous(),
+            d_alpha.contiguous(), sums,
+        )  # fmt: skip
+        own = len(starts) - 1
+        totals = records.new_zeros(own, values)
+        launch(_sum_kernel(), -(-totals.numel() // THREADS), THREADS, records.device, sums, starts, totals)
+        return _chain(records[len(records) - own :], totals[:, :6]), totals[:, 6:].float(), None
+
+
+def _chain(records: Tensor, moments: Tensor) -> Tensor:
+    """Return the gradient [M, 6] of the records from the sums of s, s xi, s eta, s xi^2, s xi eta, s eta^2.
+
+    ln alpha = ln opacity - xi^2 - eta^2 with xi = a (x - cx), eta = b ((y - cy) - slope (x - cx)).
+    """
+    _, _, slope, a, b, opacity = records.unbind(-1)
+    s, s_xi, s_eta, s_xi_xi, s_xi_eta, s_eta_eta = moments.unbind(-1)
+    d_center = (2 * a * s_xi - 2 * b * slope * s_eta, 2 * b * s_eta)
+    return torch.stack([*d_center, 2 * b / a * s_xi_eta, -2 * s_xi_xi / a, -2 * s_eta_eta / b, s / opacity], -1)
+
+
+@cache
+def _kernels(channels: int) -> tuple[Any, Any]:
+    from spike4dgs.method.splat.cuda.kernels import blend_kernels
+
+    return blend_kernels(channels)
+
+
+@cache
+def _sum_kernel() -> Any:
+    from spike4dgs.method.splat.cuda.kernels import sum_pairs
+
+    return sum_pairs
+
+
+def blend(records: Tensor, layers: Tensor, job: Job) -> tuple[Tensor, Tensor]:
+    """Composite any number of layers, some at a time; the alpha image is the first call's."""
+    images, alphas = [], []
+    for first in range(0, layers.shape[1], MAX_CHANNELS):
+        some = slice(first, first + MAX_CHANNELS)
+        part = job
+        if job.behind is not None:
+            behind = replace(job.behind, layers=job.behind.layers[:, some], image=job.behind.image[:, some])
+            part = replace(job, behind=behind)
+        image, alpha = _Blend.apply(records, layers[:, some], part)
+        images.append(image)
+        alphas.append(alpha)
+    return torch.cat(images, 1), alphas[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """The visible Gaussians of some splats in some views, ready for the kernels, and their statistics."""
+
+    seen: Seen
+    records: Tensor  # [M, 6] float64
+    radii: Tensor  # [C, N] px
+    means2d: Tensor  # [C, N, 2] px
+
+
+def project_splats(splats: Splats, views: Views, *, antialiased: bool, near: float, eps2d: float) -> Projected:
+    """Project splats and make the tensor that receives dL/dmeans2d. Raises UserError for NaN."""
+    tensors = (*splats.geometry, splats.colors)
+    if not torch.isfinite(torch.stack([t.detach().sum().double() for t in tensors]).sum()):
+        require_finite(splats)
+    seen = project(splats, views, antialiased, near, eps2d)
+    wide = any(t.dtype == torch.float64 for t in splats.geometry)
+    shape, at = (len(views), len(splats)), (seen.view, seen.index)
+    means2d = seen.center.new_zeros(*shape, 2, dtype=torch.float64 if wide else torch.float32)
+    means2d[at] = seen.center.detach().to(means2d)
+    radii = seen.radius.new_zeros(shape, dtype=torch.float32)
+    radii[at] = seen.radius.float()
+    center = seen.center
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, views.w2c)):
+        means2d.requires_grad_()
+        center = center + (means2d - means2d.detach())[at].double()  # adds 0, and receives the centre's gradient
+    return Projected(seen, torch.cat([center, seen.shape], -1), radii, means2d)
+
+
+def render_cuda(
+    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
+) -> RenderOutput:
+    """Render with the back end "cuda": see `render` for the arguments."""
+    device = splats.means.device
+    if not simulated():
+        if device.type != "cuda":
+            raise problem("back end cuda", "tensors on a CUDA device", str(device), "move them with .cuda()")
+        if missing := missing_rasterizer():
+            fix = f"{missing.fix}, or move the tensors to the CPU"
+            raise problem("back end cuda", missing.expected, missing.found, fix)
+    views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
+    p, grid = project_splats(splats, views, antialiased=antialiased, near=near, eps2d=eps2d), grid_of(views)
+    layers = splats.colors[p.seen.index].float()
+    if depth:
+        layers = torch.cat([layers, p.seen.depth[:, None].float()], -1)
+    pairs = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
+    slots = torch.arange(len(pairs.keys), device=device)
+    job = Job(sort_pairs(grid, pairs.keys, pairs.rows, slots, all_tiles(grid, device)), pairs.starts)
+    image, alpha = blend(p.records, layers, job)
+    image = image.permute(0, 2, 3, 1)
+    image, far = (image[..., :-1], image[..., -1]) if depth else (image, None)
+    return RenderOutput(image, alpha, far, p.radii, p.means2d)
+
+
+def grid_of(views: Views) -> Grid:
+    """Return the tiles of all views."""
+    return Grid(len(views), views.width, views.height)

@@ -1,0 +1,32 @@
+"""The CUDA kernels in numba's simulator against the float64 reference, on any machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SUPPORT = Path(__file__).resolve().parents[3] / "support"
+# Some in one process, because it starts slowly; hard scenes by the name of their function in splat_scenes.
+GROUPS = [
+    ["near_plane", "needles", "pancakes", "tiny_and_huge"],
+    ["opacities", "equal_depths", "off_screen", "nothing"],
+    ["far_origin", "opaque_stack", "zero_quaternions"],
+    ["one channel", "three channels with depth", "five channels"],
+    ["behind and over", "same bits"],
+]
+
+
+@pytest.mark.parametrize("cases", GROUPS, ids=lambda cases: cases[0])
+def test_images_and_gradients(cases: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, str(SUPPORT / "cuda_simulator.py"), *cases],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == cases

@@ -1,0 +1,124 @@
+"""numba's CUDA simulator for tests: each case is compared in this process, which needs NUMBA_ENABLE_CUDASIM=1.
+
+    python cuda_simulator.py CASE...
+
+The simulator runs a block's threads as Python threads and asks them in a busy loop where they are, which keeps them
+from running. Here they meet at a barrier: in our kernels all threads of a block reach every synchronisation.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numba.cuda.simulator import kernel
+from splat_parity import compare
+from splat_scenes import HARD, HEIGHT, WIDTH, random_splats, views
+
+from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat.cuda.background import make_layer, render_over
+
+SCALE = 0.22  # of the image: 22 x 15 pixels are two tiles
+
+
+def run_block(self: Any, grid_point: Any, *args: Any) -> None:
+    """Run one block's threads to their end; raise the first one's exception."""
+    size = int(np.prod(self._block_dim))
+    barrier = threading.Barrier(size)
+    threads = []
+    for point in np.ndindex(*self._block_dim):
+
+        def target() -> None:
+            try:
+                self._f(*args)
+            except BaseException:
+                barrier.abort()
+                raise
+
+        thread = kernel.BlockThread(target, self, grid_point, point, False)
+        thread.syncthreads = barrier.wait
+        threads.append(thread)
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    failed = [t.exception for t in threads if t.exception and t.exception[0] is not threading.BrokenBarrierError]
+    failed += [t.exception for t in threads if t.exception]
+    if failed:
+        raise failed[0][0].with_traceback(failed[0][1])
+
+
+def small(splats: Splats, v: Views, count: int = 24) -> tuple[Splats, Views]:
+    """Return some of the Gaussians in smaller images of the first view or two."""
+    step = max(1, len(splats) // count)
+    K = v.K.clone()
+    K[:, :2] *= SCALE
+    few = Splats(*(t[::step][:count] for t in (*splats.geometry, splats.colors)))
+    return few, Views(v.w2c[-1:], K[-1:], round(WIDTH * SCALE), round(HEIGHT * SCALE))
+
+
+def behind_and_over() -> None:
+    """A background and others in front of it against all of them at once: equal bits, and equal gradients."""
+    splats, v = small(random_splats(24, 2, seed=31), views(2))
+    v = Views(torch.cat([v.w2c, views(2).w2c[:1]]), v.K.repeat(2, 1, 1), v.width, v.height)
+    behind = Splats(*(t[:18] for t in (*splats.geometry, splats.colors)))
+    # In a corner: the other tile is copied.
+    shrink = torch.tensor([1, 1, 1]) * 0.2
+    corner = splats.means[18:] * 0.1 + torch.tensor([-0.3, 0.0, 1.0])
+    front = [corner, splats.quats[18:], splats.scales[18:] * shrink, splats.opacities[18:], splats.colors[18:]]
+    results = []
+    for joined in (True, False):
+        leaves = [t.clone().requires_grad_() for t in front]
+        if joined:
+            pairs = zip((*behind.geometry, behind.colors), leaves, strict=True)
+            out = render(Splats(*(torch.cat(p) for p in pairs)), Views(v.w2c[[1]], v.K[[1]], v.width, v.height), backend="cuda")  # fmt: skip
+        else:
+            out = render_over(make_layer(behind, v), Splats(*leaves), [1])
+        g = torch.Generator().manual_seed(1)
+        (out.image * torch.randn(out.image.shape, generator=g)).sum().backward()
+        assert out.means2d.grad is not None
+        grads = [t.grad for t in leaves] + [out.means2d.grad[:, -6:], out.radii[:, -6:]]
+        results.append([out.image.detach(), out.alpha.detach(), *grads])
+    assert (results[0][-1] > 0).any()
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b)
+
+
+def same_bits() -> None:
+    """Two renders of the same give the same bits, gradients too."""
+    splats, v = small(random_splats(24, 1, seed=32), views(1))
+    results = []
+    for _ in range(2):
+        leaves = [t.clone().requires_grad_() for t in (*splats.geometry, splats.colors)]
+        out = render(Splats(*leaves), v, backend="cuda")
+        out.image.square().sum().backward()
+        results.append([out.image.detach(), *(t.grad for t in leaves)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def random_case(seed: int, channels: int, depth: bool, antialiased: bool) -> Callable[[], None]:
+    """Return the comparison of random Gaussians."""
+    return lambda: compare(
+        *small(random_splats(24, channels, seed=seed), views(1)), "cuda", depth=depth, antialiased=antialiased
+    )
+
+
+CASES: dict[str, Callable[[], None]] = {
+    **{f.__name__: (lambda f=f: compare(*small(*f()), "cuda")) for f in HARD},
+    "one channel": random_case(1, 1, False, False),
+    "three channels with depth": random_case(2, 3, True, True),
+    "five channels": random_case(3, 5, False, False),
+    "behind and over": behind_and_over,
+    "same bits": same_bits,
+}
+
+
+if __name__ == "__main__":
+    kernel.BlockManager.run = run_block
+    for name in sys.argv[1:]:
+        CASES[name]()
+        print(name)
