@@ -68,8 +68,8 @@ def device_type(device: str) -> str:
 def choose_device(device: str, *, rasterizes: bool = True) -> str:
     """Resolve `auto` and check that the device exists. Raises UserError where it does not.
 
-    What `rasterizes` computes on CUDA only where numba-cuda works too. Without it `auto` is the CPU, and one line on stderr
-    says how to change that.
+    What `rasterizes` computes on CUDA only where numba-cuda works too. Without it `auto` is the CPU, and one line on
+    stderr says how to change that.
     """
     kind = device_type(device)
     if kind not in ("auto", "cpu", "cuda"):

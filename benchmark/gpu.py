@@ -1,4 +1,4 @@
-"""The judgement whether Gaussians can be rendered on CUDA here: by numba-cuda, which compiles kernels without a toolkit.
+"""The judgement whether Gaussians can be rendered on CUDA here, by numba-cuda, which compiles without a toolkit.
 
 The compiler comes with the package's extra for a version of CUDA. Whether it, the driver and PyTorch go together is
 known only from a trial, so one is made: a kernel of one line, compiled and run on a tensor.

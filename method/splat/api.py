@@ -57,7 +57,7 @@ def render(
     if not (near > 0 and eps2d >= 0):
         raise problem("render", "near > 0 and eps2d >= 0", f"near {near}, eps2d {eps2d}", "correct the argument")
     if backend == "auto":
-        backend = "cuda" if splats.means.is_cuda else "cpu"
+        backend = "cpu" if splats.means.device.type == "cpu" else "cuda"
     if backend not in _BACKENDS:
         raise problem("backend", ", ".join(["auto", *_BACKENDS]), str(backend), "choose one of them")
     if backend != "cuda" and splats.means.device.type != "cpu":

@@ -9,12 +9,13 @@ their outputs are filled with a constant.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
 
@@ -49,12 +50,25 @@ class Pretend(Tensor):
 
     __array__ = numpy
 
+    def new_tensor(self, data: Any, dtype: torch.dtype | None = None) -> Tensor:  # type: ignore[override]
+        return torch.tensor(data, dtype=dtype or self.dtype, device=DEVICE)
 
-def is_device(device: Any) -> bool:
-    return device is not None and torch.device(device).type == DEVICE
+    def __getitem__(self, index: Any) -> Tensor:
+        return super().__getitem__(_with_tensors(index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        super().__setitem__(_with_tensors(index), value)
+
+
+def _with_tensors(index: Any) -> Any:
+    """Return an index with tensors for lists, which PyTorch would make on the device, where no mode can see it."""
+    if isinstance(index, tuple):
+        return tuple(map(_with_tensors, index))
+    return torch.as_tensor(index) if isinstance(index, list) else index
 
 
 def run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Run an operation on the numbers of its tensors, if a GPU would; return tensors of the device it runs on."""
     name = func.__name__.split(".")[0]
     tensors = [t for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)]
     theirs = [t for t in tensors if isinstance(t, Pretend)]
@@ -63,7 +77,7 @@ def run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         raise RuntimeError(f"{func}: tensors of both devices, {[tuple(t.shape) for t in plain]} on the CPU")
     on_device = bool(theirs)
     if "device" in kwargs and kwargs["device"] is not None:
-        on_device = is_device(kwargs["device"])
+        on_device = torch.device(kwargs["device"]).type == DEVICE
         kwargs = {**kwargs, "device": torch.device("cpu")}
     if on_device and kwargs.get("generator") is not None:
         raise RuntimeError(f"{func}: a CPU generator for a tensor of the device")
@@ -89,19 +103,24 @@ class _Mode(TorchDispatchMode):
 def _fill(kernel: Any, blocks: int, threads: int, device: torch.device, *arguments: Any) -> None:
     for a in arguments:
         assert not isinstance(a, Tensor) or isinstance(a, Pretend), "a tensor of the CPU for a kernel"
-        if isinstance(a, Tensor) and a.is_floating_point() and not a.requires_grad and a.dtype == torch.float32:
-            pass
-    outputs = arguments[-2:] if len(arguments) == 9 else arguments[-1:]
-    for out in outputs:
+    for out in arguments[-2:] if kernel == "forward" else arguments[-1:]:
         out.fill_(0.01)
 
 
 @contextmanager
 def pretend_device() -> Iterator[str]:
     """Pretend that there is a device; yield its name."""
+    make, devices = torch.tensor, optimizer._get_fused_kernels_supported_devices
+
+    def tensor(data: Any, *, device: Any = None, **options: Any) -> Tensor:
+        return make(data, **options).to(device or "cpu")  # PyTorch makes the numbers where no mode can see it
+
     with pytest.MonkeyPatch.context() as patch, _Mode():
+        patch.setattr(torch, "tensor", tensor)
+        patch.setattr(torch, "autocast", lambda *args, **options: nullcontext())
+        patch.setattr(optimizer, "_get_fused_kernels_supported_devices", lambda: [*devices(), DEVICE])
         patch.setattr(render, "launch", _fill)
-        patch.setattr(render, "_kernels", lambda channels: (None, None))
-        patch.setattr(render, "_sum_kernel", lambda: None)
+        patch.setattr(render, "_kernels", lambda channels: ("forward", "backward"))
+        patch.setattr(render, "_sum_kernel", lambda: "sum")
         patch.setattr(render, "simulated", lambda: True)
         yield DEVICE

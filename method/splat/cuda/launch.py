@@ -1,7 +1,7 @@
 """Launching numba's CUDA kernels on torch tensors: on torch's current stream, or in numba's simulator.
 
-With NUMBA_ENABLE_CUDASIM=1 numba runs a kernel as Python threads on NumPy arrays. That shows the arithmetic on a machine
-without a device, slowly, and nothing else: neither the compilation nor the speed.
+With NUMBA_ENABLE_CUDASIM=1 numba runs a kernel as Python threads on NumPy arrays. That shows the arithmetic on a
+machine without a device, slowly, and nothing else: neither the compilation nor the speed.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import set_threads
-from spike4dgs.method.splat.ssim import C1, ssim, ssim_reference
+from spike4dgs.method.splat.ssim import C1, _banded, _convolved, ssim, ssim_reference
 
 
 def images(batch: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -28,6 +28,13 @@ def test_value_and_gradient_equal_the_float64_twin(shape: tuple[int, int, int]) 
     assert abs(value.item() - expected.item()) < 1e-6
     assert fast.grad is not None and slow.grad is not None
     assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm()
+
+
+@pytest.mark.parametrize("shape", [(1, 125, 200), (2, 7, 5), (1, 1, 1)])
+def test_matrix_products_blur_as_convolutions_do(shape: tuple[int, int, int]) -> None:
+    """The blur of other devices."""
+    x = images(*shape)[0].double()
+    torch.testing.assert_close(_banded(x), _convolved(x))
 
 
 @pytest.mark.parametrize(

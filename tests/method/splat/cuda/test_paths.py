@@ -1,0 +1,62 @@
+"""Every path on a pretended device: nothing mixes its tensors with those of the CPU. See `pretend_device`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import saved_models
+import torch
+from pretend_device import DEVICE, pretend_device
+from toy_bursts import write_toy_shard
+
+from spike4dgs.baselines.recipes import METHODS
+from spike4dgs.benchmark.method import FitRequest
+from spike4dgs.benchmark.scene.bursts import open_folder
+from spike4dgs.method.msdi import TINY
+from spike4dgs.method.msdi.training.data import Bursts
+from spike4dgs.method.msdi.training.train import Training, TrainingSettings
+from spike4dgs.method.saved_model import load_model
+
+# HexPlane, STG, tracking, paths over a frozen background, the radiance field, and each loss.
+PATHS = [
+    *("tfp+static", "tfp+4dgs", "tfp+stg", "tfp+d3dgs", "dy-spikegs", "dy-spikenerf", "spike4dgs-x"),
+    *("tfp+4dgs+spike", "tfp+4dgs+pixel+spike", "tfp+4dgs+spss"),
+]
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_a_fit_stays_on_its_device(name: str) -> None:
+    with pretend_device() as device:
+        METHODS[name].warm_up(FitRequest(device=device))
+
+
+@pytest.mark.parametrize("name", saved_models.MODELS)
+def test_a_saved_model_renders_on_its_device(name: str, tmp_path: Path) -> None:
+    saved_models.model(name).save(tmp_path / "model", saved_models.provenance())
+    with pretend_device() as device:
+        image = load_model(tmp_path / "model", device).model.render(saved_models.WORLD.cameras[0], 1000.0)
+    assert image.shape == (24, 40)
+
+
+def test_msdi_trains_on_its_device(tmp_path: Path) -> None:
+    write_toy_shard(tmp_path, 13, instants=1)
+    data = Bursts(open_folder(tmp_path))
+    settings = TrainingSettings(steps=4, views=4, most_views=3, lr_points=4e-3, warm_up=1)
+    with pretend_device() as device:
+        training = Training(data, TINY, settings, device, seed=1)
+        for _ in range(2):
+            training.train_step()
+
+
+def test_the_device_refuses_what_a_gpu_refuses() -> None:
+    with pretend_device():
+        here, there = torch.ones(3), torch.ones(3, device=DEVICE)
+        assert there.device.type == DEVICE and (there + 1).cpu().tolist() == [2, 2, 2]
+        for mix in (lambda: here + there, lambda: torch.cat([here, there]), lambda: here[there.long()]):
+            with pytest.raises(RuntimeError):
+                mix()
+        with pytest.raises(TypeError):
+            there.numpy()
+        with pytest.raises(RuntimeError, match="generator"):
+            torch.rand(3, generator=torch.Generator(), device=DEVICE)
