@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
 from spike4dgs.generators.recorder.frames.cutting import Cutter, First, agree, first_frame, joined
+from spike4dgs.generators.recorder.frames.delivery import Delivery
 from spike4dgs.generators.recorder.frames.gaps import INTERRUPTED
 from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout, make_layout
 from spike4dgs.generators.recorder.frames.ring import Ring
 from spike4dgs.generators.recorder.frames.ticks import Run
+from spike4dgs.generators.recorder.memory import buffer_seconds
 from spike4dgs.generators.recorder.profile.profile import PRIMARY, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.rates import Rate, Rates
 from spike4dgs.generators.recorder.usb.reader import Reader
@@ -55,8 +57,9 @@ def capture(
     are started before the primary, and every camera's first byte begins its first frame. Where a camera cannot be
     stopped, all cameras continue from the rehearsal, and tick 0 is the first whole frame after TRIGGERED.
 
-    Without `sink` all frames stay in memory and `frames` are views of it. With it (continuous mode) whole frames are
-    passed on during the capture. A sink that is too slow loses ticks, which are recorded as gaps.
+    Without `sink` all frames stay in memory and `frames` are views of it. With it (continuous mode) a thread passes
+    whole frames on during the capture. While the sink waits, `ring_seconds` of data wait in memory; beyond them ticks
+    are lost, and recorded as gaps. The reading threads never wait for the sink.
 
     A camera that fails after the trigger stops alone, and the rest of its clip is a gap: after a stall, too much data
     (babble), unplugging, `timeout_ms` without data, or, without tags, a short read in the middle of a frame. A short
@@ -103,6 +106,7 @@ class _Capture:
         self.rings = {camera: Ring(slots, profile.transfer_bytes) for camera in self.links}
         self.readers: dict[str, Reader] = {}
         self.cutters: dict[str, Cutter] = {}
+        self.delivery: Delivery | None = None
         self.sync = ARRIVAL_TIMES
         self.sending = self.interrupted = False
 
@@ -132,22 +136,20 @@ class _Capture:
             reader.keep.set()
 
     def record(self) -> None:
-        """Wait for the last bytes of all cameras; pass frames to the sink meanwhile."""
+        """Wait for the last bytes of all cameras, and until the sink has received them."""
         rates = Rates(self.layout, self.readers, self.on_rate)
         try:
             while any(r.alive for r in self.readers.values()) and not self.stop.is_set():
                 self._agree()
-                busy = self.sink is not None and self._write(self.sink)
                 rates.tell()
-                if not busy:
-                    self.stop.wait(_POLL_S)
+                self.stop.wait(_POLL_S)
         except KeyboardInterrupt:
             self.stop.set()
         self.interrupted = self.stop.is_set() and any(r.alive for r in self.readers.values())
         self._halt()
         self._agree(last=True)
-        while self.sink is not None and self._write(self.sink):
-            pass
+        if self.delivery is not None:
+            self.delivery.finish()
 
     def drain(self) -> None:
         """Stop the cameras, the primary first, and drop what they still send."""
@@ -170,9 +172,11 @@ class _Capture:
         return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)
 
     def close(self) -> None:
-        """End all reading threads, stop the cameras and release the devices, after success or failure."""
+        """End all threads, stop the cameras and release the devices, after success or failure."""
         self._halt()
         self._stop()
+        if self.delivery is not None:
+            self.delivery.abandon()
         for link in self.links.values():
             link.close()
 
@@ -207,9 +211,11 @@ class _Capture:
             reader.join()
 
     def _agree(self, last: bool = False) -> None:
-        """Set tick 0 and each camera's number of bytes, once every camera has a whole frame."""
+        """Set tick 0 and each camera's number of bytes, and begin the delivery, once all cameras have a whole frame."""
         for reader in self.readers.values():
             self._raise_error(reader)
+        if self.delivery is not None and self.delivery.error is not None:
+            raise self.delivery.error
         if self.cutters:
             return
         firsts = {c: first_frame(self.layout, self.rings[c].blocks()) for c in self.readers}
@@ -225,25 +231,14 @@ class _Capture:
             ahead = 0 if origin is None else (origin - first.counter) % COUNTER
             reader.wanted = first.position + (ahead + self.n_ticks) * self.layout.frame_bytes
             self.cutters[camera] = Cutter(camera, self.layout, self.rings[camera], origin, first.lead)
+        if self.sink is not None:
+            self.delivery = Delivery(self.sink, self.rings, self.cutters, self.n_ticks)
 
     def _overdue(self) -> bool:
         """Return whether one camera is so far ahead that the agreement leaves out another without a frame."""
         most = max(_SKEW_S * self.profile.fps * self.layout.frame_bytes, 4 * self.profile.transfer_bytes)
         readers = [r for r in self.readers.values() if r.origin is not None]
         return any(r.ring.position - (r.origin or 0) > most for r in readers)
-
-    def _write(self, sink: Sink) -> bool:
-        """Pass one block of each camera to the sink. Return whether there was any."""
-        busy = False
-        for camera, cutter in self.cutters.items():
-            if (block := self.rings[camera].pop()) is not None:
-                busy = True
-                for run in cutter.cut([block]):
-                    frames = run.frames[: max(self.n_ticks - run.first_tick, 0)]
-                    if len(frames):
-                        sink(camera, run.first_tick, frames)
-                self.rings[camera].release()
-        return busy
 
     def _camera_clip(self, camera: str, runs: Sequence[Run], n_ticks: int) -> CameraClip:
         reader, ring, cutter = self.readers[camera], self.rings[camera], self.cutters[camera]
@@ -292,7 +287,7 @@ def _primary(camera: CameraProfile) -> bool:
 
 def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
     """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
-    ticks = profile.ring_seconds * profile.fps if continuous else n_ticks
+    ticks = buffer_seconds(profile, n_ticks / profile.fps) * profile.fps if continuous else float(n_ticks)
     if layout.count_tags() and not continuous:
         ticks += _SKEW_S * profile.fps  # frames before the tick that all cameras have
     slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)

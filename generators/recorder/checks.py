@@ -12,11 +12,11 @@ import usb.core
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.memory import MEMINFO, buffer_seconds, free_bytes, least_seconds
 from spike4dgs.generators.recorder.profile.profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.transport import udev_fix
 
 USBFS_LIMIT = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
-MEMINFO = Path("/proc/meminfo")
 
 SUPER_SPEED = 4  # LIBUSB_SPEED_SUPER; 5 is SuperSpeed+
 _SPEEDS = {1: "Low Speed", 2: "Full Speed", 3: "High Speed (480 Mbit/s)"}
@@ -81,21 +81,17 @@ def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> Use
 def check_memory(profile: RigProfile, seconds: float, continuous: bool, meminfo: Path = MEMINFO) -> UserError | None:
     """Check the memory for rings and, for a clip with tags, for the frames without tags, made before it is written."""
     layout = make_layout(profile.layout, profile.width, profile.height)
-    kept_s = profile.ring_seconds if continuous else seconds
+    kept_s = buffer_seconds(profile, seconds, meminfo) if continuous else seconds
     tick_bytes = layout.frame_bytes
     if not continuous and layout.frame_bytes != layout.payload_bytes:
         tick_bytes += layout.payload_bytes
     flying = profile.transfers * profile.transfer_bytes
     need = len(profile.cameras) * (kept_s * profile.fps * tick_bytes + 2 * flying) + _SPARE_BYTES
-    try:
-        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
-        free = int(lines["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError, ValueError, IndexError):
+    free = free_bytes(meminfo)
+    if free is None or free >= need:
         return None
-    if free >= need:
-        return None
-    shorter = "ring_seconds in the rig profile" if continuous else "--seconds (or record with --continuous)"
-    fix = f"end other programs, or lower {shorter}"
+    lower = "--buffer-s (or ring_seconds in the profile)" if continuous else "--seconds (or record with --continuous)"
+    fix = f"end other programs, or lower {lower}"
     return problem("memory", f"{need / 1e9:.1f} GB for the rings", f"{free / 1e9:.1f} GB free", fix)
 
 
@@ -113,14 +109,12 @@ def check_disk(profile: RigProfile, seconds: float, out: Path) -> UserError | No
 
 def check_ring(profile: RigProfile) -> UserError | None:
     """Check that the reads in flight do not fill the ring: blocks that wait for the disk need room in it."""
-    layout = make_layout(profile.layout, profile.width, profile.height)
-    second = profile.fps * layout.frame_bytes
-    need_s = 2 * profile.transfers * profile.transfer_bytes / second
-    if profile.ring_seconds >= need_s:
+    need_s = least_seconds(profile)
+    if profile.ring_seconds is None or profile.ring_seconds >= need_s:
         return None
-    fix = "raise ring_seconds, or lower transfers or transfer_bytes"
-    expected = f"ring_seconds of {need_s:.3g} or more, twice the reads in flight"
-    return problem(f"rig {profile.name}", expected, f"{profile.ring_seconds:.3g}", fix)
+    fix = "raise --buffer-s (or ring_seconds in the profile), or lower transfer.in_flight or transfer.bytes there"
+    expected = f"a buffer of {need_s:.3g} s or more, twice the reads in flight"
+    return problem(f"rig {profile.name}", expected, f"{profile.ring_seconds:.3g} s", fix)
 
 
 def _devices(vendor: int, product: int, backend: Any | None) -> list[usb.core.Device]:

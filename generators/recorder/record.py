@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import threading
@@ -23,8 +24,10 @@ from spike4dgs.generators.recorder.checks import check_machine, find_cameras
 from spike4dgs.generators.recorder.emulation.imperfections import PERFECT, Imperfections
 from spike4dgs.generators.recorder.files.clip_files import StreamFiles
 from spike4dgs.generators.recorder.files.clip_record import ClipRecord
+from spike4dgs.generators.recorder.files.disk import BUFFER_BYTES
 from spike4dgs.generators.recorder.frames.clip import Clip, Sink
 from spike4dgs.generators.recorder.frames.layouts import UInt8
+from spike4dgs.generators.recorder.memory import buffer_seconds, bytes_per_s
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
 from spike4dgs.generators.recorder.profile.profile import RigProfile
 from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording
@@ -52,6 +55,7 @@ def record(
     mode: Literal["clip", "flat", "dark"] = "clip",
     emulate: Path | None = None,
     continuous: bool = False,
+    buffer_s: float | None = None,
     preview: bool = False,
     flat: Path | None = None,
     dark: Path | None = None,
@@ -72,6 +76,8 @@ def record(
         mode: flat and dark record uniform light and darkness, for a later clip's --flat and --dark.
         emulate: Record an emulated array that sends this scene's streams, to try all steps without hardware.
         continuous: Write to disk while recording, instead of afterwards from memory.
+        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous. By default
+            what half of the free memory holds, 10 at most.
         preview: Show spike rates while recording, and write OUT/sheet.png.
         flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
         dark: The corresponding recording in the dark.
@@ -89,6 +95,7 @@ def record(
     n_ticks = round(length * profile.fps)
     if n_ticks < 1:
         raise problem("--seconds", f"at least {1 / profile.fps:g}, one tick", f"{length:g}", "record for longer")
+    profile = _with_buffer(profile, continuous, buffer_s, length)
     if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulate is not None):
         raise UserError("; ".join(map(str, problems)))
     with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
@@ -99,7 +106,7 @@ def record(
         for camera in clip.cameras:  # without frames in continuous mode: the sink has received them
             files.write_ticks(camera.camera, camera.ticks, camera.frames)
         clip = clip.without(files.flush(clip.n_ticks))
-        failures, direct = files.failures, files.direct
+        failures, direct, longest_s = files.failures, files.direct, files.longest_write_s
         sync = fit_arrival(clip, profile.fps)
         files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
         if preview:
@@ -109,7 +116,8 @@ def record(
     _print(clip, sync, continuous)
     for failure in failures.values():
         print(f"error: {failure}; what it held before is kept", file=sys.stderr)
-    print(f"written {'past' if direct else 'through'} the page cache")
+    cache = f"written {'past' if direct else 'through'} the page cache"
+    print(f"{cache}; the disk took {longest_s:.3g} s at most for one buffer of {BUFFER_BYTES >> 20} MiB or less")
     print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
     if worse_truth is not None:
         print(f"imperfections: {worse_truth}")
@@ -134,6 +142,20 @@ def _source(
 def _without_poses(profile: RigProfile) -> RigProfile:
     """Return the same cameras without calibration: recordings of uniform light and darkness are not scenes."""
     return replace(profile, cameras=tuple(replace(c, calibration=None) for c in profile.cameras))
+
+
+def _with_buffer(profile: RigProfile, continuous: bool, buffer_s: float | None, length: float) -> RigProfile:
+    """Return the profile with the memory of continuous mode, and print it."""
+    if not continuous:
+        if buffer_s is not None:
+            raise problem("--buffer-s", "--continuous beside it", "none", "add --continuous, or leave it out")
+        return profile
+    if buffer_s is not None and not 0 < buffer_s < math.inf:
+        raise problem("--buffer-s", "seconds above 0", f"{buffer_s:g}", "give the seconds that may wait in memory")
+    seconds = buffer_s or buffer_seconds(profile, length)
+    size = seconds * len(profile.cameras) * bytes_per_s(profile)
+    print(f"memory for {seconds:.3g} s of all cameras while the disk stalls: {size / 1e9:.2g} GB")
+    return replace(profile, ring_seconds=seconds)
 
 
 def _light(profile: RigProfile, flat: Path | None, dark: Path | None, flat_radiance: float | None) -> Truth:
@@ -217,14 +239,14 @@ def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
 
     console, fits = Console(width=120), {fit.camera: fit for fit in sync.cameras}
     title = f"synchronised by {sync.method}" + (", ended early" if clip.interrupted else "")
-    columns = "camera", "MB", "lost ticks", "drift, ppm", "offset, us", "fullest ring", "no read, ms", "end"
+    columns = "camera", "MB", "lost ticks", "drift, ppm", "offset, us", "fullest buffer", "no read, ms", "end"
     table = Table(*columns, title=title)
     for c in clip.cameras:
         s, fit = c.stats, fits[c.camera]
         drift = f"{fit.drift_ppm:+.0f} +- {fit.drift_error_ppm:.0f}" + (" suspect" if fit.suspect else "")
-        ring = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
+        buffer = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
         idle = f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
-        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", drift, f"{fit.offset_us:+.0f}", ring, idle, s.end]
+        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", drift, f"{fit.offset_us:+.0f}", buffer, idle, s.end]
         table.add_row(*row, style="red" if c.gaps else None)
     console.print(table)
     if sync.worst_pair:

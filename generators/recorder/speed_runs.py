@@ -6,7 +6,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +19,10 @@ from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera
 from spike4dgs.generators.recorder.files.clip_files import StreamFiles
-from spike4dgs.generators.recorder.files.disk import BUFFER_BYTES, PER_FILE, Buffers, DiskFile
+from spike4dgs.generators.recorder.files.disk import BUFFER_BYTES, Buffers, DiskFile
 from spike4dgs.generators.recorder.frames.clip import Clip
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8
+from spike4dgs.generators.recorder.memory import buffer_seconds
 from spike4dgs.generators.recorder.profile.profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.rates import Rate
 from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
@@ -42,17 +43,12 @@ class Load:
     transfer_bytes: int
     transfers: int
     memory_bytes: int  # of a camera itself, for the time without a read
-    ring_seconds: float = RigProfile.ring_seconds  # of data that may wait for the disk
+    buffer_s: float | None = None  # of data that may wait for the disk; None: as `record` chooses it
 
     @property
     def bytes_per_s(self) -> float:
         """Bytes a second that all cameras send."""
         return float(self.cameras * self.fps * FRAME_BYTES)
-
-    @property
-    def buffer_s(self) -> float:
-        """Seconds of data that this process can hold if the disk stores none."""
-        return self.ring_seconds + self.cameras * PER_FILE * BUFFER_BYTES / self.bytes_per_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +61,27 @@ class Outcome:
     wrong_frames: int  # in the clip in memory, or at some ticks of each file, that differ from the camera's
     flush_s: float  # of `seconds`, to write the rest at the end and to fsync
     backlog: NDArray[np.float64]  # [n, 2]: seconds since the trigger, bytes then waiting in rings and buffers
+    buffer_s: float  # of data that could wait in rings
+    longest_write_s: float  # of one buffer
+    waited_s: float  # of `seconds`, in which the delivery waited for the disk
     cpu: float  # cores that were busy with this process
     emulator_cpu: float  # of these, for work that a USB controller does for real cameras
     direct: bool  # past the page cache
+
+    @property
+    def fullest_s(self) -> float:
+        """The most data that waited in the ring of one camera at once, in seconds."""
+        return max((c.stats.backlog / c.stats.slots * self.buffer_s for c in self.clip.cameras), default=0.0)
+
+    @property
+    def lost_ticks(self) -> int:
+        """Ticks in gaps, of all cameras."""
+        return sum(c.stats.lost_ticks for c in self.clip.cameras)
+
+    @property
+    def frames_per_s(self) -> float:
+        """Frames of all cameras that were kept, a second."""
+        return (self.clip.n_ticks * len(self.clip.cameras) - self.lost_ticks) / self.seconds
 
 
 class _SentReads:
@@ -146,6 +160,7 @@ class _Watch:
 def run(load: Load, seconds: float, queued: bool, folder: Path | None = None) -> Outcome:
     """Capture `seconds` of paced cameras into memory, or in continuous mode to files in `folder`, which are removed."""
     profile = array_profile(load)
+    profile = replace(profile, ring_seconds=buffer_seconds(profile, seconds))
     rng = np.random.default_rng(0)
     sources = {c.id: rng.integers(0, 256, (_SOURCE_TICKS, FRAME_BYTES), dtype=np.uint8) for c in profile.cameras}
     array = EmulatedArray(profile, sources, memory_bytes=load.memory_bytes)
@@ -163,7 +178,7 @@ def run(load: Load, seconds: float, queued: bool, folder: Path | None = None) ->
         flushing = time.monotonic()
         clip = clip.without(watch.files.flush(clip.n_ticks))
         flush_s = time.monotonic() - flushing
-        return _outcome(watch, array, clip, _wrong_on_disk(folder, clip, sources), flush_s, watch.files.direct)
+        return _outcome(watch, array, clip, _wrong_on_disk(folder, clip, sources), flush_s)
 
 
 def disk_rate(folder: Path, files: int, seconds: float, bytes_per_s: float) -> float:
@@ -200,14 +215,13 @@ def array_profile(load: Load) -> RigProfile:
         fps=load.fps,
         transfer_bytes=load.transfer_bytes,
         transfers=load.transfers,
-        ring_seconds=load.ring_seconds,
+        ring_seconds=load.buffer_s,
         timeout_ms=2000,
     )
 
 
-def _outcome(
-    watch: _Watch, array: EmulatedArray, clip: Clip, wrong: int, flush_s: float = 0.0, direct: bool = False
-) -> Outcome:
+def _outcome(watch: _Watch, array: EmulatedArray, clip: Clip, wrong: int, flush_s: float = 0.0) -> Outcome:
+    files = watch.files
     return Outcome(
         clip=clip,
         seconds=watch.seconds + flush_s,
@@ -215,9 +229,12 @@ def _outcome(
         wrong_frames=wrong,
         flush_s=flush_s,
         backlog=np.array(watch.backlog, np.float64).reshape(-1, 2),
+        buffer_s=array.profile.ring_seconds or 0.0,
+        longest_write_s=files.longest_write_s if files else 0.0,
+        waited_s=files.buffers.waited_s if files else 0.0,
         cpu=watch.cpu_s / watch.seconds,
         emulator_cpu=watch.emulator_s / watch.seconds,
-        direct=direct,
+        direct=files is not None and files.direct,
     )
 
 

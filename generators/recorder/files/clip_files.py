@@ -65,6 +65,11 @@ class StreamFiles:
         return all(file.direct for file in self._files.values())
 
     @property
+    def longest_write_s(self) -> float:
+        """Return the longest time that the disk took for one buffer so far."""
+        return max((file.longest_s for file in self._files.values()), default=0.0)
+
+    @property
     def failures(self) -> dict[str, UserError]:
         """Camera -> why its file ended, as far as it is known yet."""
         errors = ((c, self._files[c.id].error) for c in self._profile.cameras if c.id in self._files)

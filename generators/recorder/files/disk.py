@@ -19,6 +19,7 @@ import mmap
 import os
 import queue
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ class Buffers:
         self.count = files * PER_FILE
         memory = np.frombuffer(mmap.mmap(-1, self.count * self.size), np.uint8).reshape(self.count, self.size)
         memory.fill(0)  # makes the system map the pages now, not while a camera sends
+        self.waited_s = 0.0  # by `take`, in all
         self._free: queue.SimpleQueue[UInt8] = queue.SimpleQueue()
         for buffer in memory:
             self._free.put(buffer)
@@ -51,8 +53,11 @@ class Buffers:
         return (self.count - self._free.qsize()) * self.size
 
     def take(self) -> UInt8:
-        """Return a free buffer [size] of any content; wait for one."""
-        return self._free.get()
+        """Return a free buffer [size] of any content; wait for one. To be called by one thread."""
+        begun = time.monotonic()
+        buffer = self._free.get()
+        self.waited_s += time.monotonic() - begun
+        return buffer
 
     def give(self, buffer: UInt8) -> None:
         """Return a buffer to the free ones."""
@@ -70,6 +75,7 @@ class DiskFile:
         self.direct = True  # past the page cache
         self.error: OSError | None = None
         self.written = 0  # every byte before this is on the disk, or was left zero
+        self.longest_s = 0.0  # that the disk took for one buffer
         self._fd = self._open(path)
         self._buffers = buffers
         self._buffer: UInt8 | None = None  # being filled, to be written at _at
@@ -162,11 +168,13 @@ class DiskFile:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             at, buffer, n = job
+            begun = time.monotonic()
             try:
                 if self.error is None:
                     self._write(at, buffer[:n])
             except OSError as e:
                 self.error, self._failed = e, at + n
+            self.longest_s = max(self.longest_s, time.monotonic() - begun)
             self._buffers.give(buffer)
 
     def _write(self, at: int, data: UInt8) -> None:

@@ -87,7 +87,7 @@ class RigProfile:
     held_out: tuple[str, ...] = ()  # cameras that recordings hold out for testing
     transfer_bytes: int = 262144  # of one bulk read
     transfers: int = 16  # reads in flight per camera
-    ring_seconds: float = 0.5  # memory per camera in continuous mode
+    ring_seconds: float | None = None  # memory per camera in continuous mode; None: chosen from what is free
     timeout_ms: int = 500  # without any data, after which a camera counts as gone
 
     def camera(self, id: str) -> CameraProfile:
@@ -249,7 +249,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.fl
 def _check_whole(top: Table, p: RigProfile) -> None:
     """Check facts across keys: names used twice, roles, sizes that do not go together."""
     try:
-        layout = make_layout(p.layout, p.width, p.height)
+        second = p.fps * make_layout(p.layout, p.width, p.height).frame_bytes
     except UserError as e:
         raise UserError(f"{top.path}, key layout: {e}") from None
     for key, values in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
@@ -267,8 +267,8 @@ def _check_whole(top: Table, p: RigProfile) -> None:
             raise top.error(
                 "calibration", "intrinsics and poses of all cameras, or of none", found, "calibrate the rig"
             )
-    if p.ring_seconds * p.fps * layout.frame_bytes < p.transfers * p.transfer_bytes:
-        found = f"{p.ring_seconds:g} s, {p.ring_seconds * p.fps * layout.frame_bytes / 1e6:.3g} MB"
+    if p.ring_seconds is not None and p.ring_seconds * second < p.transfers * p.transfer_bytes:
+        found = f"{p.ring_seconds:g} s, {p.ring_seconds * second / 1e6:.3g} MB"
         expected = f"room for {p.transfers} reads of {p.transfer_bytes} bytes in flight"
         raise top.error("transfer.ring_seconds", expected, found, "enlarge it, or have fewer or smaller reads")
 
