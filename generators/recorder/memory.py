@@ -1,0 +1,46 @@
+"""Memory for the data that wait for the disk in continuous mode, chosen from what is free."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.profile.profile import RigProfile
+
+MEMINFO = Path("/proc/meminfo")
+
+_SHARE = 0.5  # of the free memory; the rest is left to the page cache and other programs
+_MOST_S = 10.0  # twice the longest stall that the recorder is tested with
+_UNKNOWN_S = 0.5  # where the system does not tell how much is free
+
+
+def free_bytes(meminfo: Path = MEMINFO) -> int | None:
+    """Return the memory that programs can take without swapping; None on a system that does not tell."""
+    try:
+        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
+        return int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError, IndexError):
+        return None
+
+
+def bytes_per_s(profile: RigProfile) -> int:
+    """Return the rate at which one camera sends."""
+    return profile.fps * make_layout(profile.layout, profile.width, profile.height).frame_bytes
+
+
+def least_seconds(profile: RigProfile) -> float:
+    """Return the seconds of data in twice the reads in flight: a ring has no less."""
+    return 2 * profile.transfers * profile.transfer_bytes / bytes_per_s(profile)
+
+
+def buffer_seconds(profile: RigProfile, seconds: float, meminfo: Path = MEMINFO) -> float:
+    """Return the seconds of data, of all cameras, that may wait in memory during a clip of `seconds`.
+
+    The profile's `ring_seconds`; where it is None, what half of the free memory holds, but no more than 10 s or the
+    whole clip.
+    """
+    if profile.ring_seconds is not None:
+        return profile.ring_seconds
+    free, least = free_bytes(meminfo), least_seconds(profile)
+    held = _UNKNOWN_S if free is None else _SHARE * free / (len(profile.cameras) * bytes_per_s(profile))
+    return max(min(held, _MOST_S, seconds + least), least)
