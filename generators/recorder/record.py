@@ -29,6 +29,7 @@ from spike4dgs.generators.recorder.frames.clip import Clip, Sink
 from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.generators.recorder.memory import buffer_seconds, bytes_per_s
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
+from spike4dgs.generators.recorder.priority import real_time
 from spike4dgs.generators.recorder.profile.profile import RigProfile
 from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording
 from spike4dgs.generators.recorder.sources import (
@@ -102,7 +103,8 @@ def record(
         links = _open(profile, source.backend)
         with Watch(profile, live=preview) as watch:
             sink = _sink(files, stop) if continuous else None
-            clip = capture(profile, links, length, on_state=watch.state, on_rate=watch.rates, stop=stop, sink=sink)
+            with real_time() as urgent:
+                clip = capture(profile, links, length, on_state=watch.state, on_rate=watch.rates, stop=stop, sink=sink)
         for camera in clip.cameras:  # without frames in continuous mode: the sink has received them
             files.write_ticks(camera.camera, camera.ticks, camera.frames)
         clip = clip.without(files.flush(clip.n_ticks))
@@ -114,6 +116,8 @@ def record(
     if worse_truth is not None:
         write_json(worse_truth, source.worse_truth)
     _print(clip, sync, continuous)
+    if not urgent:
+        print("recorded at ordinary priority: busy programs can delay reads; a limit `rtprio` of 1 permits real-time")
     for failure in failures.values():
         print(f"error: {failure}; what it held before is kept", file=sys.stderr)
     cache = f"written {'past' if direct else 'through'} the page cache"

@@ -27,7 +27,7 @@ RUN_COLUMNS = (
 DISK, PROCESSOR = "disk", "processor"
 
 _LEAST_S = 4.0  # length of a clip; in a shorter one a disk that is too slow does not show
-# Of data, that may wait when the buffers are emptiest in the second half: those of the files hold 0.07 s. A disk that is
+# Of data, that may wait when the buffers are emptiest in the second half: the files' own hold 0.07 s. A disk that is
 # slower than the cameras by a share x leaves x times half the clip, so 2.5 % show in 8 s.
 _LEFT_S = 0.1
 _WAITS = 0.5  # share of a clip: a delivery that waits longer than this for the disk is limited by it
@@ -55,7 +55,8 @@ def show_disk(title: str, load: Load, seconds: float, runs: int, folder: Path, c
     show_table(f"to disk: {title}", COLUMNS, rows, csv and csv.with_stem(f"{csv.stem}-disk"))
     if csv:
         _write(csv.with_stem(f"{csv.stem}-disk-runs"), [RUN_COLUMNS, *each])
-    print(f"runs of {seconds:g} s; written {'past' if every[-1].direct else 'through'} the page cache")
+    cache, priority = "past" if every[-1].direct else "through", "real-time" if every[-1].urgent else "ordinary"
+    print(f"runs of {seconds:g} s at {priority} priority; written {cache} the page cache")
     print(_worst(every))
     print(f"every one of {runs} runs sustained {_cameras(most)} to disk{end}")
 

@@ -23,6 +23,7 @@ from spike4dgs.generators.recorder.files.disk import BUFFER_BYTES, Buffers, Disk
 from spike4dgs.generators.recorder.frames.clip import Clip
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8
 from spike4dgs.generators.recorder.memory import buffer_seconds
+from spike4dgs.generators.recorder.priority import real_time
 from spike4dgs.generators.recorder.profile.profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.rates import Rate
 from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
@@ -67,6 +68,7 @@ class Outcome:
     cpu: float  # cores that were busy with this process
     emulator_cpu: float  # of these, for work that a USB controller does for real cameras
     direct: bool  # past the page cache
+    urgent: bool  # at real-time priority
 
     @property
     def fullest_s(self) -> float:
@@ -137,6 +139,7 @@ class _Watch:
     load: Load
     links: Mapping[str, _Link]
     files: StreamFiles | None = None
+    urgent: bool = False
     seconds: float = 0.0  # until DRAIN
     cpu_s: float = 0.0  # of this process
     emulator_s: float = 0.0  # CPU time of the emulation
@@ -171,10 +174,12 @@ def run(load: Load, seconds: float, queued: bool, folder: Path | None = None) ->
         links[camera.id] = _Link(devices[camera.id], camera, profile, link.queued, array.cameras[camera.id])
     watch = _Watch(load, links)
     if folder is None:
-        clip = capture(profile, links, seconds, on_state=watch.state)
+        with real_time() as watch.urgent:
+            clip = capture(profile, links, seconds, on_state=watch.state)
         return _outcome(watch, array, clip, _wrong(clip, sources))
     with StreamFiles(folder, profile, round(seconds * load.fps)) as watch.files:
-        clip = capture(profile, links, seconds, on_state=watch.state, on_rate=watch.rates, sink=watch.files.write)
+        with real_time() as watch.urgent:
+            clip = capture(profile, links, seconds, on_state=watch.state, on_rate=watch.rates, sink=watch.files.write)
         flushing = time.monotonic()
         clip = clip.without(watch.files.flush(clip.n_ticks))
         flush_s = time.monotonic() - flushing
@@ -235,6 +240,7 @@ def _outcome(watch: _Watch, array: EmulatedArray, clip: Clip, wrong: int, flush_
         cpu=watch.cpu_s / watch.seconds,
         emulator_cpu=watch.emulator_s / watch.seconds,
         direct=files is not None and files.direct,
+        urgent=watch.urgent,
     )
 
 

@@ -122,8 +122,9 @@ def test_disk_space(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def test_a_ring_is_larger_than_the_reads_in_flight() -> None:
     assert checks.check_ring(replace(ARRAY, ring_seconds=30.0)) is None
-    found = str(checks.check_ring(ARRAY))  # 0.5 s of 600 kB/s
-    assert found.startswith("rig test: expected ring_seconds of 14 or more") and "raise ring_seconds" in found
+    found = str(checks.check_ring(replace(ARRAY, ring_seconds=0.5)))  # of 600 kB/s
+    assert found.startswith("rig test: expected a buffer of 14 s or more") and "raise --buffer-s" in found
+    assert checks.check_ring(ARRAY) is None, "the one chosen from the free memory has room"
 
 
 def test_all_of_a_machines_problems_are_listed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -132,7 +133,8 @@ def test_all_of_a_machines_problems_are_listed(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(checks, "check_disk", lambda *_: None)
     ring = replace(ARRAY, ring_seconds=30.0)
     assert [str(e) for e in checks.check_machine(ring, 1.0, tmp_path)] == ["usb", "memory"]
-    found = checks.check_machine(ARRAY, 1.0, tmp_path, continuous=True, emulated=True)
+    ring = replace(ARRAY, ring_seconds=0.5)
+    found = checks.check_machine(ring, 1.0, tmp_path, continuous=True, emulated=True)
     assert [str(e)[:6] for e in found] == ["memory", "rig te"]
 
 

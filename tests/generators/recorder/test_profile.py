@@ -92,7 +92,7 @@ def test_defaults_and_own_keys(tmp_path: Path) -> None:
     assert (left.endpoint_in, left.endpoint_out, left.interface, left.control_interface) == (0x82, None, 0, None)
     assert (left.role, right.role, left.rows, right.rows) == ("primary", "secondary", "bottom-up", "top-down")
     assert (left.start, left.stop, left.mirrored, left.calibration, left.maps) == ((), (), False, None, None)
-    assert (rig.transfer_bytes, rig.transfers, rig.ring_seconds, rig.timeout_ms) == (1024, 2, 0.5, 500)
+    assert (rig.transfer_bytes, rig.transfers, rig.ring_seconds, rig.timeout_ms) == (1024, 2, None, 500)
     assert not rig.calibrated and rig.camera("right") is right
 
 
@@ -139,7 +139,11 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut("width = 40", "width = 40.0"), "width", "expected a whole number from 1 to 65535, found 40.0"),
         (cut("width = 40", "width = true"), "width", "found True"),
         (cut("plain", "striped"), "layout", "expected one of plain, tagged-rows, line-tagged, found 'striped'"),
-        (cut('"plain"', '"line-tagged"\nfps = 1'), "transfer.ring_seconds", "room for 2 reads of 1024 bytes"),
+        (
+            cut("in_flight = 2", "in_flight = 2\nring_seconds = 1e-4"),
+            "transfer.ring_seconds",
+            "room for 2 reads of 1024",
+        ),
         (cut("24", "23"), None, None),
         (cut('"plain"', '"tagged-rows"'), None, None),
         (cut('height = 24\nlayout = "plain"', 'height = 3\nlayout = "tagged-rows"'), "layout", "4 rows or more"),

@@ -1,0 +1,62 @@
+"""The memory that continuous mode takes for data that wait for the disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_camera import rig
+
+from spike4dgs.benchmark.cli import main
+from spike4dgs.generators.recorder.memory import buffer_seconds, bytes_per_s, free_bytes, least_seconds
+
+FAST = replace(rig(3), width=400, height=250, transfer_bytes=1 << 20, transfers=16)  # 250 MB/s a camera
+
+
+def meminfo(folder: Path, kilobytes: int) -> Path:
+    file = folder / "meminfo"
+    file.write_text(f"MemTotal: 1 kB\nMemAvailable:   {kilobytes} kB\n")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("free_kb", "clip_s", "expected"),
+    [
+        (6_000_000, 60.0, 0.5 * 6_000_000 * 1024 / 750e6),  # half of it
+        (60_000_000, 60.0, 10.0),  # more is of no use
+        (6_000_000, 1.0, 1.0 + 2 * 16 * 2**20 / 250e6),  # the clip, beside the reads in flight
+        (100_000, 60.0, 2 * 16 * 2**20 / 250e6),  # no less than the reads in flight need
+    ],
+)
+def test_the_default_is_half_of_what_is_free_within_bounds(
+    tmp_path: Path, free_kb: int, clip_s: float, expected: float
+) -> None:
+    file = meminfo(tmp_path, free_kb)
+    assert bytes_per_s(FAST) == 250e6 and free_bytes(file) == free_kb * 1024
+    assert buffer_seconds(FAST, clip_s, file) == pytest.approx(expected, rel=1e-12)
+    assert buffer_seconds(replace(FAST, ring_seconds=0.25), clip_s, file) == 0.25, "the profile's own"
+
+
+def test_a_system_that_does_not_tell_gets_half_a_second(tmp_path: Path) -> None:
+    assert free_bytes(tmp_path / "none") is None
+    assert buffer_seconds(FAST, 60.0, tmp_path / "none") == 0.5
+    assert least_seconds(FAST) == pytest.approx(0.1342, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--buffer-s", "2"), "--buffer-s: expected --continuous beside it"),
+        (("--buffer-s", "0", "--continuous"), "--buffer-s: expected seconds above 0, found 0"),
+        (("--buffer-s", "nan", "--continuous"), "--buffer-s: expected seconds above 0, found nan"),
+        (("--buffer-s", "0.001", "--continuous"), "expected a buffer of"),
+        (("--buffer-s", "1e6", "--continuous"), "lower --buffer-s"),
+    ],
+)
+def test_a_buffer_that_cannot_be_is_refused(
+    tmp_path: Path, small_scene: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    out = tmp_path / "x"
+    assert main(["record", "--emulate", str(small_scene), "--out", str(out), *arguments]) == 2
+    assert message in capsys.readouterr().err and not out.exists()
