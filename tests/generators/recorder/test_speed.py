@@ -68,9 +68,7 @@ def test_a_sustained_recording_empties_its_buffer_again() -> None:
     assert steady.fullest_s == 1.0 and steady.frames_per_s == 20_000.0
     stalled = outcome([0.02] * 25 + [0.5, 0.4, 0.3, 0.2, 0.1, *[0.02] * 10])
     assert not_sustained(LOAD, stalled) is None, "a stall that the buffer holds, and that the disk makes up for"
-    slow = [
-        0.03 * t for t in np.linspace(0.0, 8.0, 41)
-    ]  # a disk 3 % too slow, of which the buffers lose nothing
+    slow = [0.03 * t for t in np.linspace(0.0, 8.0, 41)]  # a disk 3 % too slow, of which the buffers lose nothing
     assert left_s(LOAD, outcome(slow)) == pytest.approx(0.12)
     assert not_sustained(LOAD, outcome(slow)) == "at least 0.12 s of data always wait in the second half"
 
