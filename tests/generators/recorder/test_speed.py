@@ -107,6 +107,6 @@ def test_the_command_writes_all_tables(tmp_path: Path, capsys: pytest.CaptureFix
     assert [line[8:10] for line in lines[1:]] == [["0", "0"], ["0", "0"]], "no tick in gaps, no byte unseen"
     shown = capsys.readouterr().out
     assert "1 camera, run 2 of 2: runs of 0.05 s are too short to tell" in shown
-    assert "every one of 2 runs sustained 0 cameras to disk; 1: 0 of 2, runs of 0.05 s are too short" in shown
+    assert "every run of 2 sustained 0 cameras to disk; 1: 0 of 2, runs of 0.05 s are too short" in shown
     assert "0 ticks lost and listed as gaps; 0 bytes lost unseen" in shown
     assert sorted(p.name for p in tmp_path.iterdir()) == ["t-disk-runs.csv", "t-disk.csv", "t.csv"]
