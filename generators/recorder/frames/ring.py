@@ -32,7 +32,7 @@ class Ring:
     """`slots` buffers of `slot_bytes`, filled by one thread and emptied by another, both in order.
 
     The filling thread calls `take` for each read it queues and `put` for each that ended; the emptying thread calls
-    `pop`, and `release` when it no longer needs the block.
+    `pop`, and `release` when it no longer needs the blocks.
     """
 
     def __init__(self, slots: int, slot_bytes: int) -> None:
@@ -51,7 +51,7 @@ class Ring:
         self._flying: deque[int] = deque()
         self._filled: deque[tuple[int, Block]] = deque()
         self._next = self._used = 0  # used: in flight, waiting, or popped
-        self._popped: int | None = None
+        self._popped = 0  # slots of the blocks that were popped last
 
     def take(self) -> UInt8:
         """Return the buffer [slot_bytes] for the next read: a free slot, or the spare one."""
@@ -79,28 +79,26 @@ class Ring:
             self._free()
         return block
 
-    def pop(self) -> Block | None:
-        """Return the oldest waiting block, or None. The block popped before it is released."""
+    def pop(self, most: int) -> list[Block]:
+        """Return the oldest waiting blocks, at most `most`. Those popped before them are released."""
         self.release()
-        if not self._filled:
-            return None
         with self._lock:
-            slot, block = self._filled.popleft()
-            self.waiting -= slot != _SPARE
-        self._popped = slot
-        return block
+            taken = [self._filled.popleft() for _ in range(min(most, len(self._filled)))]
+            self._popped = sum(slot != _SPARE for slot, _ in taken)
+            self.waiting -= self._popped
+        return [block for _, block in taken]
 
     def release(self) -> None:
-        """Release the popped block's slot for further reads."""
-        if self._popped is not None and self._popped != _SPARE:
-            self._free()
-        self._popped = None
+        """Release the popped blocks' slots for further reads."""
+        if self._popped:
+            self._free(self._popped)
+        self._popped = 0
 
     def blocks(self) -> list[Block]:
         """Return every waiting block, oldest first; they keep waiting."""
         with self._lock:
             return [block for _, block in self._filled]
 
-    def _free(self) -> None:
+    def _free(self, slots: int = 1) -> None:
         with self._lock:
-            self._used -= 1
+            self._used -= slots

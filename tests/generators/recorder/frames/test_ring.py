@@ -11,9 +11,9 @@ from spike4dgs.generators.recorder.frames.ring import Ring
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(1, 6), st.lists(st.sampled_from(["take", "put", "pop", "discard"]), max_size=60))
-def test_a_ring_never_overwrites_waiting_blocks(slots: int, steps: list[str]) -> None:
-    ring, flying, waiting, number, position, popped = Ring(slots, 8), [], [], itertools.count(1), 0, False
+@given(st.integers(1, 6), st.integers(1, 3), st.lists(st.sampled_from(["take", "put", "pop", "discard"]), max_size=60))
+def test_a_ring_never_overwrites_waiting_blocks(slots: int, most: int, steps: list[str]) -> None:
+    ring, flying, waiting, number, position, popped = Ring(slots, 8), [], [], itertools.count(1), 0, []
     kept = False
     for step in steps:
         if step == "take":
@@ -28,17 +28,11 @@ def test_a_ring_never_overwrites_waiting_blocks(slots: int, steps: list[str]) ->
             if keep:
                 waiting.append((block, n))
         elif step == "pop":
-            block = ring.pop()
-            popped = False
-            if waiting:
-                expected, n = waiting.pop(0)
-                popped = expected.data is not None
-                assert block is expected
-                assert block.data is None or (block.data == n % 256).all()
-            else:
-                assert block is None
-        for block, n in waiting:
+            popped, waiting = waiting[:most], waiting[most:]
+            blocks = ring.pop(most)
+            assert all(block is expected for block, (expected, _) in zip(blocks, popped, strict=True))
+        for block, n in [*popped, *waiting]:
             assert block.data is None or (block.data == n % 256).all()
         held = sum(b.data is not None for b, _ in waiting)
-        assert ring.waiting == held and held + popped <= slots
+        assert ring.waiting == held and held + sum(b.data is not None for b, _ in popped) <= slots
     assert ring.position == position
