@@ -16,7 +16,7 @@ from typing import Any
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.results.record import Record, check_record
+from spike4dgs.benchmark.results.record import Record, check_record, with_later_metrics
 from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
@@ -39,6 +39,7 @@ def read_entry(path: Path) -> Entry:
     """Read an entry. Raises UserError where it is damaged or invalid, or where its file name is not its record's."""
     entry = read_json(path, "a leaderboard entry")
     check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), path, "submit the record again")
+    entry = {**entry, "record": with_later_metrics(entry["record"])}
     check_record(entry["record"], path)
     found = f"{path.parent.name}/{path.stem}"
     if (name := entry_name(entry["record"])) != found:

@@ -3,7 +3,8 @@
 OUT/model.safetensors   the model, for `view` and `render`
 OUT/sheet.png           training views: image from spikes, render, error map
 OUT/video.mp4           the clip in slow motion along an orbit
-OUT/report.html         cameras, rates, poses, bad pixels, residuals, times, versions
+OUT/report.html         cameras, rates, poses, bad pixels, residuals, held-out cameras, times, versions
+OUT/predictions/        the held-out cameras, rendered, for `score`
 OUT/work/KEY/           the checkpoint of an unfinished fit
 """
 
@@ -22,6 +23,7 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.fit_command.camera_facts import camera_facts
 from spike4dgs.baselines.fit_command.comparison import compare, mean_residual, residuals, write_sheet
+from spike4dgs.baselines.fit_command.held_out import SHOWN, HeldOutScores, judge_held_out
 from spike4dgs.baselines.fit_command.recording import Recording, open_recording
 from spike4dgs.baselines.fit_command.report_page import Report, write_report
 from spike4dgs.baselines.held_out_pose import PosedRecipe
@@ -30,6 +32,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.method import FitRequest, Method, get_method, make_budget
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.results.predictions import MethodInfo
 from spike4dgs.benchmark.results.provenance import Provenance, Savable
@@ -42,6 +45,7 @@ from spike4dgs.method.viewing.render_video import frame_times, render_frames
 from spike4dgs.method.viewing.video import video_writer
 
 MODEL, SHEET, VIDEO, REPORT = "model.safetensors", "sheet.png", "video.mp4", "report.html"
+PREDICTIONS = "predictions"
 VIDEO_S, FPS, SCALE = 10.0, 30.0, 2.0  # of the video: its length, and its size as a multiple of the training views'
 SLOW_FRAME_S, SLOW_FPS = 0.5, 3.0  # a model that takes longer for a frame, such as a radiance field, gets fewer
 
@@ -59,7 +63,7 @@ def fit(
     """Fit a model to a recording, and write a sheet, a slow-motion video and a report. No ground truth is needed.
 
     A recording without poses (streams of `record` before a calibration) gets estimated ones. A killed fit resumes where
-    it was.
+    it was. Cameras that the recording holds out are judged by their own spikes: their renders are in OUT/predictions.
 
     Args:
         scene: A scene folder, or a folder of streams that `record` has written.
@@ -88,12 +92,17 @@ def fit(
             write_sheet(out / SHEET, found, f"{saved.title}: training views, residual {mean_residual(found):.2f} dB")
         with _timed(times, "video"):
             slow_motion = _write_video(out / VIDEO, saved)
+        judged = None
+        if recording.scene and recording.held_out:
+            with _timed(times, "held-out cameras"):
+                judged = judge_held_out(saved, recording.scene, out / PREDICTIONS)
         report = Report(
             about=saved.provenance,
             source=scene,
             poses=poses,
             given=recording.training.cameras,
             held_out=recording.held_out,
+            judged=judged,
             notes=(*recording.notes, f"the video is {slow_motion:.0f} times slower than the world"),
             facts=camera_facts(recording.training),
             residuals=residuals(found),
@@ -109,8 +118,17 @@ def fit(
         console,
         f"fit: {times['fit']:.1f} s; residual of the training views {mean_residual(found):.2f} dB (not a score)",
     )
+    if judged:
+        _say(console, f"held-out {', '.join(recording.held_out)} by their own spikes: {_scores(judged)}")
     _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
     return 0
+
+
+def _scores(judged: HeldOutScores) -> str:
+    """Return the scores of the held-out cameras in a line, or why there are none."""
+    known = [m for m in SHOWN if judged.mean[m] is not None]
+    values = ", ".join(f"{m} {METRICS[m].format(judged.mean[m])}" for m in known)
+    return values or f"no score ({judged.notes[SHOWN[0]]})"
 
 
 def _poses(recording: Recording, method: Method) -> str:

@@ -1,6 +1,7 @@
 """The recording that `fit` takes: a scene folder, or streams without poses, whose cameras are then estimated.
 
-Of a scene folder only what `Scene.training` holds is read: no image, mask or map of the truth, and no held-out camera.
+Of a scene folder the fit reads only what `Scene.training` holds: no image, mask or map of the truth, and no held-out
+camera. The held-out cameras' streams and recordings are read after it, to judge it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file, sha256_json
 from spike4dgs.benchmark.metrics.pose_error import Sim3
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes
-from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -34,8 +35,13 @@ class Recording:
     training: TrainingScene
     split: str
     poses: str  # where they come from
-    held_out: tuple[str, ...] = ()  # cameras that the fit does not see
+    scene: Scene | None = None  # the folder, for what is judged after the fit; None: streams without poses
     notes: tuple[str, ...] = ()  # what was assumed, and what could not be used
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """The cameras that the fit does not see."""
+        return self.scene.test if self.scene else ()
 
 
 def open_recording(root: Path, seed: int = 0, allow_gaps: bool = False) -> Recording:
@@ -47,7 +53,7 @@ def open_recording(root: Path, seed: int = 0, allow_gaps: bool = False) -> Recor
         return _without_poses(root, open_stream_folder(root, allow_gaps), seed)
     scene = open_scene(root, allow_gaps)
     notes = (f"the fit does not see the held-out {', '.join(scene.test)}",) if scene.test else ()
-    return Recording(scene.training, scene.split, GIVEN, scene.test, notes)
+    return Recording(scene.training, scene.split, GIVEN, scene, notes)
 
 
 def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) -> Recording:

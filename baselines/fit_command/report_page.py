@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spike4dgs.baselines.fit_command.camera_facts import CameraFacts
+from spike4dgs.baselines.fit_command.held_out import SHOWN, HeldOutScores
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import new_figure
 from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera, Float64, array_axes
@@ -46,6 +48,7 @@ class Report:
     poses: str  # where they come from
     given: tuple[Camera, ...]
     held_out: tuple[str, ...]
+    judged: HeldOutScores | None  # the held-out cameras by their own spikes
     notes: tuple[str, ...]
     facts: Sequence[CameraFacts]
     residuals: Mapping[str, float]  # dB, by camera
@@ -80,6 +83,7 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         "images of the same camera. It is a residual of the fit and not a score: the model has seen these images, and "
         "their noise is in it. Dead pixels respond to uniform light with less than a fifth of the mean; hot ones fire "
         "in the dark five times as often as the median pixel. A dash means that the recording does not tell.</p>",
+        _held_out(report.judged) if report.judged else "",
         "<h2>Poses</h2>",
         f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
         _image(poses_plot(about.cameras, report.given), "the array from above and from behind"),
@@ -143,6 +147,27 @@ def _cameras_table(report: Report) -> str:
         lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
     rows = "".join(f"<tr>{line}</tr>" for line in lines)
     return f'<div class="scroll"><table>{rows}</table></div>'
+
+
+def _held_out(judged: HeldOutScores) -> str:
+    """Return the section of the held-out cameras: a row for each, and their mean."""
+    heads = ["camera", "images", *(f"{METRICS[m].title}{', dB' if METRICS[m].unit else ''}" for m in SHOWN)]
+    rows = [(camera, str(judged.images[camera]), values) for camera, values in judged.cameras.items()]
+    rows.append(("mean", str(sum(judged.images.values())), judged.mean))
+    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
+    for name, images, values in rows:
+        cells = [name, images, *(METRICS[m].format(values[m]) for m in SHOWN)]
+        lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
+    table = "".join(f"<tr>{line}</tr>" for line in lines)
+    notes = "".join(f"<li>{escape(METRICS[m].title)}: {escape(note)}</li>" for m, note in judged.notes.items())
+    return (
+        f'<h2>Held-out cameras</h2><div class="scroll"><table>{table}</table></div>'
+        "<p>The fit has not seen these cameras. Their renders are compared with the spikes that they recorded "
+        "themselves, without any ground truth. The spike PSNR (higher is better) compares counts over 5, 20 and 80 "
+        "ticks; the noise of counting is in it, so compare it between models of one recording only. The spike deviance "
+        "(lower is better) is what the recorded intervals lose in likelihood against the recorded rates.</p>"
+        + (f"<ul>{notes}</ul>" if notes else "")
+    )
 
 
 def _decibel(value: float) -> str:

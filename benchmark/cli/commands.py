@@ -164,6 +164,11 @@ COMMANDS: dict[str, Command] = {
         "write the Gaussians of a fitted model at several times as .ply files",
         "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
     ),
+    "spike-agreement": Command(
+        "spike4dgs.benchmark.reports.spike_agreement:spike_agreement",
+        "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
+        "spike-agreement runs/small --data data --out runs/spike-agreement",
+    ),
     "tradeoff": Command(
         "spike4dgs.generators.reports.tradeoff:tradeoff",
         "report render time against error for several settings",

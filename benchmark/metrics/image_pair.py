@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.spikes.view import SpikeView
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
 
@@ -23,7 +24,9 @@ class ImagePair:
     """Linear radiance of truth and prediction [H, W] (1.0 = white), and the moving region [H, W] bool.
 
     `where` names the image for errors; the prediction is multiplied by `gain` before anything else. `earlier` is the
-    target of the same camera before this one, `since_ms` the time between them.
+    target of the same camera before this one, `since_ms` the time between them. `spikes` are those that the held-out
+    camera recorded around the target, where it did. A truth that is not known is NaN: only metrics that do not use it
+    are then computed.
     """
 
     truth_radiance: Image
@@ -33,6 +36,7 @@ class ImagePair:
     gain: float = 1.0
     earlier: ImagePair | None = None
     since_ms: float = math.nan
+    spikes: SpikeView | None = None
 
     @cached_property
     def truth(self) -> Float64:

@@ -16,10 +16,17 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
+from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
 from spike4dgs.benchmark.metrics.selection import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, Images, Metric
+from spike4dgs.benchmark.metrics.table import METRICS
 
 Values = dict[str, float | None]  # metric id -> value, None where there is none
+_NONE = {  # the dataset defines no value for any image
+    Images.MOVING: "no image has a moving region",
+    Images.LATER: "no camera has two targets",
+    Images.RECORDED: "no image has its ticks recorded",
+    Images.RECORDED_MOVING: "no image has a moving region and its ticks recorded",
+}
 
 
 @dataclass(frozen=True)
@@ -90,7 +97,7 @@ def scene_means(per_image: Mapping[str, Mapping[str, float | None]]) -> Values:
     later = _later(per_image)
     for m in METRICS.values():
         values = {name: image[m.id] for name, image in per_image.items()}
-        if m.images is Images.MOVING:  # these metrics refuse nothing: no value means no moving region
+        if m.images not in (Images.EVERY, Images.LATER):  # these refuse nothing: no value means that none is defined
             values = {name: v for name, v in values.items() if v is not None}
         elif m.images is Images.LATER:
             values = {name: v for name, v in values.items() if name in later}
@@ -137,7 +144,7 @@ def _coverage(
         return "" if everything else f"mean over the {len(values)} of {len(per_image)} {m.images.value}"
     if m.aligned and any(image[m.id.removesuffix("_aligned")] is not None for image in per_image.values()):
         return "no positive gain fits the predictions"
-    return "no image has a moving region" if m.images is Images.MOVING else "no camera has two targets"
+    return _NONE[m.images]
 
 
 def _capped(m: Metric, values: Mapping[str, float]) -> str:

@@ -6,7 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.metrics.table import METRICS, Metric
+from spike4dgs.benchmark.metrics.metric import Metric
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.weights import WeightsError, find_weights
 
 AUTO = "auto"
@@ -26,9 +27,12 @@ class Selection:
 
     def among(self, ids: Collection[str]) -> Selection:
         """Return the selection without metrics that are not in `ids`."""
-        kept = {i: sha256 for i, sha256 in self.weights.items() if i in ids}
-        dropped = {i: _NOT_ASKED for i in self.weights if i not in ids}
-        return Selection(kept, {**self.absent, **dropped})
+        return self.without(self.weights.keys() - set(ids), _NOT_ASKED)
+
+    def without(self, ids: Collection[str], reason: str) -> Selection:
+        """Return the selection without the metrics in `ids`, for a reason."""
+        kept = {i: sha256 for i, sha256 in self.weights.items() if i not in ids}
+        return Selection(kept, {**self.absent, **{i: reason for i in self.weights if i in ids}})
 
 
 _NOT_ASKED = "not asked for"

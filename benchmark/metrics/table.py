@@ -1,9 +1,10 @@
 """The metric table, which the scorer, the command line, the leaderboard and the docs read.
 
-A metric takes one of two kinds of input:
+A metric takes one of three kinds of input:
 
 - `linear`: gray linear radiance in the dataset's known unit (1.0 = white), clipped to [0, 1]: no gamma, no scaling.
 - `srgb8`: the same image sRGB-encoded with 8 bits, as shown to people: for perceptual and no-reference metrics.
+- `spikes`: linear radiance beside the spikes that the held-out camera itself recorded; no image of the truth.
 
 The `*_aligned` metrics multiply the prediction by one least-squares gain per scene, which forgives a method that does
 not know the exposure. The `*_dynamic` metrics use only the moving region that the dataset marks. Metrics of linear
@@ -15,56 +16,17 @@ JSON has no infinity: identical images, whose PSNR is infinite, count as `MAX_PS
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
+from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
+from spike4dgs.benchmark.metrics.spike_rows import SPIKE_METRICS
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
-from spike4dgs.benchmark.weights import METAIQA, WeightFile
-
-MAX_PSNR_DB = 100.0  # half-float images with any error at all stay far below it
-
-
-class Images(Enum):
-    """The images of a scene for which a metric has a value. The dataset decides, so all methods share them."""
-
-    EVERY = "images"
-    MOVING = "images that have a moving region"
-    LATER = "images that have an earlier one of their camera"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metric:
-    """One row of the table.
-
-    `measure` returns the value of an image pair, or None where the dataset defines none. It raises UserError for a
-    prediction that the metric refuses; the scene then has no value.
-    """
-
-    id: str
-    title: str
-    definition: str
-    higher_is_better: bool
-    implementation: str
-    measure: Callable[[ImagePair], float | None]
-    unit: str
-    digits: int  # decimals shown to people; records keep the full value
-    takes: Literal["linear", "srgb8"] = "linear"
-    images: Images = Images.EVERY
-    weights: WeightFile | None = None  # a file that users bring; None: always computable
-    aligned: bool = False  # the prediction is first multiplied by the scene's gain
-    blind: bool = False  # it does not use the truth, so the truth has a score of its own
-    tolerance: float = 1e-6  # largest difference between two machines' values of the same files
-
-    def format(self, value: float | None) -> str:
-        """Return the value as people read it; a dash for null."""
-        return "-" if value is None else f"{value:.{self.digits}f}"
+from spike4dgs.benchmark.weights import METAIQA
 
 
 def _psnr(pair: ImagePair) -> float:
@@ -282,5 +244,5 @@ _PERCEPTUAL = (
     ),
 )
 
-METRICS: dict[str, Metric] = {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL)}
+METRICS: dict[str, Metric] = {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL, *SPIKE_METRICS)}
 PRIMARY = "psnr"  # what the leaderboard ranks by

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from spike4dgs.benchmark.metrics.table import METRICS, Metric
+from spike4dgs.benchmark.metrics.metric import Metric
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.record import COSTS, Cell, Record
 
 

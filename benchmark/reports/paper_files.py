@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spike4dgs.benchmark.metrics.table import Metric
+from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
 from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.reports.table_files import write_table

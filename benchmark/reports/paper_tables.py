@@ -17,7 +17,8 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
-from spike4dgs.benchmark.metrics.table import METRICS, Metric
+from spike4dgs.benchmark.metrics.metric import Metric
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.record import COSTS, Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.scene.scene import Scene

@@ -90,9 +90,7 @@ def is_complete(record: Record) -> bool:
 
 def check_record(record: Record, where: str | Path) -> None:
     """Raise UserError unless the record follows the schema and its numbers agree with each other."""
-    if record.get("schema") != SCHEMA:
-        raise problem(where, f"schema '{SCHEMA}'", repr(record.get("schema")), "check that it is a result record")
-    check_schema(record, load_schema("spike4dgs.benchmark", "result.schema.json"), where, _AGAIN)
+    check_form(record, where)
     if record["protocol"] != PROTOCOL:
         raise problem(where, f"protocol {PROTOCOL}", str(record["protocol"]), _AGAIN)
     if set(record["scenes"]) != set(record["dataset"]["scenes"]):
@@ -108,11 +106,35 @@ def check_record(record: Record, where: str | Path) -> None:
     _check_means(record["mean"], dataset_means(record["scenes"]), f"{where}, mean")
 
 
+def check_form(record: Record, where: str | Path) -> None:
+    """Raise UserError unless the record follows the schema."""
+    if record.get("schema") != SCHEMA:
+        raise problem(where, f"schema '{SCHEMA}'", repr(record.get("schema")), "check that it is a result record")
+    check_schema(record, load_schema("spike4dgs.benchmark", "result.schema.json"), where, _AGAIN)
+
+
 def check_method_name(name: str) -> None:
     """Raise UserError unless a method's name can be part of file names."""
     schema = load_schema("spike4dgs.benchmark", "result.schema.json")["$defs"]["method"]["properties"]["name"]
     if not re.fullmatch(schema["pattern"], name):
         raise problem("method", "a name of letters, digits and + . _ -", repr(name), "rename the method")
+
+
+def with_later_metrics(record: Record) -> Record:
+    """Return a record that follows the schema with the metrics that it is too old to have: they are null."""
+    later = [m.id for m in METRICS.values() if m.added_later]
+
+    def complete(values: Values) -> Values:
+        return {**values, **{m: None for m in later if m not in values}}
+
+    def complete_cell(cell: Cell) -> Cell:
+        older = {m: "not computed: the record is older than the metric" for m in later if m not in cell["metrics"]}
+        per_image = {name: complete(values) for name, values in cell["per_image"].items()}
+        notes = {**cell["notes"], **older} if cell["status"] == "ok" else cell["notes"]
+        return {**cell, "metrics": complete(cell["metrics"]), "notes": notes, "per_image": per_image}
+
+    cells = {scene: complete_cell(cell) for scene, cell in record["scenes"].items()}
+    return {**record, "scenes": cells, "mean": complete(record["mean"])}
 
 
 def _check_metric_names(values: Values, where: str) -> None:
@@ -153,6 +175,8 @@ def same_value(a: float | None, b: float | None, tolerance: float) -> bool:
 def read_record(path: Path) -> Record:
     """Read and check a result record. Raises UserError where it is missing, damaged or inconsistent."""
     record = read_json(path, f"a {SCHEMA} record")
+    check_form(record, path)
+    record = with_later_metrics(record)
     check_record(record, path)
     return record
 

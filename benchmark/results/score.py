@@ -1,28 +1,42 @@
-"""Score a predictions folder. Reads only files: the images, the scene's ground truth and masks; never a model."""
+"""Score a predictions folder. Reads only files: images, the scene's truth, masks and held-out spikes; never a model."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
 from spike4dgs.benchmark.metrics.measure import fit_gain, measure, scene_means, scene_notes
 from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
+from spike4dgs.benchmark.results.own_spikes import Cameras, open_cameras, view_of, without_truth
 from spike4dgs.benchmark.results.predictions import SUMS, MethodInfo, Predictions, open_predictions
 from spike4dgs.benchmark.results.record import Cell, Record, build_record, missing_cell
+from spike4dgs.benchmark.results.targets import has_truth, targets_of
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
+_KEPT = 16  # targets whose images stay in memory: spikes around one are compared with those near it
 
-def score_scene(predictions: Predictions, scene: Scene, selection: Selection) -> Cell:
-    """Score predictions against the ground truth of `scene` by the selected metrics: one cell of a result record.
 
-    Raises UserError for damaged images on either side.
+def score_scene(predictions: Predictions, scene: Scene, selection: Selection, with_truth: bool = True) -> Cell:
+    """Score predictions by the selected metrics, against the scene's truth and the held-out cameras' own spikes.
+
+    Return one cell of a result record. Where the scene has no truth, or without `with_truth`, only the metrics remain
+    that need none. Raises UserError for damaged images on either side.
     """
-    info = predictions.info
-    gain = fit_gain((pair.truth_radiance, pair.predicted_radiance) for _, pair in _pairs(predictions, scene))
-    measured = {t.name: measure(pair, gain, selection.metrics) for t, pair in _pairs(predictions, scene)}
+    info, compare = predictions.info, with_truth and has_truth(scene)
+    selection = selection if compare else without_truth(selection)
+    cameras, selection = open_cameras(scene, targets_of(scene), selection)
+    gain = None
+    if compare:
+        gain = fit_gain((p.truth_radiance, p.predicted_radiance) for _, p in _pairs(predictions, scene, {}, True))
+    measured = {
+        t.name: measure(pair, gain, selection.metrics) for t, pair in _pairs(predictions, scene, cameras, compare)
+    }
     per_image = {name: m.values for name, m in measured.items()}
     return {
         "status": "ok",
@@ -45,9 +59,7 @@ def score_scene(predictions: Predictions, scene: Scene, selection: Selection) ->
 
 def open_for(root: Path, scene: Scene) -> Predictions:
     """Open a predictions folder and check that it was made for this revision and split of this scene."""
-    if not scene.targets:
-        raise problem(scene.root, "a scene with targets", "none in targets.json", "score a scene that has ground truth")
-    predictions = open_predictions(root, scene.targets)
+    predictions = open_predictions(root, targets_of(scene))
     info = predictions.info
     for what, found, expected in (
         ("scene", info.scene, scene.id),
@@ -60,23 +72,43 @@ def open_for(root: Path, scene: Scene) -> Predictions:
     return predictions
 
 
-def _pairs(predictions: Predictions, scene: Scene) -> Iterator[tuple[Target, ImagePair]]:
+def _pairs(
+    predictions: Predictions, scene: Scene, cameras: Cameras, compare: bool
+) -> Iterator[tuple[Target, ImagePair]]:
     """Yield targets with their images, checked, each camera's in the order of time.
 
-    Read anew each time, so that no clip is held in memory: a pair knows the one before it, and no more.
+    They have the spikes of the `cameras` that are given, and without `compare` no truth. Images are read anew each
+    time, so that no clip is held in memory: a pair knows the one before it, and spikes the images near them.
     """
+    everything = sorted(targets_of(scene), key=lambda t: (t.camera, t.tick))
+    read = lru_cache(_KEPT)(lambda target: _read(predictions, scene, target, compare))
     earlier: tuple[Target, ImagePair] | None = None
-    for target in sorted(scene.targets, key=lambda t: (t.camera, t.tick)):
-        truth, image, moving = scene.ground_truth(target), predictions.read(target), scene.moving(target)
-        where = f"{predictions.root / target.name}.exr"
-        check_images(truth, image, moving, where)
-        pair = ImagePair(truth, image, moving, where)
+    for target in everything:
+        truth, image, moving = read(target)
+        pair = ImagePair(truth, image, moving, f"{predictions.root / target.name}.exr")
+        if camera := cameras.get(target.camera):
+            own = [t for t in everything if t.camera == target.camera]
+            truths = (lambda t: read(t)[0]) if compare else None
+            pair = replace(pair, spikes=view_of(camera, target, own, lambda t: read(t)[1], truths))
         if earlier and earlier[0].camera == target.camera:
             since_ms = (scene.t_us(target.tick) - scene.t_us(earlier[0].tick)) / 1000
             yield target, replace(pair, earlier=earlier[1], since_ms=since_ms)
         else:
             yield target, pair
         earlier = target, pair
+
+
+def _read(predictions: Predictions, scene: Scene, target: Target, compare: bool) -> tuple[Image, Image, Mask]:
+    """Read and check a target's truth, prediction and moving region; without `compare` the truth is NaN."""
+    image, where = predictions.read(target), f"{predictions.root / target.name}.exr"
+    if compare:
+        truth, moving = scene.ground_truth(target), scene.moving(target)
+        check_images(truth, image, moving, where)
+        return truth, image, moving
+    camera = scene.cameras[target.camera]
+    nothing = np.zeros((camera.height, camera.width), np.float32)
+    check_images(nothing, image, nothing > 0, where)
+    return nothing * np.nan, image, nothing > 0
 
 
 def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:

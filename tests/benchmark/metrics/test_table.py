@@ -14,8 +14,9 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
 from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes, score_image
 from spike4dgs.benchmark.metrics.measure import measure as measure_pair
+from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images
 from spike4dgs.benchmark.metrics.selection import select_metrics
-from spike4dgs.benchmark.metrics.table import MAX_PSNR_DB, METRICS, PRIMARY, Images
+from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 
 EVERYWHERE = np.ones((24, 40), bool)
 CHOSEN = select_metrics(("psnr",))  # the metrics of linear images, which need nothing
@@ -201,9 +202,17 @@ def test_the_table_describes_every_metric_once() -> None:
         for metric in ("psnr", "ssim")
     ]
     shown = ["lpips_alex", "lpips_vgg", "lpips_squeeze", "flip", "brisque", "niqe", "metaiqa"]
-    assert list(METRICS) == [*linear, *shown, "temporal_error"]
+    windows = [f"spike_psnr_{ticks}" for ticks in (5, 20, 80)]
+    spikes = [f"{metric}{region}" for region in ("", "_dynamic") for metric in (*windows, "spike_deviance")]
+    assert list(METRICS) == [*linear, *shown, "temporal_error", *spikes]
+    assert [m.id for m in METRICS.values() if m.takes == "spikes"] == spikes
     assert [m.id for m in METRICS.values() if m.takes == "srgb8"] == shown
-    assert {m.id for m in METRICS.values() if m.higher_is_better} == {*linear, "metaiqa"}
+    assert {m.id for m in METRICS.values() if m.higher_is_better} == {
+        *linear,
+        "metaiqa",
+        *windows,
+        *(f"{m}_dynamic" for m in windows),
+    }
     assert PRIMARY in METRICS
     for m in METRICS.values():
         assert m.title and m.definition and m.implementation and m.digits > 0 < m.tolerance

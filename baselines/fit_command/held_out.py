@@ -1,0 +1,61 @@
+"""The held-out cameras of a recording, rendered by the fitted model and judged by the spikes that they recorded.
+
+No ground truth is read. The renders are a predictions folder, which `score` takes too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from spike4dgs.benchmark.metrics.measure import Values, scene_means
+from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.results.own_spikes import SPIKE_METRICS
+from spike4dgs.benchmark.results.predictions import MethodInfo, PredictionInfo, PredictionWriter
+from spike4dgs.benchmark.results.score import open_for, score_scene
+from spike4dgs.benchmark.results.targets import targets_of
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.method.saved_model import SavedModel
+
+SHOWN = tuple(metric for metric in SPIKE_METRICS if not metric.endswith("_dynamic"))  # no mask says what moves
+
+
+@dataclass(frozen=True)
+class HeldOutScores:
+    """Means over the images of each held-out camera, and over all of them; and why a value is missing."""
+
+    cameras: Mapping[str, Values]
+    mean: Values
+    images: Mapping[str, int]  # by camera
+    notes: Mapping[str, str]  # by metric
+
+
+def judge_held_out(saved: SavedModel, scene: Scene, folder: Path) -> HeldOutScores:
+    """Render the held-out cameras into a predictions folder, and score it by their own spikes alone."""
+    about, targets = saved.provenance, targets_of(scene)
+    with PredictionWriter(folder) as writer:
+        for target in targets:
+            t_us = scene.t_us(target.tick)
+            writer.add(target, saved.model.render(scene.cameras[target.camera], t_us), t_us)
+        writer.finish(
+            PredictionInfo(
+                method=MethodInfo(**{**about.method, "trained_on": tuple(about.method["trained_on"])}),
+                scene=scene.id,
+                scene_revision=scene.revision,
+                split=scene.split,
+                budget=about.budget,
+                device=about.device,
+                fit_seconds=about.fit_seconds,
+                harness=about.harness,
+                created=about.created,
+            )
+        )
+    cell = score_scene(open_for(folder, scene), scene, select_metrics(SPIKE_METRICS), with_truth=False)
+    of_camera = {
+        camera: {name: values for name, values in cell["per_image"].items() if name.startswith(f"{camera}/")}
+        for camera in dict.fromkeys(t.camera for t in targets)
+    }
+    means = {camera: scene_means(images) for camera, images in of_camera.items()}
+    images = {camera: len(found) for camera, found in of_camera.items()}
+    return HeldOutScores(means, cell["metrics"], images, {m: cell["notes"][m] for m in SHOWN if m in cell["notes"]})

@@ -1,0 +1,52 @@
+"""A row of the metric table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.weights import WeightFile
+
+MAX_PSNR_DB = 100.0  # half-float images with any error at all stay far below it
+
+
+class Images(Enum):
+    """The images of a scene for which a metric has a value. The dataset decides, so all methods share them."""
+
+    EVERY = "images"
+    MOVING = "images that have a moving region"
+    LATER = "images that have an earlier one of their camera"
+    RECORDED = "images around which the camera recorded every tick"
+    RECORDED_MOVING = "images with a moving region around which the camera recorded every tick"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """One row of the table.
+
+    `measure` returns the value of an image pair, or None where the dataset defines none. It raises UserError for a
+    prediction that the metric refuses; the scene then has no value.
+    """
+
+    id: str
+    title: str
+    definition: str
+    higher_is_better: bool
+    implementation: str
+    measure: Callable[[ImagePair], float | None]
+    unit: str
+    digits: int  # decimals shown to people; records keep the full value
+    takes: Literal["linear", "srgb8", "spikes"] = "linear"
+    images: Images = Images.EVERY
+    weights: WeightFile | None = None  # a file that users bring; None: always computable
+    aligned: bool = False  # the prediction is first multiplied by the scene's gain
+    blind: bool = False  # it does not use the truth, so the truth has a score of its own
+    added_later: bool = False  # records that were written before it lack it
+    tolerance: float = 1e-6  # largest difference between two machines' values of the same files
+
+    def format(self, value: float | None) -> str:
+        """Return the value as people read it; a dash for null."""
+        return "-" if value is None else f"{value:.{self.digits}f}"
