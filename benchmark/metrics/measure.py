@@ -21,7 +21,8 @@ from spike4dgs.benchmark.metrics.selection import AUTO, Selection, select_metric
 from spike4dgs.benchmark.metrics.table import METRICS
 
 Values = dict[str, float | None]  # metric id -> value, None where there is none
-_NONE = {  # the dataset defines no value for any image
+_NONE = {  # there is no value for any image
+    Images.EVERY: "no image has a value",
     Images.MOVING: "no image has a moving region",
     Images.LATER: "no camera has two targets",
     Images.RECORDED: "no image has its ticks recorded",

@@ -17,7 +17,7 @@ from spike4dgs.benchmark.results.record import COSTS, Cell, Record
 def make_console() -> Console:
     """Return a console; where the output is no terminal, it is wide enough for the table."""
     console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=180)
+    return console if console.is_terminal else Console(highlight=False, width=240)
 
 
 def results_table(records: Sequence[Record]) -> Table:
