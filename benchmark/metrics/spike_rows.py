@@ -28,7 +28,7 @@ def _spike_psnr(window: int, dynamic: bool, pair: ImagePair) -> float | None:
 
 
 def _spike_deviance(dynamic: bool, pair: ImagePair) -> float | None:
-    found = pair.spikes.span_deviance() if pair.spikes else None
+    found = pair.spikes.span_deviance if pair.spikes else None
     if found is None:
         return None
     value, known = found
@@ -63,7 +63,7 @@ def _deviance_row(dynamic: bool) -> Metric:
         f"where there is no truth against the recorded one; mean over the "
         f"{'moving region' if dynamic else 'pixels'}",
         higher_is_better=False,
-        implementation="benchmark/metrics/spikes/law.py, deviance",
+        implementation="benchmark/metrics/spikes/view.py, span_deviance",
         measure=partial(_spike_deviance, dynamic),
         unit="",
         digits=4,

@@ -7,7 +7,7 @@ one of two neighbouring numbers. Shot noise makes the charge of n spikes vary by
 That law alone is too sharp to judge a model: in the dark an interval of 100 ticks tells the rate to a thousandth, and
 the score would be that of the darkest pixels. A render is not asked to be better than a tolerance: its rate is taken to
 be known with this standard deviation, and the law is averaged over it. tri is only two ticks wide, so m - n / rate is
-linear in the rate where it counts, at the recorded rate n / m:
+linear in the rate where it counts, at the recorded rate n / m (to one part in m; spans are 20 ticks and longer):
 
     P(m | n, rate) = E tri(d + s Z),   d = (rate m / n - 1) m,   s^2 = (tolerance m^2 / n)^2 + (m / n)^2 n / photons
 
@@ -27,12 +27,6 @@ def log_probability(intervals: Float64, ticks: Float64, rate: Float64, tolerance
     """Return log P(ticks | intervals, rate), elementwise: `rate` and `tolerance` in spikes per tick."""
     spread = np.sqrt((tolerance * ticks**2 / intervals) ** 2 + ticks**2 / (intervals * photons))
     return _log_mean_triangle((rate * ticks / intervals - 1) * ticks, spread)
-
-
-def deviance(intervals: Float64, ticks: Float64, rate: Float64, tolerance: float, photons: float) -> Float64:
-    """Return 2 log(P(ticks | intervals, intervals / ticks) / P(ticks | intervals, rate)): 0 at the recorded rate."""
-    own = log_probability(intervals, ticks, intervals / ticks, tolerance, photons)
-    return 2 * (own - log_probability(intervals, ticks, rate, tolerance, photons))
 
 
 def _log_mean_triangle(d: Float64, s: Float64) -> Float64:

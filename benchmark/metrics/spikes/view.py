@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.metrics.spikes.law import deviance
+from spike4dgs.benchmark.metrics.spikes.law import log_probability
 from spike4dgs.benchmark.metrics.spikes.recorded import Float64, Mask, Recorded, window_around
 from spike4dgs.benchmark.metrics.spikes.time_mean import time_mean
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
-from spike4dgs.benchmark.spikes.spans import Spans
 
 TOLERANCE = 0.03  # radiance; a render that is 30 dB good. Below it the darkest pixels decide: their intervals are long
 
@@ -43,26 +43,30 @@ class SpikeView:
         rate = np.minimum(self.recorded.counts[window], most) / window
         return np.asarray((rate - response.rate(self.counted[window])) / response.unit)
 
+    @cached_property
     def span_deviance(self) -> tuple[Float64, Mask] | None:
-        """Return the deviance of the spans [H, W], in excess of the truth's own where that is known; and where it is.
+        """The deviance of the spans [H, W], and the pixels that have one; None where no span was recorded.
 
-        None where no span was recorded.
+        It is twice the logarithm of how much more probable the span is at the truth's rate; without truth, at its own.
         """
         spans = self.recorded.spans
         if spans is None or self.spanned is None:
             return None
-        known = (spans.intervals > 0) & self.recorded.response.good
-        value = self._deviance(spans, self.spanned)
-        if self.true_spanned is not None:
-            value = value - self._deviance(spans, self.true_spanned)
-        return value, known
-
-    def _deviance(self, spans: Spans, radiance: Float64) -> Float64:
         response = self.recorded.response
         intervals = np.maximum(spans.intervals, 1).astype(np.float64)
         shortest = np.floor(intervals / response.rate(np.ones_like(response.dark)))  # under white
         ticks = np.maximum(np.maximum(spans.last - spans.first, 1), shortest)
-        return deviance(intervals, ticks, response.rate(radiance), TOLERANCE * response.unit, SENSOR.photons_per_spike)
+        own = intervals / ticks
+        best = own if self.true_spanned is None else response.rate(self.true_spanned)
+        law = partial(
+            log_probability,
+            intervals,
+            ticks,
+            tolerance=TOLERANCE * response.unit,
+            photons=SENSOR.photons_per_spike,
+        )
+        known = (spans.intervals > 0) & response.good
+        return 2 * (law(rate=best) - law(rate=response.rate(self.spanned))), known
 
 
 def view_spikes(

@@ -20,13 +20,16 @@ from PIL import Image
 from small_scenes import write_small_scene
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
-from spike4dgs.baselines.fit_command.command import MODEL, REPORT, SHEET, VIDEO
+from spike4dgs.baselines.fit_command.command import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
+from spike4dgs.baselines.fit_command.held_out import SHOWN
 from spike4dgs.baselines.fit_command.recording import open_recording, own_frame
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.results.record import read_record
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
@@ -154,7 +157,29 @@ def test_no_file_of_truth_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[
         arguments = ["fit", str(scene), "--method", "tfp+4dgs", "--out", str(tmp_path / f"{scene.name}-fit"), *QUICK]
         assert main(arguments) == 0
     assert same_model(tmp_path / "whole-fit", tmp_path / "bare-fit")
-    assert "the fit does not see the held-out cam_03" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "the fit does not see the held-out cam_03" in said
+    assert "held-out cam_03 by their own spikes: no score (not computed: the stream or the recordings of cam_03" in said
+
+
+def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bare = write_small_scene(tmp_path / "scene")
+    for name in ("images", "masks"):
+        shutil.rmtree(bare / name)
+    write_json(bare / "targets.json", {"targets": []})
+    write_manifest(bare)
+    out = tmp_path / "out"
+    assert main(["fit", str(bare), "--method", "tfp+static", "--out", str(out), *QUICK]) == 0
+    said = capsys.readouterr().out
+    assert main(["score", str(out / PREDICTIONS), str(bare), "--out", str(tmp_path / "record.json")]) == 0
+    values = read_record(tmp_path / "record.json")["scenes"]["pattern-0"]["metrics"]
+    assert values["psnr"] is None and values["spike_psnr_5_dynamic"] is None
+    assert f"cam_03 by their own spikes: spike_psnr_5 {values['spike_psnr_5']:.3f}" in said
+    page = (out / REPORT).read_text()
+    (cells,) = re.findall(r"<tr><td>cam_03</td><td>15</td>((?:<td>[^<]*</td>)+)</tr>", page)
+    shown = re.findall(r"<td>([^<]*)</td>", cells)
+    assert shown == [METRICS[m].format(values[m]) for m in SHOWN]
+    assert page.count(f"<td>{shown[0]}</td>") == 2, "the mean over cameras too"
 
 
 def test_streams_without_poses_get_estimated_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

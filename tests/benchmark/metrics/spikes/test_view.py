@@ -1,0 +1,176 @@
+"""Predictions beside the spikes of a simulated camera: closed forms, and what every score of them must do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.metrics.spikes.recorded import Recorded, Response, record_around, response_of
+from spike4dgs.benchmark.metrics.spikes.view import view_spikes
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.scene.calibration import Recordings
+from spike4dgs.benchmark.spikes.gaps import Gap
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+
+Image = NDArray[np.floating]
+HEIGHT, WIDTH, TICKS, TICK, GAIN = 40, 64, 200, 100, 0.6
+SHAPE = (HEIGHT, WIDTH)
+WHOLE = ("spike_psnr_5", "spike_psnr_20", "spike_psnr_80", "spike_deviance")
+PLAIN = response_of(None, SHAPE, GAIN)
+
+
+def filmed(radiance: Image, sensor: Sensor | None = None, seed: int = 0, n_ticks: int = TICKS) -> SpikeStream:
+    """The stream of a camera under light that does not change."""
+    sensor = sensor or Sensor(GAIN, photons=5e4, noise_seed=(seed,))
+    keys = [radiance.astype(np.float32)] * 2
+    packed = np.concatenate(list(simulate(keys, [0, n_ticks], n_ticks, sensor, random_charge(*SHAPE, [seed]))))
+    return SpikeStream(packed, WIDTH, HEIGHT, 2e4)
+
+
+def scores(recorded: Recorded, prediction: Image, truth: Image | None = None) -> dict[str, float | None]:
+    """All scores of a prediction; the moving region is the left half."""
+    moving = np.zeros(SHAPE, bool)
+    moving[:, : WIDTH // 2] = True
+    view = view_spikes(recorded, [TICK], [prediction], None if truth is None else [truth])
+    pair = ImagePair(prediction if truth is None else truth, prediction, moving, "image", spikes=view)
+    return {m.id: m.measure(pair) for m in METRICS.values() if m.takes == "spikes"}
+
+
+def better(metric: str, a: float | None, b: float | None) -> bool:
+    assert a is not None and b is not None
+    return a > b if METRICS[metric].higher_is_better else a < b
+
+
+@pytest.mark.parametrize("level", [0.1, 0.37, 0.71, 1.0])
+@pytest.mark.parametrize("window", [5, 20, 80])
+def test_the_right_level_leaves_the_noise_of_counting(level: float, window: int) -> None:
+    """A counter that starts at any charge gives one of the two whole numbers around the mean: variance f (1 - f)."""
+    image = np.full(SHAPE, level)
+    sensor = Sensor(GAIN)  # no shot noise
+    found = scores(record_around(filmed(image, sensor), TICK, PLAIN), image)[f"spike_psnr_{window}"]
+    fraction = level * GAIN * window % 1
+    noise = fraction * (1 - fraction) / (window * GAIN) ** 2
+    assert found is not None
+    if noise < 1e-9:
+        assert found > 60
+    else:
+        assert found == pytest.approx(-10 * math.log10(noise), abs=0.8)
+
+
+def test_a_wrong_level_adds_its_square() -> None:
+    image = np.full(SHAPE, 0.5)  # 24 counts in 80 ticks, always
+    recorded = record_around(filmed(image, Sensor(GAIN)), TICK, PLAIN)
+    found = scores(recorded, image + 0.1)["spike_psnr_80"]
+    assert found == pytest.approx(20, abs=0.05)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_truth_is_best_and_noise_makes_it_worse(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0.02, 0.98) * np.ones(SHAPE) + rng.uniform(-0.3, 0.3, SHAPE)
+    truth = np.clip(truth, 0, 1)
+    recorded = record_around(filmed(truth, seed=seed % 1000), TICK, PLAIN)
+    noise = rng.normal(size=SHAPE)
+    rows = [scores(recorded, truth + sigma * noise, truth) for sigma in (0, 0.06, 0.15, 0.4)]
+    for metric in rows[0]:
+        for good, bad in zip(rows[:-1], rows[1:], strict=True):
+            assert better(metric, good[metric], bad[metric]), metric
+    assert rows[0]["spike_deviance"] == rows[0]["spike_deviance_dynamic"] == 0
+
+
+def test_without_the_truth_the_deviance_keeps_its_order_and_is_never_negative() -> None:
+    truth = np.random.default_rng(0).uniform(0, 1, SHAPE)
+    recorded = record_around(filmed(truth), TICK, PLAIN)
+    predictions = [truth, truth + 0.03, 0.9 * truth, np.full(SHAPE, 0.5), np.zeros(SHAPE), np.ones(SHAPE)]
+    own = [scores(recorded, p)["spike_deviance"] for p in predictions]
+    excess = [scores(recorded, p, truth)["spike_deviance"] for p in predictions]
+    differences = [a - b for a, b in zip(own, excess, strict=True) if a is not None and b is not None]
+    assert min(v for v in own if v is not None) == own[0] and own[0] is not None and own[0] > 0
+    np.testing.assert_allclose(differences, own[0], rtol=1e-9)  # the truth's own, the same for all
+
+
+def test_light_above_white_counts_as_white() -> None:
+    truth = np.full(SHAPE, 1.6)  # 0.96 spikes a tick
+    recorded = record_around(filmed(truth), TICK, PLAIN)
+    rows = [scores(recorded, np.full(SHAPE, level)) for level in (1.0, 1.6, 40.0, 0.9, 0.7)]
+    for metric in WHOLE:
+        values = [row[metric] for row in rows]
+        assert values[0] == values[1] == values[2], "a prediction above white is white too"
+        assert better(metric, values[0], values[3]) and better(metric, values[3], values[4])
+    assert rows[0]["spike_psnr_80"] is not None and rows[0]["spike_psnr_80"] > 60  # 48 counts of white, to one
+
+
+def test_gain_and_dark_maps_and_bad_pixels_come_from_the_recordings() -> None:
+    rng = np.random.default_rng(1)
+    gain = rng.normal(1, 0.1, SHAPE).astype(np.float32)
+    gain /= gain.mean()
+    dark = rng.uniform(0.002, 0.01, SHAPE).astype(np.float32)
+    gain[3, 4], dark[5, 6] = 0, 0.3  # dead and hot
+    dark[3, 4] = 0
+    sensor = Sensor(GAIN, gain=gain, dark=dark)
+    truth = rng.uniform(0.1, 0.9, SHAPE)
+    even = (filmed(np.full(SHAPE, level), sensor, 7, 2000) for level in (0.7, 0.0))
+    response = response_of(Recordings(*even, 0.7), SHAPE, GAIN)
+    assert np.argwhere(~response.good).tolist() == [[3, 4], [5, 6]]
+    np.testing.assert_allclose(response.white[response.good], GAIN * gain[response.good], rtol=0.01)
+    stream = filmed(truth, sensor)
+    known, unknown = (scores(record_around(stream, TICK, r), truth) for r in (response, PLAIN))
+    for metric in WHOLE:
+        assert better(metric, known[metric], unknown[metric])
+    wrong = truth.copy()
+    wrong[3, 4], wrong[5, 6] = 1, 0
+    assert scores(record_around(stream, TICK, response), wrong) == known, "bad pixels are left out"
+
+
+def test_windows_that_lack_a_tick_have_no_score() -> None:
+    truth = np.full(SHAPE, 0.5)
+    stream = filmed(truth)
+    near = replace(stream, gaps=(Gap("c", TICK + 30, 5, "lost"),))
+    found = scores(record_around(near, TICK, PLAIN), truth, truth)
+    assert {m for m, v in found.items() if v is None} == {"spike_psnr_80", "spike_psnr_80_dynamic"}
+    hit = replace(stream, gaps=(Gap("c", TICK, 1, "lost"),))
+    assert set(scores(record_around(hit, TICK, PLAIN), truth, truth).values()) == {None}
+    edge = scores(record_around(stream, 9, PLAIN), truth, truth)
+    assert {m for m, v in edge.items() if v is not None} == {"spike_psnr_5", "spike_psnr_5_dynamic"}
+
+
+def test_pixels_without_an_interval_are_left_out_of_the_deviance() -> None:
+    truth = np.full(SHAPE, 0.5)
+    truth[:, :10] = 0  # these never fire
+    recorded = record_around(filmed(truth), TICK, PLAIN)
+    wrong = truth.copy()
+    wrong[:, :10] = 1
+    found, right = scores(recorded, wrong), scores(recorded, truth)
+    assert found["spike_deviance"] == right["spike_deviance"]
+    assert better("spike_psnr_20", right["spike_psnr_20"], found["spike_psnr_20"]), "the counts see them"
+
+
+def test_motion_between_targets_is_in_the_expected_counts() -> None:
+    """Light that rises steadily: images at its ends and the middle give the counts that the middle alone does not."""
+    keys = [np.full(SHAPE, v, np.float32) for v in (0.2, 0.2, 0.8, 0.8)]
+    charge = random_charge(*SHAPE, [3])
+    packed = np.concatenate(list(simulate(keys, [0, 80, 110, 200], 200, Sensor(GAIN), charge)))
+    recorded = record_around(SpikeStream(packed, WIDTH, HEIGHT, 2e4), TICK, PLAIN)
+    level = float(np.interp(TICK, [80, 110], [0.2, 0.8]))
+    images = [np.full(SHAPE, v) for v in (0.2, level, 0.8)]
+    pairs = [
+        ImagePair(images[1], images[1], np.ones(SHAPE, bool), "image", spikes=view_spikes(recorded, ticks, used, None))
+        for ticks, used in (([80, 100, 110], images), ([100], images[1:2]))
+    ]
+    for metric in ("spike_psnr_80", "spike_deviance"):
+        moving, still = (METRICS[metric].measure(pair) for pair in pairs)
+        assert better(metric, moving, still)
+
+
+def test_a_response_never_fires_twice_in_a_tick() -> None:
+    response = Response(np.full(SHAPE, 1.4), np.full(SHAPE, 0.1), 1.4, np.ones(SHAPE, bool))
+    assert response.rate(np.ones(SHAPE)).max() == 1
