@@ -22,7 +22,7 @@ def score(
     split: str | None = None,
     allow_gaps: bool = False,
 ) -> int:
-    """Score predictions, of any program, from their files.
+    """Score predictions, of any program, from their files. A recording without truth is scored by its held-out spikes.
 
     Args:
         predictions: Predictions folder (images, SHA256SUMS, prediction.json); for several scenes, the folder that
