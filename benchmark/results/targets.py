@@ -1,24 +1,30 @@
-"""The images that a scene is scored on: those that it lists, or evenly spaced ones of a recording without any."""
+"""The images that a scene is scored on: those that it lists, or every millisecond of a recording without any."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
-PARTS = 16  # of a recording without targets; each held-out camera has one at every inner border
+EVERY_MS = 1.0  # between the ticks of a recording without targets, as in made scenes,
+MOST = 32  # and of each held-out camera's; longer clips have as many, evenly spread
 
 
 def targets_of(scene: Scene) -> tuple[Target, ...]:
-    """Return the scene's targets; where it lists none, 15 evenly spaced ticks of each held-out camera.
+    """Return the scene's targets; where it lists none, every millisecond of each held-out camera.
 
-    The ticks are n_ticks * k / 16, rounded. Raises UserError for a scene that holds out no camera.
+    The ticks lie strictly inside the clip, and are at most `MOST`. Raises UserError where no camera is held out.
     """
     if scene.targets:
         return scene.targets
     if not scene.test:
         fix = "hold out a camera: --held-out of `spike4dgs record`, or the splits in scene.json"
         raise problem(scene.root, "a held-out camera, or targets in targets.json", "neither", fix)
-    ticks = sorted({round(scene.n_ticks * k / PARTS) for k in range(1, PARTS)} & set(range(scene.n_ticks)))
+    every = max(1, round(scene.rate_hz * EVERY_MS * 1e-3))
+    inside = range(every, scene.n_ticks - every + 1, every) or range(scene.n_ticks // 2, scene.n_ticks // 2 + 1)
+    chosen = sorted({round(i) for i in np.linspace(0, len(inside) - 1, min(MOST, len(inside)))})
+    ticks = [inside[i] for i in chosen]
     return tuple(Target(camera, tick) for camera in scene.test for tick in ticks)
 
 

@@ -70,7 +70,7 @@ def test_a_recording_is_scored_by_its_spikes_alone(small_scene: Path, tmp_path: 
     whole, scene = open_scene(small_scene), open_scene(bare_copy(small_scene, tmp_path / "bare"))
     assert has_truth(whole) and not has_truth(scene)
     targets = targets_of(scene)
-    assert targets == tuple(Target("cam_03", round(TICKS * k / 16)) for k in range(1, 16))
+    assert targets == tuple(Target("cam_03", tick) for tick in range(20, TICKS - 19, 20))
     good, bad = (predict(tmp_path / f"p{n}", scene, targets, scene, n) for n in (0.0, 0.1))
     record, worse = (score_predictions(folder, [scene], CHOSEN) for folder in (good, bad))
     write_record(tmp_path / "r.json", record)
