@@ -18,7 +18,7 @@ from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, from_recordings, isolated, total_counts
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
 from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
@@ -38,6 +38,7 @@ _COLUMNS = {
     "spikes/s": ".0f",
     "dead": "",
     "hot": "",
+    "flickering": "",
     "bad from": "",
     "two ISIs": ".1%",
 }
@@ -63,7 +64,7 @@ def examine(name: str, stream: SpikeStream, recordings: Recordings | None = None
     """
     seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
     rate = total_counts(stream) / seen
-    bad = from_recordings(recordings.flat, recordings.dark) if recordings else isolated(rate, seen)
+    bad = find_bad(stream, recordings.flat, recordings.dark) if recordings else find_bad(stream)
     missing = sum(gap.ticks for gap in stream.gaps)
     return StreamReport(name, rate, bad, _two_intervals(stream), stream.rate_hz, stream.n_ticks, missing)
 
@@ -151,7 +152,7 @@ def _plot_gaps(axis: Any, stream: SpikeStream) -> None:
 
 def _show_bad_pixels(axis: Any, report: StreamReport) -> None:
     axis.imshow(report.rate, cmap="gray")
-    for mask, color, what in ((report.bad.dead, "tab:blue", "dead"), (report.bad.hot, "tab:red", "hot")):
+    for color, (what, mask) in zip(("tab:blue", "tab:red", "tab:orange"), report.bad.kinds.items(), strict=True):
         y, x = np.nonzero(mask)
         axis.scatter(x, y, s=12, facecolors="none", edgecolors=color, label=f"{len(x)} {what}")
     axis.legend(loc="lower right")
@@ -162,7 +163,7 @@ def _row(r: StreamReport) -> dict[str, Any]:
     """Return the values of a line of the table, in the order of _COLUMNS."""
     low, middle, high = np.percentile(r.rate, (1, 50, 99))
     rates = r.rate.mean(), middle, low, high, r.rate.mean() * r.rate_hz
-    bad = int(r.bad.dead.sum()), int(r.bad.hot.sum()), r.bad.source
+    bad = *(int(mask.sum()) for mask in r.bad.kinds.values()), r.bad.source
     return dict(zip(_COLUMNS, (r.name, r.n_ticks, r.missing, *rates, *bad, r.two_intervals), strict=True))
 
 
@@ -180,7 +181,7 @@ def _print_reports(reports: list[StreamReport]) -> None:
     console.print(table)
     print("Rates are spikes per tick and pixel; 'two ISIs' is the share of pixels with only two adjacent intervals.")
     for r in reports:
-        for what, mask in (("dead", r.bad.dead), ("hot", r.bad.hot)):
+        for what, mask in r.bad.kinds.items():
             if mask.any():
                 first = ", ".join(f"({x}, {y})" for y, x in np.argwhere(mask)[:5])
                 print(f"{r.name}: {mask.sum()} {what} pixels, the first (x, y): {first}")
@@ -230,10 +231,10 @@ def inspect(
     out: Path = Path("runs/inspect"),
     allow_gaps: bool = False,
 ) -> int:
-    """Show a scene's streams, or one raw stream: rates, dead and hot pixels, interval statistics, TFP and TFI images.
+    """Show a scene's streams, or one raw stream: rates, bad pixels, interval statistics, TFP and TFI images.
 
-    Dead and hot pixels are those of the scene's recordings of uniform light and of darkness. Without them they are the
-    pixels that differ from all of their neighbours. The table is printed, and written as statistics.csv.
+    Dead, hot and flickering pixels are those of the scene's recordings of uniform light and of darkness. Without them
+    they are the pixels that differ from all of their neighbours. The table is printed, and written as statistics.csv.
 
     Args:
         path: A scene folder, a folder of imported streams, or a headerless .dat file.

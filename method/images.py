@@ -8,15 +8,19 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
+
+NEAR_TICKS = 20  # on each side of an image's tick: most makers look no further
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,29 @@ def make_training_images(
     if calibrations:
         made = [make(s, ticks, gain, camera) for s, camera in zip(scene.streams, calibrations, strict=True)]
     else:
-        made = [make(s, ticks, gain) for s in scene.streams]
+        gains = [gain * scene.state(camera.id).gain for camera in scene.cameras]
+        made = [make(s, ticks, own) for s, own in zip(scene.streams, gains, strict=True)]
     images = torch.from_numpy(np.stack(made, axis=1)).to(device)
-    return TrainingImages(Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks)
+    views, unmeasured = (
+        Views.from_cameras(cameras, device=device),
+        (_bad(scene, device), _missing(scene, ticks, device)),
+    )
+    return TrainingImages(views, ticks, images, scene.n_ticks, *unmeasured)
+
+
+def _bad(scene: TrainingScene, device: str) -> Tensor | None:
+    """Return the bad pixels of all cameras, bool [C, H, W]; None where there are none."""
+    masks = [scene.state(camera.id).bad for camera in scene.cameras]
+    if all(mask is None for mask in masks):
+        return None
+    size = scene.streams[0].height, scene.streams[0].width
+    return torch.from_numpy(np.stack([np.zeros(size, bool) if m is None else m for m in masks])).to(device)
+
+
+def _missing(scene: TrainingScene, ticks: Sequence[int], device: str) -> Tensor | None:
+    """Return the images around which a camera's recording lacks most ticks, bool [T, C]; None where there are none."""
+    if not any(stream.gaps for stream in scene.streams):
+        return None
+    lacking = [~present(stream.gaps, scene.n_ticks) for stream in scene.streams]
+    near = [[own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for own in lacking] for t in ticks]
+    return torch.tensor(near, device=device)

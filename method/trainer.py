@@ -125,7 +125,7 @@ class Trainer:
             order = torch.randperm(count, generator=seeded(self.seed, self.step))
             views = order[: self.settings.views_per_step].sort().values
         tick = training.ticks[index]
-        images = training.images[index][views]
+        images = training.measured(index)[views]
         return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step)
 
     def train_step(self) -> Tensor:

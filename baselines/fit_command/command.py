@@ -21,7 +21,6 @@ from typing import Any
 from rich.console import Console
 from tyro.conf import Positional
 
-from spike4dgs.baselines.fit_command.camera_facts import camera_facts
 from spike4dgs.baselines.fit_command.comparison import compare, mean_residual, residuals, write_sheet
 from spike4dgs.baselines.fit_command.held_out import SHOWN, HeldOutScores, judge_held_out
 from spike4dgs.baselines.fit_command.recording import Recording, open_recording
@@ -58,10 +57,10 @@ def fit(
     budget: str = "quick",
     seed: int = 0,
     device: str = "auto",
-    allow_gaps: bool = False,
 ) -> int:
     """Fit a model to a recording, and write a sheet, a slow-motion video and a report. No ground truth is needed.
 
+    Missing ticks are filled, bad pixels left out and unequal gains corrected; the report says what was found.
     A recording without poses (streams of `record` before a calibration) gets estimated ones. A killed fit resumes where
     it was. Cameras that the recording holds out are judged by their own spikes: their renders are in OUT/predictions.
 
@@ -72,14 +71,13 @@ def fit(
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
         seed: Seed of everything random.
         device: auto, cpu or cuda.
-        allow_gaps: Accept a recording with gaps.
     """
     wanted, steps = get_method(method), make_budget(budget)
     on = choose_device(device, rasterizes=getattr(wanted, "rasterizes", True))
     console, times = make_console(), dict[str, float]()
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         with _timed(times, "opening"):
-            recording = open_recording(scene, seed, allow_gaps)
+            recording = open_recording(scene, seed)
         poses = _poses(recording, wanted)
         for text in (f"poses: {poses}", *recording.notes):
             _say(console, text)
@@ -104,7 +102,7 @@ def fit(
             held_out=recording.held_out,
             judged=judged,
             notes=(*recording.notes, f"the video is {slow_motion:.0f} times slower than the world"),
-            facts=camera_facts(recording.training),
+            facts=recording.facts,
             residuals=residuals(found),
             maker=found.maker,
             seconds=times,

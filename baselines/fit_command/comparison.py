@@ -46,9 +46,10 @@ def compare(method: Method, model: Model, scene: TrainingScene, cameras: Sequenc
     make = recipe.images if recipe else IMAGES[OTHER]
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
     made = make_training_images(scene, cameras, make, replace(settings, max_times=TIMES), device)
+    measured = np.stack([made.measured(i).cpu().numpy() for i in range(len(made.ticks))])
     times = tuple(tick * 1e6 / scene.rate_hz for tick in made.ticks)
     rendered = np.stack([[model.render(camera, t) for camera in cameras] for t in times])
-    return Comparison(tuple(cameras), times, made.images.cpu().numpy(), rendered, maker)
+    return Comparison(tuple(cameras), times, measured, rendered, maker)
 
 
 def residual_db(image: NDArray[np.floating], rendered: NDArray[np.floating]) -> float:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.baselines.fit_command.camera_facts import CameraFacts, camera_facts
+from spike4dgs.baselines.fit_command.survey import survey_gains, survey_streams
 from spike4dgs.baselines.initialization.colmap import UNCALIBRATED, clip_means, map_views
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file, sha256_json
@@ -35,8 +37,9 @@ class Recording:
     training: TrainingScene
     split: str
     poses: str  # where they come from
+    facts: tuple[CameraFacts, ...]
     scene: Scene | None = None  # the folder, for what is judged after the fit; None: streams without poses
-    notes: tuple[str, ...] = ()  # what was assumed, and what could not be used
+    notes: tuple[str, ...] = ()  # what was found, what was assumed, and what could not be used
 
     @property
     def held_out(self) -> tuple[str, ...]:
@@ -44,16 +47,20 @@ class Recording:
         return self.scene.test if self.scene else ()
 
 
-def open_recording(root: Path, seed: int = 0, allow_gaps: bool = False) -> Recording:
-    """Return the recording in a scene folder or in a folder of streams without poses.
+def open_recording(root: Path, seed: int = 0) -> Recording:
+    """Return the recording in a scene folder or in a folder of streams without poses, surveyed for faults.
 
-    Raises UserError for another folder, for gaps unless `allow_gaps`, and where poses cannot be estimated.
+    Raises UserError for another folder, where too little was recorded, and where poses cannot be estimated.
     """
     if (root / STREAMS).is_file():
-        return _without_poses(root, open_stream_folder(root, allow_gaps), seed)
-    scene = open_scene(root, allow_gaps)
+        return _without_poses(root, open_stream_folder(root, allow_gaps=True), seed)
+    scene = open_scene(root, allow_gaps=True)
     notes = (f"the fit does not see the held-out {', '.join(scene.test)}",) if scene.test else ()
-    return Recording(scene.training, scene.split, GIVEN, scene, notes)
+    recorded = {c: scene.stream(c) for c in scene.train}
+    surveyed = survey_streams(replace(scene.training, streams=tuple(recorded.values())))
+    training, gain_notes = survey_gains(surveyed.scene)
+    facts = camera_facts(training, recorded, surveyed.bad)
+    return Recording(training, scene.split, GIVEN, facts, scene, (*notes, *surveyed.notes, *gain_notes))
 
 
 def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) -> Recording:
@@ -66,9 +73,12 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     revision = sha256_json({c: sha256_file(Path(streams[c].source)) for c in names})
     first = streams[names[0]]
     clock = first.rate_hz, first.n_ticks
-    scene = TrainingScene(
-        root.resolve().name, revision, _guess(names, first), tuple(streams[c] for c in names), *clock, 1.0
+    surveyed = survey_streams(
+        TrainingScene(
+            root.resolve().name, revision, _guess(names, first), tuple(streams[c] for c in names), *clock, 1.0
+        )
     )
+    scene = surveyed.scene
     rates = clip_means(scene)
     white = max(float(np.percentile(rates, WHITE_PERCENTILE)), 1e-6)
     cameras = map_views(scene, rates / np.float32(white), seed, UNCALIBRATED, UNCALIBRATED.focal_prior).cameras
@@ -79,12 +89,14 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     notes = [
         f"white is taken to be {white:.3f} spikes per tick, the {WHITE_PERCENTILE:g}th percentile of all pixels' rates"
     ]
-    if lost := [c for c in names if c not in kept]:
+    if lost := [c.id for c in scene.cameras if c.id not in kept]:
         notes.append(f"COLMAP found no pose of {', '.join(lost)}: left out")
-    training = replace(
-        scene, cameras=own_frame(cameras), streams=tuple(streams[c] for c in kept), radiance_gain=white, recordings=()
+    repaired = {c.id: stream for c, stream in zip(scene.cameras, scene.streams, strict=True)}
+    training, gain_notes = survey_gains(
+        replace(scene, cameras=own_frame(cameras), streams=tuple(repaired[c] for c in kept), radiance_gain=white)
     )
-    return Recording(training, ALL, ESTIMATED, notes=tuple(notes))
+    facts = camera_facts(training, streams, surveyed.bad)
+    return Recording(training, ALL, ESTIMATED, facts, notes=(*surveyed.notes, *notes, *gain_notes))
 
 
 def _guess(names: Sequence[str], stream: SpikeStream) -> tuple[Camera, ...]:

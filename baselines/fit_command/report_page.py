@@ -81,8 +81,10 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         _cameras_table(report),
         f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {report.maker} "
         "images of the same camera. It is a residual of the fit and not a score: the model has seen these images, and "
-        "their noise is in it. Dead pixels respond to uniform light with less than a fifth of the mean; hot ones fire "
-        "in the dark five times as often as the median pixel. A dash means that the recording does not tell.</p>",
+        "their noise is in it. Dead pixels never fire under uniform light, hot ones fire in the dark five times as "
+        "often as the median pixel, the rate of flickering ones is not steady. Without recordings of light and "
+        "darkness these are the pixels that differ from all of their neighbours. The gain is that of the camera "
+        "beside the array's.</p>",
         _held_out(report.judged) if report.judged else "",
         "<h2>Poses</h2>",
         f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
@@ -138,12 +140,14 @@ def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def _cameras_table(report: Report) -> str:
-    heads = "camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %", "dead", "hot", "residual, dB"
+    heads = "camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %", "dead", "hot", "flickering"
+    heads = *heads, "gain", "residual, dB"
     lines = ["".join(f"<th>{head}</th>" for head in heads)]
     focal = {camera.id: camera.fx for camera in report.about.cameras}
     for f in report.facts:
         cells = [f.camera, f"{focal[f.camera]:.1f}", f"{f.missing}", *(f"{v:.4f}" for v in (f.mean, f.low, f.high))]
-        cells += ["-" if n is None else f"{n}" for n in (f.dead, f.hot)] + [_decibel(report.residuals[f.camera])]
+        cells += [*(f"{n}" for n in (f.dead, f.hot, f.flickering)), f"{f.gain:.3f}"]
+        cells.append(_decibel(report.residuals[f.camera]))
         lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
     rows = "".join(f"<tr>{line}</tr>" for line in lines)
     return f'<div class="scroll"><table>{rows}</table></div>'

@@ -205,14 +205,14 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: Cloud
     empty = distance[:, 0] > settings.hole_px
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
     added = camera.unproject(grid[empty], depth)
-    seen = np.stack([_look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
+    seen = np.stack([look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
     visible = np.isfinite(seen).any(axis=0)
     added, seen = added[visible], seen[:, visible]
     values = np.concatenate([cloud.values, np.nanmedian(seen, axis=0).astype(np.float32)])
     return Cloud(np.concatenate([cloud.points, added]), values)
 
 
-def _look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gray value [N] of the pixel that sees each point; NaN outside the image."""
     uv, z = camera.project(points)
     inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
-from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, expand, in_threads, kernel, lanes, rows
+from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, expand, find_spike, in_threads, kernel, lanes, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 _BLOCK = 128  # bytes of a tick done at a time in the stack: 1024 pixels
@@ -27,17 +27,6 @@ def tfi_image(stream: SpikeStream, tick: int) -> Float32:
     in_threads(_image, len(image), rows(stream.packed), tick, image, small=len(image) < 1 << 14)
     upright = image.reshape(stream.height, stream.width)
     return upright[::-1] if stream.rows_bottom_up else upright
-
-
-@kernel
-def find_spike(packed: UInt8, pixel: int, tick: int, step: int) -> int:
-    """Return the first tick with a spike of a stored pixel, from `tick` in direction `step`; -1 where there is none."""
-    byte, bit = pixel >> 3, pixel & 7
-    while 0 <= tick < len(packed):
-        if packed[tick, byte] >> bit & 1:
-            return tick
-        tick += step
-    return -1
 
 
 @kernel

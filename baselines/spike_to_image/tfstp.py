@@ -38,9 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
-from spike4dgs.baselines.spike_to_image.tfi import find_spike
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.bits import UInt8, find_spike, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.settings import Settings
 

@@ -27,6 +27,7 @@ from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
 from spike4dgs.benchmark.scene.splits import Split, check_splits
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps, refuse_gaps
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 SCHEMA = "spike4dgs-scene/1"
@@ -204,9 +205,9 @@ class Scene:
 
     @cached_property
     def training(self) -> TrainingScene:
-        """The part of the scene that methods get."""
+        """The part of the scene that methods get. The missing ticks of a recording are filled (`spikes.repair`)."""
         cameras = tuple(self.cameras[c] for c in self.train)
-        streams = tuple(self.stream(c) for c in self.train)
+        streams = tuple(fill_gaps(self.stream(c)) for c in self.train)
         clock = self.rate_hz, self.n_ticks, self.radiance_gain
         recordings = tuple(self.recordings(c) for c in self.train)
         frames = find_frames(self.meta, self.manifest, self.train)

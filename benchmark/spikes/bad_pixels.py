@@ -1,7 +1,8 @@
-"""Dead and hot pixels: from recordings of uniform light and of darkness, or from any stream by isolation.
+"""Dead, hot and flickering pixels: from recordings of uniform light and of darkness, or from any stream by isolation.
 
 A bright line is bright along itself, a hot pixel alone. Without recordings, a pixel is called bad where it differs from
-all of its neighbours: bad pixels that touch each other, and hot ones in bright light, are then not found.
+all of its neighbours: bad pixels that touch each other, and hot ones in bright light, are then not found. A flickering
+pixel's rate changes under steady light: its counts in windows of WINDOW_TICKS differ by more than the usual pixel's.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -21,6 +23,9 @@ Float64 = NDArray[np.float64]
 FEWEST_SPIKES = 10  # fewer say nothing of a rate
 HOT_SIGMA = 6.0  # robust standard deviations of its surroundings that a hot pixel is above its brightest neighbour,
 HOT_SHARE = 0.5  # and share of that neighbour's rate: texture of one pixel seldom has more
+WINDOW_TICKS = 50  # of a flickering pixel's counts: a state that holds for a few milliseconds shows
+FLICKER_FACTOR = 4.0  # times the usual deviation of counts that a flickering pixel has,
+FLICKER_LEAST = 1.0  # and at least so many spikes: steady light's counts differ by one, which deviates by a half
 _LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
 _ROWS = 100  # compared with their surroundings at a time
 
@@ -31,7 +36,18 @@ class BadPixels:
 
     dead: Mask
     hot: Mask
+    flickering: Mask
     source: str
+
+    @property
+    def kinds(self) -> dict[str, Mask]:
+        """The masks by name."""
+        return {"dead": self.dead, "hot": self.hot, "flickering": self.flickering}
+
+    @property
+    def all(self) -> Mask:
+        """The pixels that are bad in any way."""
+        return self.dead | self.hot | self.flickering
 
 
 def total_counts(stream: SpikeStream) -> NDArray[np.int64]:
@@ -42,8 +58,40 @@ def total_counts(stream: SpikeStream) -> NDArray[np.int64]:
     return counts
 
 
+def find_bad(stream: SpikeStream, flat: SpikeStream | None = None, dark: SpikeStream | None = None) -> BadPixels:
+    """Return the bad pixels of a camera: from its recordings, or without them by isolation in `stream`."""
+    if flat and dark:
+        return from_recordings(flat, dark)
+    seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
+    return isolated(total_counts(stream) / seen, seen, deviation(stream))
+
+
+def deviation(stream: SpikeStream) -> Float64:
+    """Return the standard deviation of each pixel's counts in windows of WINDOW_TICKS [H, W].
+
+    What the whole chip does, as under a lamp that flickers, does not count. Zero for fewer than two windows.
+    """
+    edges = range(0, stream.n_ticks - WINDOW_TICKS + 1, WINDOW_TICKS)
+    total = np.zeros((stream.height, stream.width))
+    square, levels = total.copy(), []
+    for start in edges:
+        counts = stream.counts(start, start + WINDOW_TICKS)
+        levels.append(float(counts.mean()))
+        own = counts - levels[-1]
+        total += own
+        square += own**2
+    n = max(len(edges), 1)
+    return np.asarray(np.sqrt(np.maximum(square / n - (total / n) ** 2, 0)))
+
+
+def flickering(stream: SpikeStream) -> Mask:
+    """Return the pixels [H, W] whose rate is not steady in a recording of steady light or of darkness."""
+    found = deviation(stream)
+    return found > max(FLICKER_FACTOR * float(np.median(found)), FLICKER_LEAST)
+
+
 def from_recordings(flat: SpikeStream, dark: SpikeStream) -> BadPixels:
-    """Return the pixels that never fire under uniform light, and those that fire too often in the dark.
+    """Return the pixels that never fire under uniform light, fire too often in the dark, or flicker in either.
 
     A hot pixel's dark rate is at least `SENSOR.hot_factor` times the chip's median, in at least FEWEST_SPIKES spikes.
     Raises UserError where the recordings are of two sizes, or the uniform one has too few spikes to tell.
@@ -56,25 +104,38 @@ def from_recordings(flat: SpikeStream, dark: SpikeStream) -> BadPixels:
         expected = f"{FEWEST_SPIKES} spikes of a usual pixel"
         raise problem(flat.source, expected, f"{np.median(light):g}", "record uniform light for longer")
     hot = dark_spikes >= max(SENSOR.hot_factor * float(np.median(dark_spikes)), FEWEST_SPIKES)
-    return BadPixels(light == 0, hot, "recordings")
+    unsteady = flickering(flat) | flickering(dark)
+    return BadPixels(light == 0, hot & ~unsteady, unsteady, "recordings")
 
 
-def isolated(rate: Float64, n_ticks: int) -> BadPixels:
+def isolated(rate: Float64, n_ticks: int, deviation: Float64 | None = None) -> BadPixels:
     """Return the pixels of a mean rate [H, W], over `n_ticks`, that differ from all of their eight neighbours.
 
     A pixel is dead where it never fires although each neighbour fires at least FEWEST_SPIKES times. It is hot where it
     is above its brightest neighbour by HOT_SHARE of that one's rate and by HOT_SIGMA robust standard deviations of the
-    24 pixels around it.
+    24 pixels around it. It flickers where the same is true of the `deviation` of its counts [H, W], if that is given.
     """
-    padded = np.pad(rate, 2, mode="reflect")  # no pixel is its own neighbour
-    dead, hot = np.zeros(rate.shape, np.bool_), np.zeros(rate.shape, np.bool_)
-    for start in range(0, len(rate), _ROWS):
-        rows = slice(start, min(start + _ROWS, len(rate)))
-        lowest, highest, spread = _surroundings(padded[rows.start : rows.stop + 4])
-        excess = rate[rows] - highest
-        dead[rows] = (rate[rows] == 0) & (lowest * n_ticks >= FEWEST_SPIKES)
-        hot[rows] = (excess > HOT_SHARE * highest) & (excess > HOT_SIGMA * np.maximum(spread, 1 / n_ticks))
-    return BadPixels(dead, hot, "isolation")
+    lowest, hot = _outstanding(rate, 1 / n_ticks)
+    dead = (rate == 0) & (lowest * n_ticks >= FEWEST_SPIKES)
+    unsteady = np.zeros_like(hot)
+    if deviation is not None:
+        unsteady = _outstanding(deviation, 1 / WINDOW_TICKS)[1] & (deviation > FLICKER_LEAST)
+    return BadPixels(dead, hot & ~unsteady, unsteady, "isolation")
+
+
+def _outstanding(image: Float64, least: float) -> tuple[Float64, Mask]:
+    """Return the lowest neighbour of each pixel of an image [H, W], and which pixels are far above the highest.
+
+    The deviation of a pixel's surroundings counts as at least `least`.
+    """
+    padded = np.pad(image, 2, mode="reflect")  # no pixel is its own neighbour
+    lowest, above = np.zeros(image.shape), np.zeros(image.shape, np.bool_)
+    for start in range(0, len(image), _ROWS):
+        rows = slice(start, min(start + _ROWS, len(image)))
+        lowest[rows], highest, spread = _surroundings(padded[rows.start : rows.stop + 4])
+        excess = image[rows] - highest
+        above[rows] = (excess > HOT_SHARE * highest) & (excess > HOT_SIGMA * np.maximum(spread, least))
+    return lowest, above
 
 
 def _surroundings(padded: Float64) -> tuple[Float64, Float64, Float64]:

@@ -140,3 +140,14 @@ def _copy_rows(flat: UInt8, flip: bool, image: UInt8) -> None:
         row = image[y]
         for x in range(width):
             row[np.uint64(x)] = flat[np.uint64(first + x)]
+
+
+@kernel
+def find_spike(packed: UInt8, pixel: int, tick: int, step: int) -> int:
+    """Return the first tick with a spike of a stored pixel, from `tick` in direction `step`; -1 where there is none."""
+    byte, bit = pixel >> 3, pixel & 7
+    while 0 <= tick < len(packed):
+        if packed[tick, byte] >> bit & 1:
+            return tick
+        tick += step
+    return -1

@@ -68,7 +68,7 @@ def changing(images: Tensor, s: ChangeSettings) -> Tensor:
     found = variation(images, s)
     if s.lowest is None:
         return found > s.limit
-    noise = np.quantile(found.cpu().numpy(), s.noise_share)
+    noise = np.nanquantile(found.cpu().numpy(), s.noise_share)  # a dead pixel of a calibrated camera is NaN
     return found > float(np.clip(s.noise_factor * noise, s.lowest, s.limit))
 
 

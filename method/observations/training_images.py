@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +19,23 @@ class TrainingImages:
     ticks: tuple[int, ...]  # ascending
     images: Tensor  # [T, C, H, W] linear radiance
     n_ticks: int  # length of the clip
+    bad: Tensor | None = None  # bool [C, H, W], bad pixels, whose values are a neighbour's; None: there are none
+    missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
+
+    def measured(self, index: int) -> Tensor:
+        """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""
+        image = self.images[index]
+        if self.bad is not None:
+            image = image.masked_fill(self.bad, math.nan)
+        if self.missing is not None:
+            image = image.masked_fill(self.missing[index][:, None, None], math.nan)
+        return image
+
+    def at(self, index: int) -> TrainingImages:
+        """Return the images of one time alone."""
+        missing = None if self.missing is None else self.missing[index : index + 1]
+        times = slice(index, index + 1)
+        return replace(self, ticks=self.ticks[times], images=self.images[times], missing=missing)
 
 
 def known(image: Tensor, rendered: Tensor) -> Tensor:

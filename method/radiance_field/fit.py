@@ -27,6 +27,7 @@ from spike4dgs.method.motion.hexplane import (
     time_sparsity,
 )
 from spike4dgs.method.observations.changes import RAYS, changing
+from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.radiance_field.march import Rays, camera_rays
 from spike4dgs.method.radiance_field.model import DynamicField, FieldShape, RadianceModel, bounds_of
 from spike4dgs.method.radiance_field.occupancy import OccupancySettings, may_move
@@ -91,7 +92,7 @@ class Fitter:
         s, spiking, job = self.settings, self.spiking, self.job
         index = self.choose_time()
         pixels = torch.randint(len(self.rays), (s.rays,), generator=generator).to(self.recorded.device)
-        recorded = self.recorded[index, pixels]
+        recorded = job.training_images.measured(index).flatten()[pixels] * job.scene.radiance_gain
         images = self.field.trace(
             self.rays[pixels], job.training_images.ticks[index] / job.training_images.n_ticks, generator
         )
@@ -100,7 +101,8 @@ class Fitter:
         planes = self.field.deformation.planes
         space, times = list(planes.space), list(planes.time)
         smooth = s.smooth_weight * time_smoothness(times) + s.sparse_weight * time_sparsity(times)
-        return spike_loss(rates[0], recorded) + spike_loss(rates[1], recorded) + s.tv_weight * plane_tv(space) + smooth
+        loss = spike_loss(rates[0], known(recorded, rates[0])) + spike_loss(rates[1], known(recorded, rates[1]))
+        return loss + s.tv_weight * plane_tv(space) + smooth
 
     def train_step(self) -> Tensor:
         """Take one step; return the loss."""

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, random_charge, recorded
@@ -46,4 +47,4 @@ class SpikeRate(Supervision):
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         current = self.cameras.rate(render(sample.t), sample.views)
         rate = firing_rate(current, random_charge(current, sample.step), s.neuron_ticks)
-        return spike_loss(rate, counts.to(rate) / ticks)
+        return spike_loss(rate, known(counts.to(rate) / ticks, rate))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ class SpikeCameras(nn.Module):
         first = scene.streams[0]
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
+        white *= np.float32([scene.state(c.id).gain for c in scene.cameras])[:, None, None]
         for i, found in enumerate(scene.calibrations or ()):
             light = found.radiance_gain * found.gain
             known = np.isfinite(light) & np.isfinite(found.dark)
@@ -47,12 +49,14 @@ class SpikeCameras(nn.Module):
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:
     """Return spikes [V, H, W] float32 that the sample's views recorded in `ticks` ticks around its tick, and the ticks.
 
-    At the clip's ends the window is what is left of it: at least the tick itself.
+    At the clip's ends the window is what is left of it: at least the tick itself. Where the sample's images are no
+    number nothing was measured: the spikes are NaN too.
     """
     start = sample.tick - ticks // 2
     first, last = max(0, start), min(scene.n_ticks, start + ticks)
     counts = np.stack([scene.streams[v].counts(first, last) for v in sample.views])
-    return torch.from_numpy(counts.astype(np.float32)), last - first
+    measured = torch.where(sample.images.isfinite().cpu(), torch.from_numpy(counts.astype(np.float32)), math.nan)
+    return measured, last - first
 
 
 def random_charge(like: Tensor, step: int) -> Tensor:

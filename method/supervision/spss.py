@@ -34,6 +34,7 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
+from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.spike import SpikeSettings
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, fire, random_charge, recorded
@@ -71,7 +72,7 @@ class SpikeVariation(Supervision):
         average, deviation = window_moments(self.phi, spike, s.neuron_ticks)
         seen = counts.to(rate) / ticks
         spread = (seen * (1 - seen) + FLOOR).sqrt()  # of spikes that are 0 or 1
-        return (average - seen).abs().mean() + (deviation - spread).abs().mean()
+        return (average - known(seen, average)).abs().mean() + (deviation - known(spread, deviation)).abs().mean()
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
         """Return phi_s and its learning rate."""

@@ -116,13 +116,12 @@ def step_count(settings: TrackingSettings, visit: Visit) -> int:
 def fit_first(job: FitJob) -> Gaussians:
     """Optimise and densify Gaussians at the first time, with the one trainer as for a static scene; return them."""
     s, images, i, request = job.settings["motion"], job.training_images, first_index(job), job.request
-    one_time = replace(images, ticks=images.ticks[i : i + 1], images=images.images[i : i + 1])
     settings = TrainerSettings(coarse_steps=s.first_steps, views_per_step=s.views_per_step)
     motion = Static(job.extent, Static.defaults, seeded(request.seed, -1))
     loss = Pixel(job.settings["supervision"], job.scene)
     start = from_points(job.start.points, job.start.values, opacity=settings.initial_opacity, device=request.device)
     scale = job.extent.scale
-    trainer = Trainer(one_time, start, motion, loss, settings, DensitySettings(), scale=scale, seed=request.seed)
+    trainer = Trainer(images.at(i), start, motion, loss, settings, DensitySettings(), scale=scale, seed=request.seed)
     total = s.first_steps + later_total(job)
     trainer.run(lambda done, _, note="": request.progress(done, total, note))
     return trainer.gaussians.detached()
@@ -136,7 +135,8 @@ class Tracker:
         training_images = job.training_images
         self.window = moving_window(training_images.views, masks, self.settings.margin_px)
         self.masks = masks
-        self.images, self.quiet = self.window.cut(training_images.images), ~self.window.cut(masks)
+        measured = torch.stack([training_images.measured(i) for i in range(len(training_images.ticks))])
+        self.images, self.quiet = self.window.cut(measured), ~self.window.cut(masks)
         moving = foreground_points(gaussians.means, training_images.views, masks)
         with torch.no_grad():
             seen = render(gaussians.splats(), self.window.views).visible.any(0)
