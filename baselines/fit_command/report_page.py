@@ -140,8 +140,8 @@ def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def _cameras_table(report: Report) -> str:
-    heads = "camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %", "dead", "hot", "flickering"
-    heads = *heads, "gain", "residual, dB"
+    heads = ["camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %"]
+    heads += ["dead", "hot", "flickering", "gain", "residual, dB"]
     lines = ["".join(f"<th>{head}</th>" for head in heads)]
     focal = {camera.id: camera.fx for camera in report.about.cameras}
     for f in report.facts:

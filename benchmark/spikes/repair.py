@@ -3,9 +3,10 @@
 Every consumer of a stream then works as it is, whatever it counts. What is filled says nothing new: a loss leaves bad
 pixels out (`CameraState.bad`), and the gaps that remain listed, which are long.
 
-A pixel's intervals within NEAR_TICKS on either side of a gap, two at least, give its usual interval L, and the places
-p and q on an even train of the last spike before the gap and the first after it. round((q - p) / L) - 1 spikes were
-lost; they are put at even distances. Under constant light that restores the count, but for what the tick hides of a spike's place.
+A pixel's intervals within NEAR_TICKS on either side of a gap, two at least, give its usual interval L, and on an even
+train the places p and q of the last spike before the gap and the first after it. round((q - p) / L) - 1 spikes were
+lost; they are put at even distances. Under constant light that restores the count, but for what the tick hides of a
+spike's place.
 """
 
 from __future__ import annotations

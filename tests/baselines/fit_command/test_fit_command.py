@@ -120,7 +120,7 @@ def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
     for (_, row), stream in zip(rows, WORLD.training.streams, strict=True):
         cells = re.findall(r"<td>([^<]*)</td>", row)
         assert float(cells[2]) == pytest.approx(stream.window(0, 60).mean(), abs=1e-4)  # the mean rate
-        assert cells[5:7] == ["-", "-"]  # without recordings of light and darkness nothing tells the bad pixels
+        assert cells[5:9] == ["0", "0", "0", "1.000"]  # bad pixels, by isolation, and the gain
 
 
 def test_residuals_are_those_of_the_saved_model(fitted: Path, recorded: Path) -> None:
