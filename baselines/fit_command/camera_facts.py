@@ -39,5 +39,6 @@ def _facts(camera: str, stream: SpikeStream, bad: BadPixels, gain: float) -> Cam
     seen = int(present(stream.gaps, stream.n_ticks).sum())
     rate = total_counts(stream) / max(seen, 1)
     low, high = np.percentile(rate, (1, 99))
-    pixels = (int(mask.sum()) for mask in bad.kinds.values())
-    return CameraFacts(camera, stream.n_ticks - seen, float(rate.mean()), float(low), float(high), *pixels, gain)
+    dead, hot, flickering = (int(mask.sum()) for mask in bad.kinds.values())
+    mean = float(rate.mean())
+    return CameraFacts(camera, stream.n_ticks - seen, mean, float(low), float(high), dead, hot, flickering, gain)

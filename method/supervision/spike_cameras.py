@@ -31,7 +31,7 @@ class SpikeCameras(nn.Module):
         first = scene.streams[0]
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
-        white *= np.float32([scene.state(c.id).gain for c in scene.cameras])[:, None, None]
+        white *= np.array([scene.state(c.id).gain for c in scene.cameras], np.float32)[:, None, None]
         for i, found in enumerate(scene.calibrations or ()):
             light = found.radiance_gain * found.gain
             known = np.isfinite(light) & np.isfinite(found.dark)

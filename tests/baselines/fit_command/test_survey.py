@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.fit_command.gains import log_gains
+from spike4dgs.baselines.fit_command.gains import log_gains, shrunk
 from spike4dgs.baselines.fit_command.survey import survey_gains, survey_streams
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
@@ -117,6 +117,11 @@ def test_log_gains_are_found_among_outliers_and_hidden_points():
     logs[rng.random(logs.shape) < 0.3] = np.nan
     logs = logs[:, np.isfinite(logs).sum(axis=0) >= 2]
     np.testing.assert_allclose(log_gains(logs), truth, atol=0.01)
+
+
+def test_differences_as_small_as_the_estimates_own_error_are_no_gains():
+    np.testing.assert_array_equal(shrunk(np.array([0.995, 1.005, 1.0])), 1)
+    np.testing.assert_allclose(shrunk(np.array([0.9, 1.1])), [0.901, 1.099])
 
 
 def test_gains_come_from_uniform_light_and_from_the_views():

@@ -1,0 +1,55 @@
+"""Losses on spikes leave out what was not measured: bad pixels and long gaps, NaN in a sample's images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.array.camera_state import CameraState
+from spike4dgs.method.supervision.base import Sample
+from spike4dgs.method.supervision.spike import SpikeRate
+from spike4dgs.method.supervision.spike_cameras import SpikeCameras, recorded
+from spike4dgs.method.supervision.spike_render import SpikeRender
+from spike4dgs.method.supervision.spss import SpikeVariation
+
+SCENE = ToyWorld(width=24, height=16, side=2, n_ticks=60).training
+
+
+def gradient(kind, images):
+    rendered = torch.full(images.shape, 0.4, requires_grad=True)
+    loss = kind(kind.defaults, SCENE)(lambda t: rendered, Sample(0.5, 30, (0, 2), images, 0))
+    loss.backward()
+    return rendered.grad
+
+
+@pytest.mark.parametrize("kind", [SpikeRate, SpikeVariation])
+def test_an_unmeasured_pixel_pulls_at_nothing_and_changes_nothing_else(kind):
+    images = torch.full((2, 16, 24), 0.5)
+    whole = gradient(kind, images)
+    images[0, 3, 4] = images[1, 10, 20] = math.nan
+    found = gradient(kind, images)
+    unmeasured = images.isnan()
+    assert (found[unmeasured] == 0).all() and (whole[unmeasured] != 0).all()
+    assert torch.equal(found[~unmeasured], whole[~unmeasured])
+
+
+def test_a_view_in_a_gap_leaves_the_loss_finite():
+    images = torch.full((2, 16, 24), 0.5)
+    images[1] = math.nan
+    for kind in (SpikeRate, SpikeVariation, SpikeRender):
+        assert gradient(kind, images).isfinite().all()
+    counts, ticks = recorded(SCENE, Sample(0.5, 30, (0, 2), images, 0), 40)
+    assert ticks == 40 and counts[0].isfinite().all() and counts[1].isnan().all()
+
+
+def test_a_cameras_gain_is_part_of_its_response():
+    name = SCENE.cameras[1].id
+    scene = replace(SCENE, states={name: CameraState(gain=1.1)})
+    image = torch.full((2, 16, 24), 0.5)
+    plain, own = (SpikeCameras(s).rate(image, (0, 1)) for s in (SCENE, scene))
+    assert torch.equal(own[0], plain[0])
+    torch.testing.assert_close(own[1], 1.1 * plain[1])
