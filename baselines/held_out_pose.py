@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.benchmark.array.lens import nearest, resample
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import FitRequest, Model, Recipe
 from spike4dgs.benchmark.results.provenance import Provenance
@@ -25,6 +26,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.observations.pinholes import make_lenses
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.torch_state import one_torch_thread
@@ -107,13 +109,19 @@ def refine_pose(
     """Return the camera near `camera` that makes mean |rendered - image| over the mask `background` [H, W] smallest.
 
     The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
-    included, so that refinement never ends worse than it began. Raises UserError where the mask is empty.
+    included, so that refinement never ends worse than it began. A lens is taken out of image and mask first. Raises
+    UserError where the mask is empty.
     """
     shape = (camera.height, camera.width)
     if image.shape != shape or background.shape != shape or not background.any():
         found = f"{image.shape}, {background.shape}, {int(background.sum())} background pixels"
         expected = f"an image and a mask of shape {shape} with background pixels"
         raise problem("pose refinement", expected, found, "check it")
+    given = camera
+    if camera.distortion:
+        (lens,) = make_lenses([camera])
+        camera, image = lens.pinhole, resample(image, lens.to_camera)
+        background = nearest(background, lens.to_camera) & lens.seen
     start = Views.from_cameras([camera], device=device)
     target = torch.as_tensor(image, device=device)[None]
     weight = torch.as_tensor(background, dtype=target.dtype, device=device)[None] / float(background.sum())
@@ -132,4 +140,4 @@ def refine_pose(
             adam.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()
-    return replace(camera, R=best[:3, :3], t=best[:3, 3])
+    return replace(given, R=best[:3, :3], t=best[:3, 3])

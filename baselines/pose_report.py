@@ -29,6 +29,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.initialization import Initialization
+from spike4dgs.method.observations.pinholes import as_pinholes, undistorted
 
 Row = dict[str, float | int | str | None]
 CLIP = "clip"  # means of the whole clip, as they are
@@ -131,7 +132,7 @@ def poses(
         raise problem("--images", f"one of {', '.join((CLIP, FLAT, *IMAGES))}", repr(images), "correct the name")
     rows = []
     for path in scenes:
-        scene = open_scene(path, allow_gaps, split).training
+        scene = as_pinholes(open_scene(path, allow_gaps, split).training)
         shown = _images(scene, images)
         for name in initialization:
             budget = Budget() if refine else None
@@ -149,7 +150,8 @@ def _images(scene: TrainingScene, images: str) -> Float32:
         return clip_means(scene)
     if images == FLAT:
         return window_means(scene, 0, scene.n_ticks, flat_field=True)
-    return np.concatenate([IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams])
+    made = [IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams]
+    return undistorted(scene, np.concatenate(made), unseen=None)
 
 
 def measure_poses(

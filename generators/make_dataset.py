@@ -38,6 +38,7 @@ def make_dataset(
     adaptive_keys: bool = True,
     sub_ticks: bool = True,
     whole_frames: bool = False,
+    lens: tuple[float, ...] = (),
     workers: int = 1,
     scheduler: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
@@ -63,6 +64,8 @@ def make_dataset(
         adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
         sub_ticks: Render instants inside a tick where the motion in one tick is too large.
         whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
+        lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first of them, such as -0.15 0.03.
+            Streams, other recordings and ground truth all show it. The scene's id ends in -lens.
         workers: Processes that render.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
         device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
@@ -77,7 +80,8 @@ def make_dataset(
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:
         raise problem("worlds", "names or --all", "both", "leave one out")
-    switches = {
+    switches: dict[str, Any] = {
+        "lens": _lens(lens, audit),
         "gain_map": gain_map,
         "dark_map": dark_map,
         "shot_noise": shot_noise,
@@ -98,7 +102,10 @@ def make_dataset(
             note = "; pass --replace to make and audit it again" if audit else ""
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     if todo:
-        pick_variant()  # fails here, before anything is written, if it cannot render
+        variant = pick_variant()  # fails here, before anything is written, if it cannot render
+        if lens and variant.startswith("scalar"):
+            fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
+            raise problem("--lens", "Mitsuba's LLVM or CUDA variant", variant, fix)
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
@@ -121,7 +128,7 @@ def _make(job: Job, out: Path, run: Run, with_audit: bool, console: Any, which: 
     console.print(f"{job.id}: {total:.0f} s, written to {folder}", markup=False)
 
 
-def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, switches: dict[str, bool]) -> Job:
+def _job(world: str, profile: str, seed: int, variant: int, seconds: float | None, switches: dict[str, Any]) -> Job:
     if world not in _all_names():
         raise problem("world", f"one of {_names()}", repr(world), "correct the name")
     if profile not in PROFILES:
@@ -132,6 +139,17 @@ def _job(world: str, profile: str, seed: int, variant: int, seconds: float | Non
         fix = "give seconds such as 0.02"
         raise problem("--seconds", "whole milliseconds, at least 0.002", str(seconds), fix)
     return Job(world, variant, seed, profile, PROFILES[profile], round(ticks) / RATE_HZ, **switches)
+
+
+def _lens(values: tuple[float, ...], audit: bool) -> tuple[float, ...]:
+    """Return the five coefficients of a lens, none for a pinhole. Raises UserError for others than numbers."""
+    from spike4dgs.benchmark.array.lens import NAMES, make_distortion
+
+    if len(values) > len(NAMES) or not all(map(math.isfinite, values)):
+        raise problem("--lens", f"at most {len(NAMES)} numbers: {', '.join(NAMES)}", str(values), "correct it")
+    if values and audit:
+        raise problem("--audit", "pinhole cameras, which Mitsuba's own sensor can be", "--lens", "leave one out")
+    return make_distortion(values)
 
 
 def _all_names() -> list[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from spike4dgs.benchmark.array.lens import Distortion
+
 RATE_HZ = 20_000
 TARGET_EVERY = RATE_HZ // 1000  # ticks between ground-truth frames: 1 ms
 
@@ -49,12 +51,16 @@ class Job:
     adaptive: bool = True  # False: every pixel that changes, at every tick
     sub_ticks: bool = True  # False: never render instants inside a tick
     whole_frames: bool = False  # True: every pixel of every key
+    lens: Distortion = ()  # of every camera
 
     @property
     def id(self) -> str:
-        """Id such as `car-0-small`; with a length that is not the profile's, such as `car-0-paper-500ms`."""
-        usual = self.seconds == self.profile.seconds
-        return f"{self.world}-{self.variant}-{self.profile_name}" + ("" if usual else f"-{self.seconds * 1000:g}ms")
+        """Id such as `car-0-small`; with a length that is not the profile's, such as `car-0-paper-500ms`.
+
+        With a lens it ends in `-lens`.
+        """
+        length = "" if self.seconds == self.profile.seconds else f"-{self.seconds * 1000:g}ms"
+        return f"{self.world}-{self.variant}-{self.profile_name}{length}" + ("-lens" if self.lens else "")
 
     @property
     def n_ticks(self) -> int:
@@ -79,6 +85,7 @@ class Job:
             "adaptive_keys": self.adaptive,
             "sub_ticks": self.sub_ticks,
             "whole_frames": self.whole_frames,
+            **({"lens": list(self.lens)} if self.lens else {}),
         }
 
     @property

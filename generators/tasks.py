@@ -8,7 +8,7 @@ needs no common file system.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -35,7 +35,7 @@ def world_of(job: Job) -> WorldScene:
 def cameras_of(job: Job) -> tuple[Camera, ...]:
     """Return the cameras of a job's profile."""
     p = job.profile
-    return cameras(world_of(job), p.width, p.height, p.views)
+    return tuple(replace(c, distortion=job.lens) for c in cameras(world_of(job), p.width, p.height, p.views))
 
 
 @lru_cache(maxsize=1)

@@ -30,6 +30,7 @@ from spike4dgs.method.images import (
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.observations.made_scene import made_scene
+from spike4dgs.method.observations.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.supervision.base import Supervision
@@ -114,6 +115,7 @@ class RecipeMethod:
         check_device(request.device)
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
+        scene = as_pinholes(scene)
         start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"], request.device))
         return self._fit(scene, start, settings, request)
 
@@ -198,7 +200,7 @@ def fit_gaussians(
     scale = job.extent.scale
     trainer = Trainer(job.training_images, first, motion, loss, settings, density, scale=scale, seed=request.seed)
     trainer.run(request.progress, request.checkpoint, job.key)
-    cameras = trainer.poses.cameras(start.cameras)
+    cameras = with_lenses(job.scene, trainer.poses.cameras(start.cameras))
     duration_us, device = job.scene.duration_us, request.device
     return FittedModel(trainer.pieces(), trainer.background, motion, duration_us, device, spec, cameras)
 

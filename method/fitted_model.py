@@ -18,6 +18,7 @@ from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
 from spike4dgs.method.model_files.names import BACKGROUND, from_file_names, motion_settings, to_file_names
 from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
+from spike4dgs.method.observations.pinholes import through_lens
 from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import join
@@ -67,6 +68,7 @@ class FittedModel:
         tensors = [t for g in (*self.pieces, self.background) for t in g.tensors().values()]
         return count_bytes([*tensors, *self.motion.state_dict().values()])
 
+    @through_lens
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""

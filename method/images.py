@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -16,6 +17,7 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.observations.pinholes import nearest_pixels, undistorted
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
@@ -88,7 +90,19 @@ def on_device(make: ImageMaker, device: str) -> ImageMaker:
 def make_training_images(
     scene: TrainingScene, cameras: Sequence[Camera], make: ImageMaker, settings: ImageSettings, device: str
 ) -> TrainingImages:
-    """Return images of all training views at the chosen times, as `cameras` see them."""
+    """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
+    ticks, made = make_images(scene, make, settings, device)
+    images = torch.from_numpy(undistorted(scene, made)).to(device)
+    bad, missing = _bad(scene), _missing(scene, ticks)
+    masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
+    lacking = None if missing is None else torch.from_numpy(missing).to(device)
+    return TrainingImages(Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking)
+
+
+def make_images(
+    scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
+) -> tuple[tuple[int, ...], Float32]:
+    """Return the chosen ticks and the images [T, C, H, W] at the pixels of the training streams."""
     make = on_device(make, device)
     ticks = choose_ticks(scene.n_ticks, settings)
     gain, calibrations = scene.radiance_gain, scene.calibrations if settings.flat_field else None
@@ -97,27 +111,30 @@ def make_training_images(
     else:
         gains = [gain * scene.state(camera.id).gain for camera in scene.cameras]
         made = [make(s, ticks, own) for s, own in zip(scene.streams, gains, strict=True)]
-    images = torch.from_numpy(np.stack(made, axis=1)).to(device)
-    views, unmeasured = (
-        Views.from_cameras(cameras, device=device),
-        (_bad(scene, device), _missing(scene, ticks, device)),
-    )
-    return TrainingImages(views, ticks, images, scene.n_ticks, *unmeasured)
+    return ticks, np.stack(made, axis=1)
 
 
-def _bad(scene: TrainingScene, device: str) -> Tensor | None:
-    """Return the bad pixels of all cameras, bool [C, H, W]; None where there are none."""
+def as_measured(scene: TrainingScene, ticks: Sequence[int], images: Float32) -> Float32:
+    """Return images of `make_images` with NaN where nothing was measured: at bad pixels, and inside long gaps."""
+    bad, missing, out = _bad(scene), _missing(scene, ticks), images.copy()
+    if bad is not None:
+        out[:, np.stack(bad)] = math.nan
+    if missing is not None:
+        out[missing] = math.nan
+    return out
+
+
+def _bad(scene: TrainingScene) -> list[NDArray[np.bool_]] | None:
+    """Return the bad pixels [H, W] of each camera's stream; None where there are none."""
     masks = [scene.state(camera.id).bad for camera in scene.cameras]
     if all(mask is None for mask in masks):
         return None
-    size = scene.streams[0].height, scene.streams[0].width
-    return torch.from_numpy(np.stack([np.zeros(size, bool) if m is None else m for m in masks])).to(device)
+    return [np.zeros((s.height, s.width), bool) if m is None else m for m, s in zip(masks, scene.streams, strict=True)]
 
 
-def _missing(scene: TrainingScene, ticks: Sequence[int], device: str) -> Tensor | None:
-    """Return the images around which a camera's recording lacks most ticks, bool [T, C]; None where there are none."""
+def _missing(scene: TrainingScene, ticks: Sequence[int]) -> NDArray[np.bool_] | None:
+    """Return the images around which a camera's recording lacks most ticks, [T, C]; None where there are none."""
     if not any(stream.gaps for stream in scene.streams):
         return None
     lacking = [~present(stream.gaps, scene.n_ticks) for stream in scene.streams]
-    near = [[own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for own in lacking] for t in ticks]
-    return torch.tensor(near, device=device)
+    return np.array([[own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for own in lacking] for t in ticks])

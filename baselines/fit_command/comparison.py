@@ -21,7 +21,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32, encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.images import ImageSettings, make_training_images
+from spike4dgs.method.images import ImageSettings, as_measured, make_images
 
 TIMES = 9  # of the clip, that residuals are taken at
 SHOWN = (1, 4, 7)  # those of them that the sheet shows
@@ -45,11 +45,10 @@ def compare(method: Method, model: Model, scene: TrainingScene, cameras: Sequenc
     maker = recipe.recipe.images if recipe else OTHER
     make = recipe.images if recipe else IMAGES[OTHER]
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
-    made = make_training_images(scene, cameras, make, replace(settings, max_times=TIMES), device)
-    measured = np.stack([made.measured(i).cpu().numpy() for i in range(len(made.ticks))])
-    times = tuple(tick * 1e6 / scene.rate_hz for tick in made.ticks)
+    ticks, images = make_images(scene, make, replace(settings, max_times=TIMES), device)
+    times = tuple(tick * 1e6 / scene.rate_hz for tick in ticks)
     rendered = np.stack([[model.render(camera, t) for camera in cameras] for t in times])
-    return Comparison(tuple(cameras), times, measured, rendered, maker)
+    return Comparison(tuple(cameras), times, as_measured(scene, ticks, images), rendered, maker)
 
 
 def residual_db(image: NDArray[np.floating], rendered: NDArray[np.floating]) -> float:

@@ -28,6 +28,7 @@ from spike4dgs.baselines.initialization.features import NOTHING, FeatureSettings
 from spike4dgs.baselines.initialization.rig import PointSettings, RigSettings, rig, swept, window_means
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.initialization import Start
+from spike4dgs.method.observations.pinholes import undistorted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -89,7 +90,7 @@ def clip_means(scene: TrainingScene) -> Float32:
     """Return the mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
     ticks = min(scene.n_ticks, 65535)
     counts = np.stack([s.counts(0, ticks) for s in scene.streams]).astype(np.float32)
-    return counts / np.float32(ticks * scene.radiance_gain)
+    return undistorted(scene, counts / np.float32(ticks * scene.radiance_gain), unseen=None)
 
 
 def map_views(

@@ -51,6 +51,7 @@ from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
 from spike4dgs.method.msdi.shrink import shrink
 from spike4dgs.method.msdi.weights import load_network, weights_path
+from spike4dgs.method.observations.pinholes import nearest_pixels
 from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
@@ -152,13 +153,14 @@ def infer(
     device = choose_device(device, rasterizes=False)
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / settings.trained_px))
-    spikes = np.stack([window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams])
+    windows = [window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams]
+    spikes = np.stack(nearest_pixels(scene, windows))
     small = shrink(torch.from_numpy(spikes), factor)[None]
     cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)
     K = torch.from_numpy(np.stack([c.K for c in cameras])[None].astype(np.float32))
     sensors, gain = None, scene.radiance_gain
     if calibrations := scene.calibrations:
-        sensors = block_means(calibrations, factor, device)
+        sensors = block_means(at_pinholes(scene, calibrations), factor, device)
         gain = float(np.mean([c.radiance_gain for c in calibrations]))
     with torch.inference_mode():
         found = network(small.to(device), K.to(device) if calibrated else None, sensors)
@@ -172,6 +174,12 @@ def shrunk(camera: Camera, factor: int) -> Camera:
     width, height = -(-camera.width // factor), -(-camera.height // factor)
     fx, fy, cx, cy = (x / factor for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def at_pinholes(scene: TrainingScene, calibrations: Sequence[Calibration]) -> list[Calibration]:
+    """Return the response of the scene's views, by pixel: that of the nearest pixel of the stream."""
+    gains, darks = (nearest_pixels(scene, [getattr(c, name) for c in calibrations]) for name in ("gain", "dark"))
+    return [replace(c, gain=g, dark=d) for c, g, d in zip(calibrations, gains, darks, strict=True)]
 
 
 def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -> Sensors:

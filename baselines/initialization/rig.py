@@ -35,6 +35,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.initialization import Start
 from spike4dgs.method.observations.changes import COUNTS, changing, without_specks
+from spike4dgs.method.observations.pinholes import nearest_pixels, seen_pixels, undistorted
 from spike4dgs.method.settings import Settings
 
 Float32 = NDArray[np.float32]
@@ -96,16 +97,18 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
     mean = window_means(scene, 0, scene.n_ticks, flat_field)
     windows = _windows(scene.n_ticks, settings.window_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
-    moving = [_moving(np.stack(c)) for c in counts]
+    moving = _moving_pixels(scene, [np.stack(c) for c in counts])
     planes = find_range(scene.cameras, mean, settings)
     maps = [sweep(scene.cameras, mean, i, planes, settings=settings) for i in range(len(scene.cameras))]
-    clouds = [_points(scene.cameras, maps, mean, [~m for m in moving], settings)]
+    seen = seen_pixels(scene)
+    static = [~m & s for m, s in zip(moving, seen, strict=True)] if seen else [~m for m in moving]
+    clouds = [_points(scene.cameras, maps, mean, static, settings)]
     middle, last = len(windows) // 2, len(windows) - 1
     for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[at]
         images = window_means(scene, start, stop, flat_field)
         near = slice(max(0, at - 1), at + 2)
-        quiet = [~_moving(np.stack(c[near])) | (at == middle) for c in counts]
+        quiet = [~m | (at == middle) for m in _moving_pixels(scene, [np.stack(c[near]) for c in counts])]
         short = [sweep(scene.cameras, images, i, planes, m, settings) for i, m in enumerate(moving)]
         pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
         clouds.append(_points(scene.cameras, short, images, pixels, settings))
@@ -123,8 +126,10 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
     """Return the mean radiance [C, H, W] of all views in a window."""
     rates = np.stack([_rate(s, start, stop) for s in scene.streams])
     if flat_field and scene.calibrations:
-        return np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
-    return rates / np.float32(scene.radiance_gain)
+        means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
+    else:
+        means = rates / np.float32(scene.radiance_gain)
+    return undistorted(scene, means, unseen=None)
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
@@ -137,6 +142,13 @@ def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
 def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
     count = max(1, n_ticks // length)
     return [(i * length, min((i + 1) * length, n_ticks)) for i in range(count)]
+
+
+def _moving_pixels(scene: TrainingScene, counts: Sequence[NDArray[np.int64]]) -> list[Mask]:
+    """Return the moving pixels of each view, [h, w], from its counts [windows, H, W]; a pixel not seen does not move."""
+    moving = nearest_pixels(scene, [_moving(c) for c in counts])
+    seen = seen_pixels(scene)
+    return [m & s for m, s in zip(moving, seen, strict=True)] if seen else moving
 
 
 def _moving(counts: NDArray[np.int64]) -> Mask:

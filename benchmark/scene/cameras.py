@@ -1,4 +1,4 @@
-"""Pinhole cameras. Inside: OpenCV world-to-camera. At the edge: nerfstudio, COLMAP and Mitsuba conventions.
+"""Cameras. Inside: OpenCV world-to-camera. At the edge: nerfstudio, COLMAP and Mitsuba conventions.
 
 | convention | pose | camera axes | pixel centres |
 |---|---|---|---|
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.lens import NAMES, Distortion, distort, make_distortion, undistort
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 
@@ -27,9 +28,10 @@ _MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # flips x and y between OpenCV and M
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated pinhole camera: x_cam = R x_world + t (OpenCV axes), pixel centres at +0.5.
+    """A calibrated camera: x_cam = R x_world + t (OpenCV axes), pixel centres at +0.5.
 
-    R is [3, 3], t is [3], float64, metres. fx, fy, cx, cy are in pixels; cx = width / 2 is the middle.
+    R is [3, 3], t is [3], float64, metres. fx, fy, cx, cy are in pixels; cx = width / 2 is the middle. `distortion`
+    holds OpenCV's k1, k2, p1, p2, k3; it is empty for a pinhole.
     """
 
     id: str
@@ -41,6 +43,7 @@ class Camera:
     cy: float
     R: Float64
     t: Float64
+    distortion: Distortion = ()
 
     @property
     def K(self) -> Float64:
@@ -67,15 +70,29 @@ class Camera:
         return -self.R.T @ self.t
 
     def project(self, points: Float64) -> tuple[Float64, Float64]:
-        """Return pixel coordinates [N, 2] and depths z [N] of world points [N, 3] (z <= 0 is behind the camera)."""
+        """Return pixel coordinates [N, 2] and depths z [N] of world points [N, 3] (z <= 0 is behind the camera).
+
+        Coordinates are NaN where the lens shows no such point.
+        """
         p = np.asarray(points, dtype=np.float64) @ self.R.T + self.t
         z = p[:, 2]
+        if self.distortion:
+            return distort(p[:, :2] / z[:, None], self.distortion) * (self.fx, self.fy) + (self.cx, self.cy), z
         return np.stack([self.fx * p[:, 0] / z + self.cx, self.fy * p[:, 1] / z + self.cy], axis=-1), z
 
     def unproject(self, uv: Float64, z: Float64) -> Float64:
         """Return the world points [N, 3] of pixel coordinates [N, 2] and depths z [N]."""
-        p = np.stack([(uv[:, 0] - self.cx) / self.fx * z, (uv[:, 1] - self.cy) / self.fy * z, z], axis=-1)
+        xy = self.normalized(uv)
+        p = np.stack([xy[:, 0] * z, xy[:, 1] * z, z], axis=-1)
         return (p - self.t) @ self.R
+
+    def normalized(self, uv: Float64) -> Float64:
+        """Return where the rays of pixel coordinates [..., 2] cross the plane z = 1 of the camera's frame: x, y.
+
+        NaN where the lens has no such ray.
+        """
+        xy = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy], axis=-1)
+        return undistort(xy, self.distortion) if self.distortion else xy
 
 
 def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: float, width: int, height: int) -> Camera:
@@ -96,7 +113,7 @@ def array_axes(cameras: Sequence[Camera]) -> Float64:
 
 
 def to_nerfstudio(camera: Camera) -> dict[str, Any]:
-    """Return per-frame nerfstudio keys (fl_x ... transform_matrix), OpenGL camera-to-world."""
+    """Return per-frame nerfstudio keys (fl_x ... transform_matrix), OpenGL camera-to-world; k1 ... of a lens."""
     return {
         "fl_x": camera.fx,
         "fl_y": camera.fy,
@@ -104,6 +121,7 @@ def to_nerfstudio(camera: Camera) -> dict[str, Any]:
         "cy": camera.cy,
         "w": camera.width,
         "h": camera.height,
+        **dict(zip(NAMES, camera.distortion, strict=False)),
         "transform_matrix": (camera.c2w @ _OPENGL).tolist(),
     }
 
@@ -114,12 +132,31 @@ def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -
         m = np.array(frame["transform_matrix"], dtype=np.float64) @ _OPENGL
         fx, fy, cx, cy = (float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
         width, height = int(frame["w"]), int(frame["h"])
+        lens = make_distortion([float(frame.get(name, 0.0)) for name in NAMES])
     except (KeyError, TypeError, ValueError) as e:
         keys = "fl_x, fl_y, cx, cy, w, h and a 4x4 transform_matrix"
         raise problem(where, f"{keys} for camera {id}", repr(e), "write the scene again") from None
     check_rotation(m[:3, :3], f"{where}, camera {id}")
     R = m[:3, :3].T
-    return Camera(id, width, height, fx, fy, cx, cy, R, -R @ m[:3, 3])
+    camera = Camera(id, width, height, fx, fy, cx, cy, R, -R @ m[:3, 3], lens)
+    check_lens(camera, where)
+    return camera
+
+
+def border(camera: Camera) -> Float64:
+    """Return points [N, 2] px around the image, its corners among them, a pixel or less apart."""
+    across, down = np.linspace(0, camera.width, camera.width + 1), np.linspace(0, camera.height, camera.height + 1)
+    rows = [np.stack([across, np.full_like(across, y)], axis=-1) for y in (0, camera.height)]
+    columns = [np.stack([np.full_like(down, x), down], axis=-1) for x in (0, camera.width)]
+    return np.concatenate(rows + columns)
+
+
+def check_lens(camera: Camera, where: str | Path) -> None:
+    """Raise UserError unless the lens's model gives a ray for every pixel."""
+    if camera.distortion and not np.isfinite(camera.normalized(border(camera))).all():
+        values = ", ".join(f"{name} {value:g}" for name, value in zip(NAMES, camera.distortion, strict=True))
+        expected = f"a lens of {camera.id} whose model holds up to the image's corners"
+        raise problem(where, expected, values, "calibrate with fewer coefficients")
 
 
 def check_rotation(R: Float64, where: str) -> None:
@@ -139,8 +176,11 @@ def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
     """Return the intrinsics of Mitsuba's `perspective` sensor (fov along x in degrees, principal point offsets).
 
     Mitsuba's offsets are relative to the film size and count opposite to ours: cx = W (0.5 - offset_x).
-    Raises UserError for non-square pixels, which the sensor cannot model.
+    Raises UserError for non-square pixels and lens distortion, which the sensor cannot model.
     """
+    if camera.distortion:
+        fix = "render with Mitsuba's LLVM or CUDA variant, see `spike4dgs doctor`"
+        raise problem(f"camera {camera.id}", "a pinhole for Mitsuba's sensor", "lens distortion", fix)
     if abs(camera.fx - camera.fy) > 1e-9 * camera.fx:
         raise problem(
             f"camera {camera.id}", "fx = fy", f"{camera.fx} and {camera.fy}", "use square pixels for rendering"

@@ -64,11 +64,12 @@ def variation(images: Tensor, s: ChangeSettings) -> Tensor:
 
 
 def changing(images: Tensor, s: ChangeSettings) -> Tensor:
-    """Return the pixels that change: bool [C, H, W] from images [T, C, H, W]."""
+    """Return the pixels that change: bool [C, H, W] from images [T, C, H, W]; none where a value is no number."""
     found = variation(images, s)
     if s.lowest is None:
         return found > s.limit
-    noise = np.nanquantile(found.cpu().numpy(), s.noise_share)  # a dead pixel of a calibrated camera is NaN
+    values = found.cpu().numpy()
+    noise = np.quantile(values[np.isfinite(values)], s.noise_share)
     return found > float(np.clip(s.noise_factor * noise, s.lowest, s.limit))
 
 

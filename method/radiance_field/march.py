@@ -41,7 +41,8 @@ class Rays:
 def camera_rays(camera: Camera, device: str = "cpu") -> Rays:
     """Return the rays of all pixels of a camera, row by row, through the pixels' centres."""
     v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    towards = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+    xy = camera.normalized(np.stack([u, v], -1))
+    towards = np.stack([xy[:, 0], xy[:, 1], np.ones_like(u)], -1) @ camera.R
     directions = torch.as_tensor(towards, dtype=torch.float32, device=device)
     origin = torch.as_tensor(camera.center, dtype=torch.float32, device=device)
     return Rays(origin.expand(len(directions), 3), directions)

@@ -90,6 +90,9 @@ class Views:
         cls, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
     ) -> Views:
         """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp."""
+        if bent := [c.id for c in cameras if c.distortion]:
+            fix = "render pinholes and resample them, see `method.observations.pinholes`"
+            raise problem("cameras", "pinholes", f"lens distortion of {', '.join(bent)}", fix)
         sizes = sorted({(c.width, c.height) for c in cameras})
         if len(sizes) != 1:
             raise problem("cameras", "one image size", f"{sizes}", "render the cameras of each size on their own")

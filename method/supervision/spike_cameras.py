@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.observations.pinholes import AtSensors
 from spike4dgs.method.supervision.base import Sample
 
 
@@ -28,6 +29,7 @@ class SpikeCameras(nn.Module):
 
     def __init__(self, scene: TrainingScene) -> None:
         super().__init__()
+        self.at_sensors = AtSensors(scene)
         first = scene.streams[0]
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
@@ -41,9 +43,9 @@ class SpikeCameras(nn.Module):
         self.register_buffer("dark", torch.from_numpy(dark), persistent=False)
 
     def rate(self, image: Tensor, views: tuple[int, ...]) -> Tensor:
-        """Return the charge per tick [V, H, W] of the cameras `views` that see the radiance `image` [V, H, W]."""
+        """Return the charge per tick [V, H, W] of the cameras `views` whose renders are the radiance `image`."""
         chosen = list(views)
-        return image * self.white[chosen] + self.dark[chosen]
+        return self.at_sensors(image, views) * self.white[chosen] + self.dark[chosen]
 
 
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:

@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.fitted_model import count_bytes
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.observations.pinholes import through_lens
 from spike4dgs.method.splat import Splats, Views, render
 
 
@@ -105,6 +106,7 @@ class TrackedModel:
         colors[self.tracks.rows] = values["colors"]
         return replace(g, means=means, quats=quats, colors=colors)
 
+    @through_lens
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
