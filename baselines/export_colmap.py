@@ -3,7 +3,8 @@
     OUT/images/CAMERA/TICK.png
     OUT/sparse/0/cameras.bin, images.bin, points3D.bin, ...
 
-Images are called `CAMERA/TICK.png` in the model. All images of a camera share its PINHOLE camera and its pose.
+Images are called `CAMERA/TICK.png` in the model. All images of a camera share its camera, PINHOLE or with lens
+distortion OPENCV, and its pose. Images are as the camera sees them, not undistorted.
 """
 
 from __future__ import annotations

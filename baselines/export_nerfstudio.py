@@ -22,7 +22,7 @@ from spike4dgs.baselines.spike_to_image.base import Float32
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_json
-from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
+from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 
@@ -107,10 +107,11 @@ def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
             "fl_y": abs(c.fy - first.fx) / first.fx * reach,
             "cx": abs(c.cx - c.width / 2),
             "cy": abs(c.cy - c.height / 2),
+            "lens distortion": distortion_px(c),
         }
         worst = max(off, key=lambda key: off[key])
         if off[worst] > _TOLERANCE_PX or (c.width, c.height) != (first.width, first.height):
-            expected = "cameras of one size and one focal length, their principal points in the middle"
+            expected = "pinholes of one size and one focal length, their principal points in the middle"
             found = f"{worst} of {c.id} off by {off[worst]:.3g} px at {c.width}x{c.height}"
             fix = "this format has no other cameras: rectify the images, or use transforms_*.json of the scene"
             raise problem(where, expected, found, fix)

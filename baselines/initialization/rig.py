@@ -145,7 +145,7 @@ def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
 
 
 def _moving_pixels(scene: TrainingScene, counts: Sequence[NDArray[np.int64]]) -> list[Mask]:
-    """Return the moving pixels of each view, [h, w], from its counts [windows, H, W]; a pixel not seen does not move."""
+    """Return the moving pixels of each view [h, w] from its counts [windows, H, W]; a pixel not seen does not move."""
     moving = nearest_pixels(scene, [_moving(c) for c in counts])
     seen = seen_pixels(scene)
     return [m & s for m, s in zip(moving, seen, strict=True)] if seen else moving

@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, uniform_filter
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -22,6 +23,7 @@ Distortion = tuple[float, ...]  # k1, k2, p1, p2, k3; empty: a pinhole
 
 NAMES = ("k1", "k2", "p1", "p2", "k3")
 _MOST_STEPS = 50  # of Newton's method; 4 to 8 are usual, more are needed near the fold
+_NOTHING = 1e-12  # smaller coefficients do nothing within any lens, and roots of such polynomials overflow
 _TABLE = 1000  # radii of the first guess
 _CONVERGED = 1e-13  # of normalised coordinates
 
@@ -46,7 +48,7 @@ def fold_radius(lens: Distortion) -> float:
 
     The tangential coefficients are left out.
     """
-    k1, k2, _, _, k3 = lens
+    k1, k2, _, _, k3 = (k if abs(k) > _NOTHING else 0.0 for k in lens)
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # of d(r (1 + k1 s + k2 s^2 + k3 s^3)) / dr, in s = r^2
     squares = [r.real for r in roots if abs(r.imag) < 1e-9 * max(1.0, abs(r)) and r.real > 0]
     return float(np.sqrt(min(squares))) if squares else float("inf")
@@ -70,7 +72,7 @@ def distort(xy: Float64, lens: Distortion) -> Float64:
 
 
 def undistort(xy: Float64, lens: Distortion) -> Float64:
-    """Return the pinhole's coordinates [..., 2] of the lens's [..., 2], by Newton's method; NaN where there are none."""
+    """Return the pinhole's coordinates [..., 2] of the lens's [..., 2], by Newton's method; NaN where it has none."""
     wanted = np.asarray(xy, np.float64)
     limit = fold_radius(lens) * (1 - 1e-9)
     found = _first_guess(wanted, lens, limit)
@@ -128,30 +130,23 @@ def resample(image: Float32, at: Float64) -> Float32:
     Beyond the image its border is repeated. A value is NaN where most of what lies around it is NaN; elsewhere such
     pixels are filled from their neighbours first.
     """
-    import cv2
-
-    whole = np.ascontiguousarray(image, np.float32)
-    where = np.nan_to_num(at - 0.5, nan=-1e4).astype(np.float32)
-    known = np.isfinite(whole)
-    border = cv2.BORDER_REPLICATE
+    known = np.isfinite(image)
     if not known.any():
         return np.full(at.shape[:2], np.nan, np.float32)
-    filled = whole if known.all() else _filled(whole, known)
-    found = cv2.remap(filled, where, None, cv2.INTER_CUBIC, borderMode=border)
-    found = np.clip(found, filled.min(), filled.max())  # no overshoot below black
-    if filled is not whole:
-        share = cv2.remap(known.astype(np.float32), where, None, cv2.INTER_LINEAR, borderMode=border)
-        found[share < 0.5] = np.nan
+    filled = image if known.all() else _filled(image, known)
+    where = np.nan_to_num(at - 0.5, nan=-1.0).transpose(2, 0, 1)[::-1]
+    # Linear interpolation loses 2 dB here, on images of 200x125 pixels.
+    found = map_coordinates(filled, where, order=3, mode="nearest").clip(filled.min(), filled.max())
+    if filled is not image:
+        found[map_coordinates(known.astype(np.float32), where, order=1, mode="nearest") < 0.5] = np.nan
     return np.asarray(found, np.float32)
 
 
 def _filled(image: Float32, known: NDArray[np.bool_]) -> Float32:
-    """Return an image without NaN: the mean of the known pixels around, of the known pixels of all where there is none."""
-    import cv2
-
-    weight = cv2.boxFilter(known.astype(np.float32), -1, (5, 5))
-    mean = cv2.boxFilter(np.where(known, image, 0).astype(np.float32), -1, (5, 5))
-    around = np.where(weight > 0, mean / np.maximum(weight, 1e-6), image[known].mean())
+    """Return an image without NaN: unknown pixels get the mean of the known ones around, or of all."""
+    weight = uniform_filter(known.astype(np.float64), 5)
+    mean = uniform_filter(np.where(known, image, 0.0).astype(np.float64), 5)
+    around = np.where(weight > 0.01, mean / np.maximum(weight, 0.01), image[known].mean())
     return np.where(known, image, around).astype(np.float32)
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from spike4dgs.benchmark.array.lens import NAMES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.imports.colmap import read_colmap_model
 from spike4dgs.benchmark.imports.found_camera import FoundCamera
 from spike4dgs.benchmark.imports.kalibr import is_camchain, read_camchain
 from spike4dgs.benchmark.imports.opencv import SUFFIXES, read_opencv_files
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera, check_lens
 
 NEGLIGIBLE_PX = 0.05  # lens distortion below this is left out
 
@@ -18,19 +20,18 @@ NEGLIGIBLE_PX = 0.05  # lens distortion below this is left out
 def read_camera_files(path: Path, names: Sequence[str], size: tuple[int, int]) -> tuple[Camera, ...]:
     """Return a camera for each stream, by name; others are left out, which is said.
 
-    Raises UserError where the file is missing, foreign or damaged, where a stream has no camera, and where a lens
-    distorts by NEGLIGIBLE_PX or more.
+    Raises UserError where the file is missing, foreign or damaged, where a stream has no camera, and where a lens that
+    is not OpenCV's k1, k2, p1, p2, k3 distorts by NEGLIGIBLE_PX or more.
     """
     found = _read(path, names, size)
     if missing := [name for name in names if name not in found]:
         known = ", ".join(sorted(found)) or "none"
         fix = "name the streams' files as the cameras are called"
         raise problem(path, "a camera for each stream", f"none for {', '.join(missing)} (it has {known})", fix)
-    for name in names:
-        _check_distortion(path, found[name])
+    cameras = tuple(_with_lens(path, found[name]) for name in names)
     if others := sorted(set(found) - set(names)):
         print(f"{path}: no stream of {', '.join(others)}: left out")
-    return tuple(found[name].camera for name in names)
+    return cameras
 
 
 def _read(path: Path, names: Sequence[str], size: tuple[int, int]) -> dict[str, FoundCamera]:
@@ -47,11 +48,17 @@ def _read(path: Path, names: Sequence[str], size: tuple[int, int]) -> dict[str, 
     return read_opencv_files([path], size)
 
 
-def _check_distortion(path: Path, found: FoundCamera) -> None:
-    px, name = found.distortion_px, found.camera.id
-    if px >= NEGLIGIBLE_PX:
-        expected = f"pinhole cameras (lens distortion below {NEGLIGIBLE_PX:g} px everywhere)"
-        fix = "if the lens allows it, calibrate without distortion coefficients"
-        raise problem(path, expected, f"{px:.2f} px in {name}", fix)
-    if px:
-        print(f"{name}: lens distortion of at most {px:.3f} px is left out")
+def _with_lens(path: Path, found: FoundCamera) -> Camera:
+    """Return the camera of a scene, with its lens where it distorts noticeably."""
+    px, camera = found.distortion_px, found.camera
+    if px < NEGLIGIBLE_PX:
+        if px:
+            print(f"{camera.id}: lens distortion of at most {px:.3f} px is left out")
+        return replace(camera, distortion=())
+    if found.distort:
+        expected = f"OpenCV's lens model ({', '.join(NAMES)}), or distortion below {NEGLIGIBLE_PX:g} px everywhere"
+        fix = "calibrate with that model"
+        raise problem(path, expected, f"another one, with {px:.2f} px, in {camera.id}", fix)
+    check_lens(camera, path)
+    print(f"{camera.id}: its lens moves pixels by up to {px:.2f} px")
+    return camera

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.array.lens import NAMES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.imports.found_camera import Distort, Float64, FoundCamera, check_size, make_camera
+from spike4dgs.benchmark.scene.writer import colmap_distortion
 
 _POINT_BYTES = 43  # at least, in points3D.bin
 _SAME = 1e-9  # relative: images of one camera that have the same pose
@@ -66,7 +69,10 @@ def _camera(name: str, image: Any, camera: Any, folder: Path) -> FoundCamera:
     intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     size = camera.width, camera.height
     made = make_camera(name, size, intrinsics, pose.rotation.matrix(), pose.translation, folder)
-    return FoundCamera(made, None if camera.is_undistorted() else _distortion(camera, intrinsics))
+    lens = colmap_distortion(camera)
+    if lens is None:
+        return FoundCamera(made, _distortion(camera, intrinsics))
+    return FoundCamera(replace(made, distortion=lens))
 
 
 def _distortion(camera: Any, intrinsics: tuple[float, float, float, float]) -> Distort:
@@ -81,5 +87,10 @@ def _distortion(camera: Any, intrinsics: tuple[float, float, float, float]) -> D
 
 def _equal(a: FoundCamera, b: FoundCamera) -> bool:
     """Return whether two cameras have the same intrinsics and pose, and as much distortion."""
-    first, second = (np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), [f.distortion_px]]) for f in (a, b))
+
+    def numbers(f: FoundCamera) -> Float64:
+        lens = f.camera.distortion or (0.0,) * len(NAMES)
+        return np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), lens, [f.distortion_px]])
+
+    first, second = numbers(a), numbers(b)
     return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME))

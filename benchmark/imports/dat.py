@@ -38,7 +38,8 @@ def import_dat(
 
     Cameras come from a COLMAP model (its folder, text or binary), from OpenCV (a YAML or XML file with a map for each
     camera, or a folder of files, one for each), or from Kalibr (camchain.yaml). They are named like the .dat files.
-    A lens that distorts by 0.05 px or more is refused.
+    Lens distortion by OpenCV's k1, k2, p1, p2, k3 is kept (COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV, Kalibr's radtan).
+    Another lens, such as a fisheye, is refused where it distorts by 0.05 px or more.
 
     Args:
         path: A .dat file, or a folder of them; a camera is called like its file.

@@ -1,28 +1,28 @@
-"""A camera from another program's file: our pinhole camera, and the lens distortion that it leaves out."""
+"""A camera from another program's file, and a lens that OpenCV's model of five numbers does not describe."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.lens import NAMES, make_distortion
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.cameras import Camera, check_rotation
+from spike4dgs.benchmark.scene.cameras import Camera, check_rotation, distortion_px
 
 Float64 = NDArray[np.float64]
 Distort = Callable[[Float64], Float64]  # normalised image coordinates [N, 2] of a pinhole -> of the lens
 
 CENTRE = 0.5  # added to principal points of OpenCV and Kalibr, whose pixel centres are at whole numbers
-_GRID = 33  # points each way, corners included, at which distortion is measured
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera of a file, and what its lens does."""
+    """A camera of a file, and its lens where the camera cannot hold it."""
 
     camera: Camera
     distort: Distort | None = None
@@ -30,15 +30,7 @@ class FoundCamera:
     @property
     def distortion_px(self) -> float:
         """The farthest that the lens moves a point of the pinhole's image, in pixels."""
-        if self.distort is None:
-            return 0.0
-        c = self.camera
-        across, down = np.linspace(0, c.width, _GRID), np.linspace(0, c.height, _GRID)
-        uv = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-        focal = np.array([c.fx, c.fy])
-        pinhole = (uv - (c.cx, c.cy)) / focal
-        moved = np.linalg.norm((self.distort(pinhole) - pinhole) * focal, axis=1)
-        return float(moved.max()) if np.isfinite(moved).all() else float("inf")
+        return distortion_px(self.camera, self.distort)
 
 
 def make_camera(
@@ -68,12 +60,16 @@ def check_size(found: Any, size: tuple[int, int], name: str, where: Path) -> Non
         raise problem(where, expected, "x".join(map(str, found)), "correct --width and --height, or calibrate again")
 
 
-def brown_distortion(coefficients: Float64) -> Distort | None:
-    """Return OpenCV's lens model of k1, k2, p1, p2[, k3[, k4, k5, k6[, s1 ... s4[, tx, ty]]]]; None for zeros."""
-    import cv2
+def with_brown_lens(camera: Camera, coefficients: Float64) -> FoundCamera:
+    """Return a camera with OpenCV's lens model of k1, k2, p1, p2[, k3[, k4, k5, k6[, s1 ... s4[, tx, ty]]]]."""
+    if not coefficients[len(NAMES) :].any():
+        return FoundCamera(replace(camera, distortion=make_distortion(coefficients[: len(NAMES)].tolist())))
+    return FoundCamera(camera, brown_distortion(coefficients))
 
-    if not coefficients.any():
-        return None
+
+def brown_distortion(coefficients: Float64) -> Distort:
+    """Return that lens model with all of its coefficients."""
+    import cv2
 
     def distort(xy: Float64) -> Float64:
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)

@@ -11,13 +11,13 @@ import yaml
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.imports.found_camera import (
     CENTRE,
-    Distort,
     FoundCamera,
-    brown_distortion,
     check_size,
     fisheye_distortion,
     make_camera,
+    with_brown_lens,
 )
+from spike4dgs.benchmark.scene.cameras import Camera
 
 _KEYS = "camera_model, intrinsics, distortion_model, distortion_coeffs, resolution"
 _DISTORTIONS = ("none", "radtan", "equidistant")
@@ -53,16 +53,19 @@ def read_camchain(path: Path, size: tuple[int, int]) -> dict[str, FoundCamera]:
             raise problem(path, f"camera_model pinhole of {name}", repr(model), "calibrate with that model")
         check_size(tuple(resolution) if isinstance(resolution, list) else (resolution,), size, str(name), path)
         camera = make_camera(str(name), size, intrinsics, w2c[:3, :3], w2c[:3, 3], path, CENTRE)
-        found[str(name)] = FoundCamera(camera, _distortion(str(name), lens, coefficients, path))
+        found[str(name)] = _with_lens(camera, lens, coefficients, path)
     return found
 
 
-def _distortion(name: str, lens: Any, coefficients: Any, path: Path) -> Distort | None:
+def _with_lens(camera: Camera, lens: Any, coefficients: Any, path: Path) -> FoundCamera:
+    name = camera.id
     if lens not in _DISTORTIONS:
         expected = f"a distortion_model of {name} among {', '.join(_DISTORTIONS)}"
         raise problem(path, expected, repr(lens), "calibrate with one of them")
     if lens == "none":
-        return None
+        return FoundCamera(camera)
     if coefficients.shape != (4,):
         raise problem(path, f"4 distortion_coeffs of {name}", str(coefficients.tolist()), "calibrate again")
-    return brown_distortion(coefficients) if lens == "radtan" else fisheye_distortion(coefficients)
+    if lens == "radtan":
+        return with_brown_lens(camera, coefficients)
+    return FoundCamera(camera, fisheye_distortion(coefficients))

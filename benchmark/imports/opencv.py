@@ -20,9 +20,9 @@ from spike4dgs.benchmark.imports.found_camera import (
     CENTRE,
     Float64,
     FoundCamera,
-    brown_distortion,
     check_size,
     make_camera,
+    with_brown_lens,
 )
 
 SUFFIXES = (".yml", ".yaml", ".xml")
@@ -97,4 +97,4 @@ def _camera(name: str, node: Any, size: tuple[int, int], path: Path) -> FoundCam
     if len(coefficients) not in _COEFFICIENTS:
         expected = f"{', '.join(map(str, _COEFFICIENTS))} {_DISTORTION[0]} of {name}"
         raise problem(path, expected, str(len(coefficients)), "write OpenCV's own")
-    return FoundCamera(camera, brown_distortion(coefficients))
+    return with_brown_lens(camera, coefficients)

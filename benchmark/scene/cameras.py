@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from spike4dgs.benchmark.files import read_json
 
 Float64 = NDArray[np.float64]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes
+_GRID = 33  # points each way, corners included, at which distortion is measured
 _MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # flips x and y between OpenCV and Mitsuba camera axes
 
 
@@ -149,6 +150,22 @@ def border(camera: Camera) -> Float64:
     rows = [np.stack([across, np.full_like(across, y)], axis=-1) for y in (0, camera.height)]
     columns = [np.stack([np.full_like(down, x), down], axis=-1) for x in (0, camera.width)]
     return np.concatenate(rows + columns)
+
+
+def distortion_px(camera: Camera, other_lens: Callable[[Float64], Float64] | None = None) -> float:
+    """Return the farthest that the lens moves a point of the pinhole's image, in pixels; infinite beyond its fold.
+
+    `other_lens` takes normalised coordinates [N, 2] of the pinhole to the lens's, in place of the camera's own.
+    """
+    if not (camera.distortion or other_lens):
+        return 0.0
+    across, down = np.linspace(0, camera.width, _GRID), np.linspace(0, camera.height, _GRID)
+    uv = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    focal = np.array([camera.fx, camera.fy])
+    xy = (uv - (camera.cx, camera.cy)) / focal
+    bent = other_lens(xy) if other_lens else distort(xy, camera.distortion)
+    moved = np.linalg.norm((bent - xy) * focal, axis=1)
+    return float(moved.max()) if np.isfinite(moved).all() else float("inf")
 
 
 def check_lens(camera: Camera, where: str | Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.lens import Distortion, make_distortion
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json, write_text, writing
 from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
@@ -131,8 +132,9 @@ def _write_transforms(root: Path, scene: SceneDescription) -> None:
     test += [_frame(scene, by_id[t.camera], t.tick, f"images/{t.name}.exr") for t in targets]
     paths = sorted((root / "images").glob("*/*.exr"))
     images = [_frame(scene, by_id[p.parent.name], int(p.stem), p.relative_to(root).as_posix()) for p in paths]
+    model = "OPENCV" if any(c.distortion for c in scene.cameras) else "PINHOLE"
     for name, frames in (("train", train), ("test", test), ("all", images)):
-        write_json(root / f"transforms_{name}.json", {"camera_model": "PINHOLE", "frames": frames})
+        write_json(root / f"transforms_{name}.json", {"camera_model": model, "frames": frames})
 
 
 def _frame(scene: SceneDescription, camera: Camera, tick: int, file_path: str) -> dict[str, Any]:
@@ -146,8 +148,9 @@ def write_colmap(
     points: NDArray[np.float64],
     images: Mapping[str, Sequence[str]] | None = None,
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin with pycolmap: a PINHOLE camera and its images for each view.
+    """Write cameras.bin, images.bin and points3D.bin with pycolmap: a camera and its images for each view.
 
+    The camera is a PINHOLE, with lens distortion an OPENCV camera, or FULL_OPENCV where k3 is not 0.
     `images` are the names of a camera's images; without them it has one, called like it. Raises UserError where the
     folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
     """
@@ -156,10 +159,10 @@ def write_colmap(
     names = {c.id: [c.id] for c in cameras} if images is None else images
     model, image_id = pycolmap.Reconstruction(), 0
     for i, c in enumerate(cameras, start=1):
+        kind, lens = _colmap_lens(c)
+        params = [c.fx, c.fy, c.cx, c.cy, *lens]
         model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=i, model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy]
-            )
+            pycolmap.Camera(camera_id=i, model=kind, width=c.width, height=c.height, params=params)
         )
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
         for name in names[c.id]:
@@ -180,8 +183,28 @@ def write_colmap(
         raise problem(folder, "a whole COLMAP model", "a part of it", "free some disk space, or choose another folder")
 
 
+def _colmap_lens(camera: Camera) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's camera model and its coefficients."""
+    if not camera.distortion:
+        return "PINHOLE", ()
+    k1, k2, p1, p2, k3 = camera.distortion
+    return ("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k3 else ("OPENCV", (k1, k2, p1, p2))
+
+
+def colmap_distortion(camera: Any) -> Distortion | None:
+    """Return the lens distortion of a pycolmap camera; None where OpenCV's five numbers do not describe it."""
+    model, params = camera.model.name, [float(v) for v in camera.params]
+    if camera.is_undistorted():
+        return ()
+    if model in ("SIMPLE_RADIAL", "RADIAL"):
+        return make_distortion(params[3:])
+    if model == "OPENCV" or (model == "FULL_OPENCV" and not any(params[9:])):
+        return make_distortion(params[4:9])
+    return None
+
+
 def read_colmap(folder: Path) -> tuple[Camera, ...]:
-    """Return the cameras of a COLMAP model of PINHOLE cameras, one per registered image, named by the image."""
+    """Return the cameras of a COLMAP model that `write_colmap` wrote, one per registered image, named by the image."""
     import pycolmap
 
     model = pycolmap.Reconstruction(str(folder))
@@ -192,7 +215,7 @@ def read_colmap(folder: Path) -> tuple[Camera, ...]:
         K = c.calibration_matrix()
         values = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
         R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
-        cameras.append(Camera(image.name, c.width, c.height, *values, R, t))
+        cameras.append(Camera(image.name, c.width, c.height, *values, R, t, colmap_distortion(c) or ()))
     return tuple(sorted(cameras, key=lambda c: c.id))
 
 

@@ -76,7 +76,7 @@ def make_lenses(cameras: Sequence[Camera]) -> tuple[Lens, ...]:
 
 
 def _bounds(camera: Camera) -> Float64:
-    """Return left, top and right, bottom [2, 2] of what the camera sees, in whole pixels of its pinhole, with a margin."""
+    """Return left, top and right, bottom [2, 2] of the camera's field of view in its pinhole, px, with a margin."""
     seen = camera.normalized(border(camera)) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return np.stack([np.floor(seen.min(axis=0)) - _MARGIN_PX, np.ceil(seen.max(axis=0)) + _MARGIN_PX])
 

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.array.lens import NAMES, make_distortion
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.cameras import Camera, check_rotation
+from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.profile.calibration_maps import read_maps
 from spike4dgs.generators.recorder.profile.toml_table import (
@@ -43,6 +44,7 @@ _ID = matching("a name of letters, digits, '.', '_' and '-'", NAME.match)
 _POSITIVE = number(0, 1e12, "a positive number")
 _FINITE = number(-1e12, 1e12, "a finite number")
 _VECTOR = tuple_of(_FINITE, "a list of numbers")
+_LENS = Kind(f"a list of {', '.join(NAMES)}, or of the first of them", lambda v: make_distortion(_VECTOR.read(v)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,8 @@ def calibration_toml(cameras: Iterable[Camera]) -> str:
     lines = [f'schema = "{CALIBRATION_SCHEMA}"']
     for c in cameras:
         values = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "rotation": c.R.tolist(), "translation": c.t.tolist()}
+        if c.distortion:
+            values["distortion"] = list(c.distortion)
         # Python writes the shortest digits that give the same number back, and TOML reads them.
         lines += ["", f'[camera."{c.id}"]', *(f"{key} = {_plain(value)}" for key, value in values.items())]
     return "\n".join(lines) + "\n"
@@ -227,12 +231,15 @@ def _read_calibration(table: Table, id: str, width: int, height: int) -> Camera:
     cx, cy = (table.take(name, _FINITE) for name in ("cx", "cy"))
     rotation = table.take("rotation", Kind("three rows of three numbers", lambda v: _array(v, (3, 3))))
     translation = table.take("translation", Kind("three numbers", lambda v: _array(v, (3,))))
+    lens = table.get("distortion", _LENS, ())
     table.close()
     try:
         check_rotation(rotation, "")
     except UserError:
         raise table.error("rotation", "a rotation matrix (world to camera)", shown(rotation.tolist())) from None
-    return Camera(id, width, height, fx, fy, cx, cy, rotation, translation)
+    camera = Camera(id, width, height, fx, fy, cx, cy, rotation, translation, lens)
+    check_lens(camera, table.path)
+    return camera
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -1,9 +1,9 @@
 """Bundle adjustment of an array from views of a board: intrinsics, camera poses and board poses of least error.
 
-The unknowns are few (6 a board pose, up to 9 a camera), so the normal equations are added up detection by detection
+The unknowns are few (6 a board pose, up to 11 a camera), so the normal equations are added up detection by detection
 from exact derivatives and solved densely, with Levenberg-Marquardt damping. Poses change by a small motion from the
 left: X -> exp(w) X + v. The pose of the reference camera is constant, which fixes the frame; the board's size fixes the
-scale. Pinholes with square pixels; no distortion, because a scene's cameras have none.
+scale. Square pixels; with `Freedom.lens` also k1 and k2 of each lens (`benchmark.array.lens`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ _MOST_STEPS = 60
 _CONVERGED = 1e-9  # relative decrease of the sum of squares of a last step
 _FINEST_PX = 1e-3  # the accuracy of corners is never better
 _PER_CAMERA = 9  # w, v, focal length, principal point
+_PER_LENS = 2  # k1, k2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +49,25 @@ class Rig:
     t: Float64  # [C, 3]
     board_R: Float64  # [T, 3, 3]
     board_t: Float64  # [T, 3]
+    lens: Float64 | None = None  # [C, 2] k1, k2; None: pinholes
 
     def residuals(self, s: Detections, points: Float64) -> Float64:
         """Return the projections of the board's points [N, 3] minus the detected corners [S, N, 2], px."""
         turned, world = self.turned(s, points)
         x = turned + self.t[s.camera][:, None]
-        seen = self.focal[s.camera][:, None, None] * x[..., :2] / x[..., 2:] + self.principal[s.camera][:, None]
-        return np.asarray(seen - s.uv)
+        f = self.focal[s.camera][:, None, None]
+        seen = f * x[..., :2] / x[..., 2:]
+        if self.lens is not None:
+            square = np.sum((x[..., :2] / x[..., 2:]) ** 2, axis=-1)
+            seen = seen * self.radial(s, square)[0][..., None]
+        return np.asarray(seen + self.principal[s.camera][:, None] - s.uv)
+
+    def radial(self, s: Detections, square: Float64) -> tuple[Float64, Float64]:
+        """Return 1 + k1 r^2 + k2 r^4 and its derivative in r^2, [S, N] each, of squares r^2 [S, N]."""
+        if self.lens is None:
+            return np.ones_like(square), np.zeros_like(square)
+        k1, k2 = (self.lens[s.camera, i][:, None] for i in range(_PER_LENS))
+        return 1 + square * (k1 + square * k2), k1 + 2 * k2 * square
 
     def turned(self, s: Detections, points: Float64) -> tuple[Float64, Float64]:
         """Return the points in the cameras' frames but for t [S, N, 3], and in the world [S, N, 3]."""
@@ -68,6 +81,7 @@ class Freedom:
 
     shared_focal: bool = False  # one focal length for all cameras, instead of one each
     centered: bool = False  # principal points stay in the middle
+    lens: bool = False  # k1 and k2 of each camera's lens, instead of none
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +99,10 @@ def adjust(
     rig: Rig, detections: Detections, points: Float64, reference: int, freedom: Freedom | None = None
 ) -> Adjusted:
     """Minimise the squares from an initial rig near the solution. `points` [N, 3]: the board's corners."""
-    columns = _columns(len(rig.focal), len(rig.board_t), reference, freedom or Freedom())
+    freedom = freedom or Freedom()
+    columns = _columns(len(rig.focal), len(rig.board_t), reference, freedom)
+    if freedom.lens and rig.lens is None:
+        rig = replace(rig, lens=np.zeros((len(rig.focal), _PER_LENS)))
     damping = 1e-3
     cost, H, g = _normal(rig, detections, points, columns)
     for _ in range(_MOST_STEPS):
@@ -124,18 +141,18 @@ def rms_px(rig: Rig, detections: Detections, points: Float64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    camera: Int64  # [C, 9] column of w, v, focal length, principal point; -1 where it is known
+    camera: Int64  # [C, 9 or 11] column of w, v, focal length, principal point, lens; -1 where it is known
     board: Int64  # [T, 6] columns of w, v
     n: int
 
 
 def _columns(n_cameras: int, n_views: int, reference: int, freedom: Freedom) -> _Columns:
-    unknown = np.ones((n_cameras, _PER_CAMERA), bool)
+    unknown = np.ones((n_cameras, _PER_CAMERA + freedom.lens * _PER_LENS), bool)
     unknown[reference, :6] = False
     if freedom.shared_focal:
         unknown[:, 6] = np.arange(n_cameras) == 0
     if freedom.centered:
-        unknown[:, 7:] = False
+        unknown[:, 7:9] = False
     camera = np.where(unknown, np.cumsum(unknown).reshape(unknown.shape) - 1, -1)
     if freedom.shared_focal:
         camera[:, 6] = camera[0, 6]
@@ -146,7 +163,7 @@ def _columns(n_cameras: int, n_views: int, reference: int, freedom: Freedom) -> 
 def _normal(rig: Rig, detections: Detections, points: Float64, columns: _Columns) -> tuple[float, Float64, Float64]:
     """Return the sum of squares, J^T J [P, P] and J^T r [P]."""
     r, J = _linearised(rig, detections, points)
-    at = np.concatenate([columns.camera[detections.camera], columns.board[detections.view]], axis=1)  # [S, 15]
+    at = np.concatenate([columns.camera[detections.camera], columns.board[detections.view]], axis=1)  # [S, 15 or 17]
     at = np.where(at >= 0, at, columns.n)  # known values go to a row and column that are dropped
     H, g = np.zeros((columns.n + 1, columns.n + 1)), np.zeros(columns.n + 1)
     np.add.at(H, (at[:, :, None], at[:, None, :]), J.transpose(0, 2, 1) @ J)
@@ -155,21 +172,29 @@ def _normal(rig: Rig, detections: Detections, points: Float64, columns: _Columns
 
 
 def _linearised(rig: Rig, s: Detections, points: Float64) -> tuple[Float64, Float64]:
-    """Return residuals [S, 2 N], 0 for unused corners, and derivatives [S, 2 N, 9 + 6]: by camera, by board."""
+    """Return residuals [S, 2 N], 0 for unused corners, and derivatives [S, 2 N, 9 or 11 + 6]: by camera, by board."""
     turned, world = rig.turned(s, points)
     x = turned + rig.t[s.camera][:, None]
     f = rig.focal[s.camera][:, None]
     a, b, inverse = x[..., 0] / x[..., 2], x[..., 1] / x[..., 2], f / x[..., 2]
-    pinhole = np.zeros((*a.shape, 2, 3))  # d (u, v) / d x
-    pinhole[..., 0, 0] = pinhole[..., 1, 1] = inverse
-    pinhole[..., 0, 2], pinhole[..., 1, 2] = -a * inverse, -b * inverse
-    by_board = pinhole @ rig.R[s.camera][:, None]
-    J = np.empty((*a.shape, 2, _PER_CAMERA + 6))
-    J[..., 0:3], J[..., 3:6] = -pinhole @ _cross(x), pinhole
-    J[..., 0, 6], J[..., 1, 6] = a, b
+    square = a * a + b * b
+    radial, slope = rig.radial(s, square)
+    aa, ab, bb = radial + 2 * slope * a * a, 2 * slope * a * b, radial + 2 * slope * b * b  # d (u, v) / d (a, b) / f
+    seen = np.zeros((*a.shape, 2, 3))  # d (u, v) / d x
+    seen[..., 0, 0], seen[..., 1, 1] = aa * inverse, bb * inverse
+    if rig.lens is not None:
+        seen[..., 0, 1] = seen[..., 1, 0] = ab * inverse
+    seen[..., 0, 2], seen[..., 1, 2] = -(aa * a + ab * b) * inverse, -(ab * a + bb * b) * inverse
+    by_board = seen @ rig.R[s.camera][:, None]
+    own = _PER_CAMERA + (_PER_LENS if rig.lens is not None else 0)
+    J = np.empty((*a.shape, 2, own + 6))
+    J[..., 0:3], J[..., 3:6] = -seen @ _cross(x), seen
+    J[..., 0, 6], J[..., 1, 6] = a * radial, b * radial
     J[..., 7:9] = np.eye(2)
-    J[..., 9:12], J[..., 12:15] = -by_board @ _cross(world), by_board
-    r = np.stack([f * a, f * b], -1) + rig.principal[s.camera][:, None] - s.uv
+    for k, power in enumerate((square, square * square)[: own - _PER_CAMERA]):
+        J[..., 0, 9 + k], J[..., 1, 9 + k] = f * a * power, f * b * power
+    J[..., own : own + 3], J[..., own + 3 :] = -by_board @ _cross(world), by_board
+    r = np.stack([f * a * radial, f * b * radial], -1) + rig.principal[s.camera][:, None] - s.uv
     counts = s.used[..., None]
     return np.where(counts, r, 0).reshape(len(r), -1), np.where(counts[..., None], J, 0).reshape(
         len(r), -1, J.shape[-1]
@@ -188,7 +213,8 @@ def _moved(rig: Rig, step: Float64, columns: _Columns) -> Rig:
     board = step[columns.board]
     R, t = _nudged(rig.R, rig.t, camera[:, :6])
     board_R, board_t = _nudged(rig.board_R, rig.board_t, board)
-    return Rig(rig.focal + camera[:, 6], rig.principal + camera[:, 7:], R, t, board_R, board_t)
+    lens = None if rig.lens is None else rig.lens + camera[:, 9:]
+    return Rig(rig.focal + camera[:, 6], rig.principal + camera[:, 7:9], R, t, board_R, board_t, lens)
 
 
 def _nudged(R: Float64, t: Float64, motion: Float64) -> tuple[Float64, Float64]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.array.lens import make_distortion
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
@@ -86,9 +87,10 @@ def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Cam
 
     The origin is the mean position of the board: about the point that the array looks at.
     """
+    lenses = [()] * len(names) if rig.lens is None else [make_distortion(k.tolist()) for k in rig.lens]
     cameras = [
-        Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t)
-        for name, f, m, R, t in zip(names, rig.focal, rig.principal, rig.R, rig.t, strict=True)
+        Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t, lens)
+        for name, f, m, R, t, lens in zip(names, rig.focal, rig.principal, rig.R, rig.t, lenses, strict=True)
     ]
     W = array_axes(cameras)
     frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
@@ -122,6 +124,7 @@ def calibrate_rig(
     window_ticks: int = 100,
     shared_focal: bool = False,
     centered: bool = False,
+    distortion: bool = False,
     allow_gaps: bool = False,
 ) -> int:
     """Calibrate an array from clips of a moving chessboard: OUT/calibration.toml, report.json and corners.png.
@@ -136,6 +139,7 @@ def calibrate_rig(
         window_ticks: Ticks that an image adds up; more ticks give less noise and more motion blur.
         shared_focal: One focal length for all cameras.
         centered: Principal points stay in the middle of the image.
+        distortion: Estimate k1 and k2 of every lens. The board must reach the corners of the images.
         allow_gaps: Use clips with gaps; images with missing ticks are left out.
     """
     if not clips:
@@ -144,7 +148,7 @@ def calibrate_rig(
     names, size = common_cameras(recordings)
     chosen = choose_views(recordings, views, window_ticks)
     seen = find_all(recordings, names, chosen, board)
-    found = calibrate_array(seen.detections, board, names, size, Freedom(shared_focal, centered))
+    found = calibrate_array(seen.detections, board, names, size, Freedom(shared_focal, centered, distortion))
     report = {
         "clips": [r.name for r in recordings],
         "board": {"columns": columns, "rows": rows, "square_m": square_m},
@@ -169,6 +173,7 @@ def _results(found: ArrayCalibration) -> dict[str, Any]:
             "focal_px": camera.fx,
             "focal_sd_px": float(a.focal_px[c]),
             "principal_point_px": [camera.cx, camera.cy],
+            **({"distortion": list(camera.distortion)} if camera.distortion else {}),
             "center_sd_m": float(a.center_m[c]),
             "turn_sd_deg": float(a.turn_deg[c]),
         }
@@ -196,6 +201,9 @@ def _print(report: dict[str, Any]) -> None:
         row = [name, f"{c['views']}", f"{c['reprojection_px']:.3f}", f"{c['focal_px']:.2f}", f"{c['focal_sd_px']:.2f}"]
         table.add_row(*row, f"{x:.1f}, {y:.1f}", f"{1e3 * c['center_sd_m']:.2f}", f"{c['turn_sd_deg']:.3f}")
     Console(width=120).print(table)
+    for name, c in report["cameras"].items():
+        if lens := c.get("distortion"):
+            print(f"{name}: k1 {lens[0]:.4f}, k2 {lens[1]:.4f}")
     views, corners = report["views"], report["corners"]
     print(
         f"{views['with_board']} of {views['looked_at']} views have the board; "

@@ -159,7 +159,7 @@ def test_kalibr_cameras_are_seen_from_the_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["colmap", "opencv", "kalibr"])
-def test_lens_distortion_is_measured(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lens_distortion_is_kept(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     write_streams(tmp_path / "in", [c.id for c in CAMERAS])
 
     def written(name: str, coefficients: np.ndarray) -> Path:
@@ -173,20 +173,50 @@ def test_lens_distortion_is_measured(tmp_path: Path, kind: str, capsys: pytest.C
     c = CAMERAS[0]
     radius = np.hypot(c.width / 2, c.height / 2)
     expected = BENT[0] * (radius / c.fx) ** 2 * radius
-    with pytest.raises(UserError, match=rf"pinhole cameras .* found {expected:.2f} px in cam_00"):
-        import_dat(tmp_path / "in", **SIZE, cameras=written("bent", BENT), out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    import_dat(tmp_path / "in", **SIZE, cameras=written("slight", SLIGHT), out=tmp_path / "out")
+    import_dat(tmp_path / "in", **SIZE, cameras=written("bent", BENT), out=tmp_path / "out")
+    assert f"cam_00: its lens moves pixels by up to {expected:.2f} px" in capsys.readouterr().out
+    scene = open_scene(tmp_path / "out")
+    first = CAMERAS[0].w2c if kind == "kalibr" else np.eye(4)  # Kalibr's world is the first camera's
+    points = POINTS @ first[:3, :3].T + first[:3, 3]
+    for c in CAMERAS:
+        uv = cv2.projectPoints(POINTS, cv2.Rodrigues(c.R)[0], c.t, opencv_matrix(c), BENT)[0].reshape(-1, 2)
+        assert np.abs(scene.cameras[c.id].project(points)[0] - (uv + 0.5)).max() < 1e-5
+    import_dat(tmp_path / "in", **SIZE, cameras=written("slight", SLIGHT), out=tmp_path / "slight-out")
     assert f"cam_02: lens distortion of at most {expected / 1000:.3f} px is left out" in capsys.readouterr().out
+    assert not open_scene(tmp_path / "slight-out").cameras["cam_02"].distortion
 
 
-def test_a_fisheye_is_no_pinhole(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("model", "lens"), [("SIMPLE_RADIAL", [0.05]), ("RADIAL", [0.05, -0.01])])
+def test_radial_colmap_cameras(tmp_path: Path, model: str, lens: list[float]) -> None:
+    write_streams(tmp_path / "in", ["cam_00"])
+    c, made = CAMERAS[0], pycolmap.Reconstruction()
+    params = [c.fx, c.cx, c.cy, *lens]
+    made.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model=model, width=c.width, height=c.height, params=params)
+    )
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
+    made.add_image_with_trivial_frame(pycolmap.Image(image_id=1, camera_id=1, name="cam_00"), pose)
+    (tmp_path / "model").mkdir()
+    made.write_binary(str(tmp_path / "model"))
+    import_dat(tmp_path / "in", **SIZE, cameras=tmp_path / "model", out=tmp_path / "out")
+    expected = np.array([made.image(1).project_point(p) for p in POINTS])
+    assert np.abs(open_scene(tmp_path / "out").cameras["cam_00"].project(POINTS)[0] - expected).max() < 1e-6
+
+
+def test_other_lenses_are_refused(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", [c.id for c in CAMERAS])
-    path = write_kalibr(tmp_path / "camchain.yaml", "equidistant")
     c, radius = CAMERAS[0], np.hypot(WIDTH / 2, HEIGHT / 2)
     expected = radius - c.fx * np.arctan(radius / c.fx)
-    with pytest.raises(UserError, match=f"found {expected:.2f} px in cam_00"):
-        import_dat(tmp_path / "in", **SIZE, cameras=path, out=tmp_path / "out")
+    fisheye = write_kalibr(tmp_path / "camchain.yaml", "equidistant")
+    with pytest.raises(UserError, match=f"found another one, with {expected:.2f} px, in cam_00"):
+        import_dat(tmp_path / "in", **SIZE, cameras=fisheye, out=tmp_path / "out")
+    rational = write_opencv(tmp_path / "rational.yml", np.array([0.1, 0, 0, 0, 0, 0.3, 0, 0]))
+    with pytest.raises(UserError, match=r"expected OpenCV's lens model \(k1, k2, p1, p2, k3\)"):
+        import_dat(tmp_path / "in", **SIZE, cameras=rational, out=tmp_path / "out")
+    folded = write_opencv(tmp_path / "folded.yml", np.array([-3.0, 0, 0, 0]))
+    with pytest.raises(UserError, match="a lens of cam_00 whose model holds up to the image's corners"):
+        import_dat(tmp_path / "in", **SIZE, cameras=folded, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
