@@ -120,8 +120,9 @@ def refine_pose(
     given = camera
     if camera.distortion:
         (lens,) = make_lenses([camera])
-        camera, image = lens.pinhole, resample(image, lens.to_camera)
-        background = nearest(background, lens.to_camera) & lens.seen
+        straight = resample(np.where(background, image, np.nan).astype(np.float32), lens.to_camera)
+        background = nearest(background, lens.to_camera) & lens.seen & np.isfinite(straight)
+        camera, image = lens.pinhole, np.nan_to_num(straight)
     start = Views.from_cameras([camera], device=device)
     target = torch.as_tensor(image, device=device)[None]
     weight = torch.as_tensor(background, dtype=target.dtype, device=device)[None] / float(background.sum())

@@ -75,7 +75,9 @@ def make_dataset(
     from rich.console import Console
 
     from spike4dgs.benchmark.runs.executors import executor
+    from spike4dgs.benchmark.scene.cameras import check_lens
     from spike4dgs.generators.rendering.mitsuba_variant import choose_device, pick_variant
+    from spike4dgs.generators.tasks import cameras_of
 
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:
@@ -106,6 +108,8 @@ def make_dataset(
         if lens and variant.startswith("scalar"):
             fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
             raise problem("--lens", "Mitsuba's LLVM or CUDA variant", variant, fix)
+        for job in todo if lens else ():
+            check_lens(cameras_of(job)[0], "--lens")
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")

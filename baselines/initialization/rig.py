@@ -94,7 +94,7 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} at one position"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
-    mean = window_means(scene, 0, scene.n_ticks, flat_field)
+    mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
     windows = _windows(scene.n_ticks, settings.window_ticks)
     counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
     moving = _moving_pixels(scene, [np.stack(c) for c in counts])
@@ -106,7 +106,7 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
     middle, last = len(windows) // 2, len(windows) - 1
     for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[at]
-        images = window_means(scene, start, stop, flat_field)
+        images = _marked(scene, window_means(scene, start, stop, flat_field))
         near = slice(max(0, at - 1), at + 2)
         quiet = [~m | (at == middle) for m in _moving_pixels(scene, [np.stack(c[near]) for c in counts])]
         short = [sweep(scene.cameras, images, i, planes, m, settings) for i, m in enumerate(moving)]
@@ -130,6 +130,13 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
     else:
         means = rates / np.float32(scene.radiance_gain)
     return undistorted(scene, means, unseen=None)
+
+
+def _marked(scene: TrainingScene, images: Float32) -> Float32:
+    """Return images [C, H, W] with -1 where a view sees nothing, which the plane sweep takes as outside of the image."""
+    if seen := seen_pixels(scene):
+        images[~np.stack(seen)] = -1
+    return images
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
@@ -212,7 +219,7 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: Cloud
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     if len(cloud.points) < settings.neighbours:
         far = 1 / inverse_depth_step(cameras)
-        return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), mean.mean(), np.float32))
+        return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), np.maximum(mean, 0).mean(), np.float32))
     distance, nearest = cKDTree(uv).query(grid, k=settings.neighbours)
     empty = distance[:, 0] > settings.hole_px
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
@@ -225,8 +232,8 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: Cloud
 
 
 def look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gray value [N] of the pixel that sees each point; NaN outside the image."""
+    """Return the gray value [N] of the pixel that sees each point; NaN outside the image, and where it is negative."""
     uv, z = camera.project(points)
     inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
     u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
-    return np.where(inside, image[v, u], np.nan)
+    return np.where(inside & (image[v, u] >= 0), image[v, u], np.nan)

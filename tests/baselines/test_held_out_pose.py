@@ -19,6 +19,7 @@ from toy_world import ToyWorld
 from spike4dgs.baselines.held_out_pose import PosedRecipe, RefinableModel, Refinement, refine_pose
 from spike4dgs.baselines.initialization.rig import rig
 from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.array.lens import resample
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.results.record import read_record
@@ -30,6 +31,7 @@ from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Parts
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.observations.pinholes import make_lenses
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision.table import SUPERVISIONS
@@ -75,6 +77,17 @@ def test_refinement_finds_the_pose_from_background_pixels_alone() -> None:
     assert off(wrong, TRUE) > 0.8 and off(found, TRUE) < 0.1
     assert np.allclose(found.R @ found.R.T, np.eye(3), atol=1e-9)
     assert (found.id, found.fx, found.width) == (TRUE.id, TRUE.fx, TRUE.width)
+
+
+def test_refinement_takes_a_lens_out_of_the_image() -> None:
+    curved = replace(TRUE, distortion=(-0.2, 0.03, 0.0, 0.0, 0.0))
+    (lens,) = make_lenses([curved])
+    image = resample(render_view(Views.from_cameras([lens.pinhole]))[0].numpy(), lens.to_pinhole)
+    background = np.ones(image.shape, bool)
+    background[20:50, 30:65] = False
+    image[~background] = 5.0
+    found = refine_pose(render_view, moved(curved, 1.0, -0.03), image, background, DEPTH_M, Refinement())
+    assert off(replace(found, distortion=()), TRUE) < 0.1 and found.distortion == curved.distortion
 
 
 def test_refinement_never_ends_worse_than_it_began() -> None:

@@ -181,6 +181,10 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
         (("car",), {"seconds": float("nan")}, "--seconds"),
         (("car",), {"seed": -1}, "--seed"),
         (("car",), {"variant": -1}, "--seed and --variant"),
+        (("car",), {"lens": (0.1,) * 6}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
+        (("car",), {"lens": (float("nan"),)}, "--lens"),
+        (("car",), {"lens": (-0.1,), "audit": True}, "--audit: expected pinhole cameras"),
+        (("car",), {"lens": (-9.0,)}, "whose model holds up to the image's corners"),
     ],
 )
 def test_bad_arguments_are_one_line(worlds, options, words, tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -38,19 +38,23 @@ class ToyWorld:
     n_ticks: int = 240
     travel: float = 0.25
     seed: int = 0
+    lens: tuple[float, ...] = ()  # of every camera
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         offsets = np.linspace(-0.4, 0.4, self.side)
         return tuple(
-            look_at(
-                f"cam_{i:02d}",
-                np.array([x, -3.0, 1.0 + z]),
-                np.array([0.0, 0.3, 0.7]),
-                np.array([0.0, 0.0, 1.0]),
-                focal=1.2 * self.width,
-                width=self.width,
-                height=self.height,
+            replace(
+                look_at(
+                    f"cam_{i:02d}",
+                    np.array([x, -3.0, 1.0 + z]),
+                    np.array([0.0, 0.3, 0.7]),
+                    np.array([0.0, 0.0, 1.0]),
+                    focal=1.2 * self.width,
+                    width=self.width,
+                    height=self.height,
+                ),
+                distortion=self.lens,
             )
             for i, (z, x) in enumerate((z, x) for z in offsets for x in offsets)
         )
@@ -68,7 +72,8 @@ class ToyWorld:
     def trace(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Radiance, depth z and board mask, each [H, W], at t in [0, 1]."""
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-        d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+        xy = camera.normalized(np.stack([u, v], -1))
+        d = np.concatenate([xy, np.ones_like(xy[..., :1])], -1) @ camera.R
         o = camera.center
         with np.errstate(divide="ignore", invalid="ignore"):
             to_floor, to_wall, to_board = -o[2] / d[..., 2], (1.0 - o[1]) / d[..., 1], -o[1] / d[..., 1]

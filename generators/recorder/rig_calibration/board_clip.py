@@ -106,7 +106,12 @@ def in_front(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], float]:
 
 
 def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:
-    """Return radiance [H, W] of the board in front of an even wall, with 4x4 samples a pixel. R, t: board to world."""
+    """Return radiance [H, W] of the board in front of an even wall, with 4x4 samples a pixel. R, t: board to world.
+
+    Raises UserError for a camera with lens distortion.
+    """
+    if camera.distortion:
+        raise problem(f"camera {camera.id}", "a pinhole", "lens distortion", "give --like a scene without it")
     to_camera = np.stack([camera.R @ R[:, 0], camera.R @ R[:, 1], camera.R @ t + camera.t], axis=1)
     to_board = np.linalg.inv(camera.K @ to_camera)  # (u, v, 1) -> (x, y, 1) / depth, x and y in the board's plane
     to_board[:2] /= board.square_m

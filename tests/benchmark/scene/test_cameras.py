@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import (
     Camera,
+    border,
     from_mitsuba,
     from_nerfstudio,
     look_at,
@@ -191,3 +195,57 @@ def test_mitsuba_cannot_model_oblong_pixels() -> None:
     camera = look_at("c", np.array([0.0, -1, 0]), np.zeros(3), np.array([0.0, 0, 1]), focal=9.0, width=4, height=4)
     with pytest.raises(UserError, match="fx = fy"):
         mitsuba_sensor(dataclasses.replace(camera, fy=10.0))
+
+
+def with_lens(camera: Camera, *lens: float) -> Camera:
+    """The camera with a lens that bends as much at its corners as it would at radius 1/2."""
+    corner = max(np.hypot(x, y) for x, y in camera.normalized(border(camera)))
+    scales = [(0.5 / corner) ** power for power in (2, 4, 1, 1, 6)]
+    return dataclasses.replace(camera, distortion=tuple(k * s for k, s in zip(lens, scales, strict=True)))
+
+
+@settings(max_examples=40, deadline=None)
+@given(cameras(), st.floats(-0.4, 0.4), st.floats(-0.1, 0.1), st.booleans())
+def test_a_lens_is_opencvs_and_goes_through_all_files(pinhole: Camera, k1: float, k2: float, cubic: bool) -> None:
+    camera = with_lens(pinhole, k1, k2, 1e-3, -2e-3, 0.02 * cubic)
+    points = seen_points(camera)
+    uv, z = camera.project(points)
+    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres are at whole numbers
+    rotation = cv2.Rodrigues(camera.R)[0]
+    expected = cv2.projectPoints(points, rotation, camera.t, K, np.array(camera.distortion))[0].reshape(-1, 2) + 0.5
+    assert np.abs(uv - expected).max() < 1e-4  # Rodrigues' vectors near half a turn are this exact
+    assert np.allclose(camera.unproject(uv, z), points, atol=1e-5)
+    assert worst_px(camera, from_nerfstudio("cam_00", to_nerfstudio(camera)), points) < 1e-6
+
+
+def small_camera() -> Camera:
+    forward, up = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
+    return look_at("cam_00", np.zeros(3), forward, up, focal=50, width=40, height=30)
+
+
+def test_a_pinhole_has_no_keys_of_a_lens() -> None:
+    pinhole = look_at(
+        "cam_00", np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, 1.0]), focal=50, width=40, height=30
+    )
+    assert not {"k1", "k2", "p1", "p2", "k3"} & set(to_nerfstudio(pinhole))
+    frame = {**to_nerfstudio(pinhole), "k1": -0.1, "k2": 0.0}
+    assert from_nerfstudio("cam_00", frame).distortion == (-0.1, 0.0, 0.0, 0.0, 0.0)
+    with pytest.raises(UserError, match="cam_00 whose model holds up to the image's corners, found k1 -5"):
+        from_nerfstudio("cam_00", {**frame, "k1": -5.0})
+    with pytest.raises(UserError, match="a pinhole for Mitsuba's sensor, found lens distortion"):
+        mitsuba_sensor(from_nerfstudio("cam_00", frame))
+
+
+@pytest.mark.parametrize("lens", [(-0.2, 0.03, 1e-3, -1e-3, 0.0), (-0.2, 0.03, 0.0, 0.0, 0.01)])
+def test_colmap_projects_through_the_lens(tmp_path: Path, lens: tuple[float, ...]) -> None:
+    pinhole = look_at(
+        "cam_00", np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, 1.0]), focal=50, width=40, height=30
+    )
+    camera = dataclasses.replace(pinhole, distortion=lens)
+    write_colmap(tmp_path, [camera], np.zeros((0, 3)))
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert model.camera(1).model.name == ("FULL_OPENCV" if lens[4] else "OPENCV")
+    points = seen_points(camera)
+    expected = np.array([model.image(1).project_point(p) for p in points])
+    assert np.abs(camera.project(points)[0] - expected).max() < 1e-6
+    assert read_colmap(tmp_path)[0].distortion == pytest.approx(lens)

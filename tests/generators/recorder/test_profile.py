@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,18 @@ def test_a_calibration_file_returns_every_number_exactly(tmp_path: Path) -> None
     rig = RIG.replace("[transfer]", 'calibration = "c.toml"\n[transfer]')
     profile = load_profile(save(tmp_path, rig.replace("left", "cam_00").replace("right", "cam_01")))
     assert profile.calibrated
+
+
+def test_a_calibration_file_holds_lenses(tmp_path: Path) -> None:
+    pinhole, curved = array_cameras(2, 40, 24)
+    text = calibration_toml([pinhole, replace(curved, distortion=(-0.15, 0.03, 0.0, 0.0, 0.0))])
+    assert text.count("distortion") == 1
+    (tmp_path / "c.toml").write_text(text)
+    found = read_calibration(tmp_path / "c.toml", 40, 24)
+    assert (found[pinhole.id].distortion, found[curved.id].distortion) == ((), (-0.15, 0.03, 0.0, 0.0, 0.0))
+    (tmp_path / "c.toml").write_text(text.replace("[-0.15, 0.03, 0.0, 0.0, 0.0]", "[1, 2, 3, 4, 5, 6]"))
+    with pytest.raises(UserError, match=r"distortion: expected a list of k1, k2, p1, p2, k3, or of the first"):
+        read_calibration(tmp_path / "c.toml", 40, 24)
 
 
 def cut(old: str, new: str = "") -> Callable[[str], str]:

@@ -103,6 +103,33 @@ def test_poses_come_out_within_their_deviations(adjusted):
     assert np.mean([c.center[1] for c in cameras_found]) < -0.8  # behind the origin, at which they look
 
 
+def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
+    lens = (-0.5, 0.3, 0.0, 0.0, 0.0)
+    cameras, shares = [replace(c, distortion=lens) for c in CAMERAS[::3]], np.linspace(0, 1, 12)
+    detections = detections_of(cameras, shares, 0.05)
+    rig, reference = initial(cameras, detections)
+    pinholes = adjust(rig, detections, BOARD.corners, reference)
+    found = adjust(rig, detections, BOARD.corners, reference, Freedom(lens=True))
+    assert pinholes.rig.lens is None and pinholes.sigma_px > 1.5 * found.sigma_px
+    assert 0.045 < found.sigma_px < 0.055  # the noise that was added
+    n, at = len(cameras), found.rig
+
+    def residuals(x):
+        step = x.reshape(n, 3)
+        other = replace(at, focal=at.focal + step[:, 0], lens=at.lens + step[:, 1:])
+        return other.residuals(detections, BOARD.corners).ravel()
+
+    cost = np.sum(residuals(np.zeros(3 * n)) ** 2)
+    solution = least_squares(residuals, np.zeros(3 * n), x_scale=np.tile([10.0, 0.1, 0.1], n), xtol=1e-14, ftol=1e-14)
+    assert cost <= 2 * solution.cost * (1 + 1e-8)
+    for camera, true in zip(rig_command.levelled(at, [c.id for c in cameras], (WIDTH, HEIGHT)), cameras, strict=True):
+        assert camera.distortion[2:] == (0.0, 0.0, 0.0)
+        corners = np.array([[10.0, 10], [150, 10], [10, 90], [150, 90], [80, 50]])
+        rays = camera.normalized(corners) - camera.normalized(corners[-1:])
+        expected = true.normalized(corners) - true.normalized(corners[-1:])
+        assert np.abs(rays - expected).max() * true.fx < 0.5  # px; the board does not reach the corners
+
+
 def test_fixed_parameters_stay(adjusted):
     cameras, detections, rig, reference, free = adjusted
     fixed = adjust(rig, detections, BOARD.corners, reference, Freedom(shared_focal=True, centered=True))
