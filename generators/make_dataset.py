@@ -104,10 +104,10 @@ def make_dataset(
             note = "; pass --replace to make and audit it again" if audit else ""
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     if todo:
-        variant = pick_variant()  # fails here, before anything is written, if it cannot render
-        if lens and variant.startswith("scalar"):
+        chosen = pick_variant()  # fails here, before anything is written, if it cannot render
+        if lens and chosen.startswith("scalar"):
             fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
-            raise problem("--lens", "Mitsuba's LLVM or CUDA variant", variant, fix)
+            raise problem("--lens", "Mitsuba's LLVM or CUDA variant", chosen, fix)
         for job in todo if lens else ():
             check_lens(cameras_of(job)[0], "--lens")
     with executor(workers, scheduler) as run:

@@ -133,7 +133,7 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
 
 
 def _marked(scene: TrainingScene, images: Float32) -> Float32:
-    """Return images [C, H, W] with -1 where a view sees nothing, which the plane sweep takes as outside of the image."""
+    """Return images [C, H, W] with -1 where a view sees nothing: the plane sweep takes that as outside of the image."""
     if seen := seen_pixels(scene):
         images[~np.stack(seen)] = -1
     return images
@@ -219,7 +219,8 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: Cloud
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     if len(cloud.points) < settings.neighbours:
         far = 1 / inverse_depth_step(cameras)
-        return Cloud(camera.unproject(grid, np.full(len(grid), far)), np.full(len(grid), np.maximum(mean, 0).mean(), np.float32))
+        gray = np.full(len(grid), np.maximum(mean, 0).mean(), np.float32)
+        return Cloud(camera.unproject(grid, np.full(len(grid), far)), gray)
     distance, nearest = cKDTree(uv).query(grid, k=settings.neighbours)
     empty = distance[:, 0] > settings.hole_px
     depth = 1 / np.median(1 / z[nearest[empty]], axis=1)

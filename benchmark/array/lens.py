@@ -12,11 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
+T = TypeVar("T", bound=np.generic)
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Distortion = tuple[float, ...]  # k1, k2, p1, p2, k3; empty: a pinhole
@@ -150,7 +152,7 @@ def _filled(image: Float32, known: NDArray[np.bool_]) -> Float32:
     return np.where(known, image, around).astype(np.float32)
 
 
-def nearest(image: NDArray[np.generic], at: Float64) -> NDArray[np.generic]:
+def nearest(image: NDArray[T], at: Float64) -> NDArray[T]:
     """Return the pixels [..., h, w] of [..., H, W] that positions [h, w, 2] px lie in, the border's beyond it."""
     height, width = image.shape[-2:]
     column, row = (np.floor(np.nan_to_num(at[..., i], nan=-1.0)).astype(np.int64) for i in (0, 1))

@@ -69,8 +69,8 @@ def make_lenses(cameras: Sequence[Camera]) -> tuple[Lens, ...]:
         to_camera, to_pinhole = _maps(
             c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion, left, top, right - left, bottom - top
         )
-        size = {"width": right - left, "height": bottom - top}
-        pinhole = replace(c, **size, cx=c.cx - left, cy=c.cy - top, distortion=())
+        size = right - left, bottom - top
+        pinhole = replace(c, width=size[0], height=size[1], cx=c.cx - left, cy=c.cy - top, distortion=())
         lenses.append(Lens(c, pinhole, to_camera, to_pinhole))
     return tuple(lenses)
 
