@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
@@ -45,8 +46,10 @@ class Supervision(nn.Module):
 def difference(rendered: Tensor, image: Tensor, w: float) -> Tensor:
     """Return (1 - w) mean |rendered - image| + w (1 - SSIM) of batches [V, H, W].
 
-    A pixel of `image` that is no number counts as met.
+    A pixel of `image` that is no number counts as met, and has no gradient.
     """
+    if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
+        rendered = torch.where(finite, rendered, rendered.detach())
     image = known(image, rendered)
     absolute = (rendered - image).abs().mean()
     return (1 - w) * absolute + w * (1 - ssim(rendered, image)) if w else absolute
