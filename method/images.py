@@ -9,20 +9,17 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.observations.pinholes import nearest_pixels, undistorted
 from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
-
-NEAR_TICKS = 20  # on each side of an image's tick: most makers look no further
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ def make_training_images(
     """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
     ticks, made = make_images(scene, make, settings, device)
     images = torch.from_numpy(undistorted(scene, made)).to(device)
-    bad, missing = _bad(scene), _missing(scene, ticks)
+    bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
     return TrainingImages(Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking)
@@ -116,25 +113,9 @@ def make_images(
 
 def as_measured(scene: TrainingScene, ticks: Sequence[int], images: Float32) -> Float32:
     """Return images of `make_images` with NaN where nothing was measured: at bad pixels, and inside long gaps."""
-    bad, missing, out = _bad(scene), _missing(scene, ticks), images.copy()
+    bad, missing, out = bad_pixels(scene), missing_images(scene, ticks), images.copy()
     if bad is not None:
         out[:, np.stack(bad)] = math.nan
     if missing is not None:
         out[missing] = math.nan
     return out
-
-
-def _bad(scene: TrainingScene) -> list[NDArray[np.bool_]] | None:
-    """Return the bad pixels [H, W] of each camera's stream; None where there are none."""
-    masks = [scene.state(camera.id).bad for camera in scene.cameras]
-    if all(mask is None for mask in masks):
-        return None
-    return [np.zeros((s.height, s.width), bool) if m is None else m for m, s in zip(masks, scene.streams, strict=True)]
-
-
-def _missing(scene: TrainingScene, ticks: Sequence[int]) -> NDArray[np.bool_] | None:
-    """Return the images around which a camera's recording lacks most ticks, [T, C]; None where there are none."""
-    if not any(stream.gaps for stream in scene.streams):
-        return None
-    lacking = [~present(stream.gaps, scene.n_ticks) for stream in scene.streams]
-    return np.array([[own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for own in lacking] for t in ticks])

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.observations.pinholes import AtSensors
+from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
 from spike4dgs.method.supervision.base import Sample
 
 
@@ -51,14 +52,18 @@ class SpikeCameras(nn.Module):
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:
     """Return spikes [V, H, W] float32 that the sample's views recorded in `ticks` ticks around its tick, and the ticks.
 
-    At the clip's ends the window is what is left of it: at least the tick itself. Where the sample's images are no
-    number nothing was measured: the spikes are NaN too.
+    At the clip's ends the window is what is left of it: at least the tick itself. The spikes of bad pixels are NaN, and
+    those of a camera that lacks most ticks around the sample's.
     """
     start = sample.tick - ticks // 2
     first, last = max(0, start), min(scene.n_ticks, start + ticks)
-    counts = np.stack([scene.streams[v].counts(first, last) for v in sample.views])
-    measured = torch.where(sample.images.isfinite().cpu(), torch.from_numpy(counts.astype(np.float32)), math.nan)
-    return measured, last - first
+    chosen = list(sample.views)
+    counts = np.stack([scene.streams[v].counts(first, last) for v in chosen]).astype(np.float32)
+    if bad := bad_pixels(scene):
+        counts[np.stack(bad)[chosen]] = math.nan
+    if (missing := missing_images(scene, [sample.tick])) is not None:
+        counts[missing[0, chosen]] = math.nan
+    return torch.from_numpy(counts), last - first
 
 
 def random_charge(like: Tensor, step: int) -> Tensor:

@@ -88,7 +88,7 @@ def _flat(rate: float, seed: int) -> SimpleNamespace:
     def counts(start: int, stop: int) -> np.ndarray:
         return (np.floor(charge + rate * stop) - np.floor(charge + rate * start)).astype(np.uint16)
 
-    return SimpleNamespace(counts=counts, width=32, height=20)
+    return SimpleNamespace(counts=counts, width=32, height=20, gaps=())
 
 
 def test_noise_embedding_scales_and_lifts_its_own_view_only() -> None:

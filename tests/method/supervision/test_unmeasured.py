@@ -1,8 +1,7 @@
-"""Losses on spikes leave out what was not measured: bad pixels and long gaps, NaN in a sample's images."""
+"""Losses on spikes leave out what was not measured: bad pixels and long gaps."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -10,6 +9,7 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.array.camera_state import CameraState
+from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.supervision.spike import SpikeRate
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, recorded
@@ -19,30 +19,35 @@ from spike4dgs.method.supervision.spss import SpikeVariation
 SCENE = ToyWorld(width=24, height=16, side=2, n_ticks=60).training
 
 
-def gradient(kind, images):
-    rendered = torch.full(images.shape, 0.4, requires_grad=True)
-    loss = kind(kind.defaults, SCENE)(lambda t: rendered, Sample(0.5, 30, (0, 2), images, 0))
+VIEWS = (0, 2)
+
+
+def gradient(kind, scene):
+    """The gradient of a loss in the renders [2, H, W] of the views."""
+    rendered = torch.full((2, 16, 24), 0.4, requires_grad=True)
+    loss = kind(kind.defaults, scene)(lambda t: rendered, Sample(0.5, 30, VIEWS, torch.full((2, 16, 24), 0.5), 0))
     loss.backward()
     return rendered.grad
 
 
 @pytest.mark.parametrize("kind", [SpikeRate, SpikeVariation])
 def test_an_unmeasured_pixel_pulls_at_nothing_and_changes_nothing_else(kind):
-    images = torch.full((2, 16, 24), 0.5)
-    whole = gradient(kind, images)
-    images[0, 3, 4] = images[1, 10, 20] = math.nan
-    found = gradient(kind, images)
-    unmeasured = images.isnan()
+    unmeasured = torch.zeros(2, 16, 24, dtype=torch.bool)
+    unmeasured[0, 3, 4] = unmeasured[1, 10, 20] = True
+    names = [SCENE.cameras[view].id for view in VIEWS]
+    states = {name: CameraState(bad=mask.numpy()) for name, mask in zip(names, unmeasured, strict=True)}
+    whole, found = gradient(kind, SCENE), gradient(kind, replace(SCENE, states=states))
     assert (found[unmeasured] == 0).all() and (whole[unmeasured] != 0).all()
     assert torch.equal(found[~unmeasured], whole[~unmeasured])
 
 
 def test_a_view_in_a_gap_leaves_the_loss_finite():
-    images = torch.full((2, 16, 24), 0.5)
-    images[1] = math.nan
+    gap = Gap(SCENE.cameras[2].id, 10, 45, "overflow")
+    streams = (*SCENE.streams[:2], replace(SCENE.streams[2], gaps=(gap,)), *SCENE.streams[3:])
+    scene = replace(SCENE, streams=streams)
     for kind in (SpikeRate, SpikeVariation, SpikeRender):
-        assert gradient(kind, images).isfinite().all()
-    counts, ticks = recorded(SCENE, Sample(0.5, 30, (0, 2), images, 0), 40)
+        assert gradient(kind, scene).isfinite().all()
+    counts, ticks = recorded(scene, Sample(0.5, 30, VIEWS, torch.full((2, 16, 24), 0.5), 0), 40)
     assert ticks == 40 and counts[0].isfinite().all() and counts[1].isnan().all()
 
 
