@@ -86,6 +86,15 @@ COMMANDS: dict[str, Command] = {
         "fit a model to a recording without ground truth; write a video and a report",
         "fit captures/turntable --out runs/turntable",
     ),
+    "fault-table": Command(
+        "spike4dgs.baselines.fault_table:make_fault_table",
+        "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
+        "fault-table data/turntable-0-small --out runs/faults",
+        needs=(
+            "spike4dgs.generators.recorder.record:record",
+            "spike4dgs.generators.recorder.emulation.imperfections:Imperfections",
+        ),
+    ),
     "score": Command(
         "spike4dgs.benchmark.runs.score_command:score",
         "score a predictions folder of any program",
