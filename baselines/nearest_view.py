@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -26,7 +27,9 @@ class NearestViewModel:
         distances = [float(np.linalg.norm(c.center - camera.center)) for c in self.scene.cameras]
         # Rounded to a micrometre: equals on paper must not be told apart by the last bit.
         nearest = int(np.argmin(np.round(distances, 6)))
-        return self.images(self.scene.streams[nearest], [self.scene.tick(t_us)], self.scene.radiance_gain)[0]
+        stream, clock = self.scene.streams[nearest], self.scene.state(self.scene.cameras[nearest].id).clock
+        ticks, _ = local_ticks(clock, [self.scene.tick(t_us)], stream.n_ticks)
+        return self.images(stream, ticks, self.scene.radiance_gain)[0]
 
 
 @dataclass

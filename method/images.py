@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
@@ -99,20 +100,24 @@ def make_training_images(
 def make_images(
     scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
 ) -> tuple[tuple[int, ...], Float32]:
-    """Return the chosen ticks and the images [T, C, H, W] at the pixels of the training streams."""
+    """Return the chosen ticks and the images [T, C, H, W] at the pixels of the training streams.
+
+    Ticks are the array's. A camera's image is made at its own tick then, or at the end of its clip nearest to it.
+    """
     make = on_device(make, device)
     ticks = choose_ticks(scene.n_ticks, settings)
     gain, calibrations = scene.radiance_gain, scene.calibrations if settings.flat_field else None
+    own = [local_ticks(scene.state(c.id).clock, ticks, scene.n_ticks)[0] for c in scene.cameras]
     if calibrations:
-        made = [make(s, ticks, gain, camera) for s, camera in zip(scene.streams, calibrations, strict=True)]
+        made = [make(s, t, gain, camera) for s, t, camera in zip(scene.streams, own, calibrations, strict=True)]
     else:
         gains = [gain * scene.state(camera.id).gain for camera in scene.cameras]
-        made = [make(s, ticks, own) for s, own in zip(scene.streams, gains, strict=True)]
+        made = [make(s, t, g) for s, t, g in zip(scene.streams, own, gains, strict=True)]
     return ticks, np.stack(made, axis=1)
 
 
 def as_measured(scene: TrainingScene, ticks: Sequence[int], images: Float32) -> Float32:
-    """Return images of `make_images` with NaN where nothing was measured: at bad pixels, and inside long gaps."""
+    """Return images of `make_images` with NaN where nothing was measured: bad pixels, long gaps, beyond a clip."""
     bad, missing, out = bad_pixels(scene), missing_images(scene, ticks), images.copy()
     if bad is not None:
         out[:, np.stack(bad)] = math.nan

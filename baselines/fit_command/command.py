@@ -22,9 +22,10 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from spike4dgs.baselines.fit_command.comparison import compare, mean_residual, residuals, write_sheet
-from spike4dgs.baselines.fit_command.held_out import SHOWN, HeldOutScores, judge_held_out
+from spike4dgs.baselines.fit_command.held_out import SHOWN, HeldOutScores, held_out_views, judge_held_out
 from spike4dgs.baselines.fit_command.recording import Recording, open_recording
 from spike4dgs.baselines.fit_command.report_page import Report, write_report
+from spike4dgs.baselines.fit_command.self_calibrated import Source, self_calibrated
 from spike4dgs.baselines.held_out_pose import PosedRecipe
 from spike4dgs.benchmark.environment import choose_device, command_line, device_type, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
@@ -57,12 +58,15 @@ def fit(
     budget: str = "quick",
     seed: int = 0,
     device: str = "auto",
+    poses: Source = "auto",
+    clocks: Source = "auto",
 ) -> int:
     """Fit a model to a recording, and write a sheet, a slow-motion video and a report. No ground truth is needed.
 
     Missing ticks are filled, bad pixels left out and unequal gains corrected; the report says what was found.
     A recording without poses (streams of `record` before a calibration) gets estimated ones. A killed fit resumes where
-    it was. Cameras that the recording holds out are judged by their own spikes: their renders are in OUT/predictions.
+    it was. Poses and clocks are checked against the clip, and estimated anew where they are wrong. Cameras that the
+    recording holds out are judged by their own spikes: their renders are in OUT/predictions.
 
     Args:
         scene: A scene folder, or a folder of streams that `record` has written.
@@ -71,6 +75,8 @@ def fit(
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
         seed: Seed of everything random.
         device: auto, cpu or cuda.
+        poses: auto (given ones are adjusted where features say that they are wrong) or given.
+        clocks: auto (the cameras' clocks are estimated from what moves, and used where they differ) or given.
     """
     wanted, steps = get_method(method), make_budget(budget)
     on = choose_device(device, rasterizes=getattr(wanted, "rasterizes", True))
@@ -78,11 +84,15 @@ def fit(
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         with _timed(times, "opening"):
             recording = open_recording(scene, seed)
-        poses = _poses(recording, wanted)
-        for text in (f"poses: {poses}", *recording.notes):
+        with _timed(times, "poses and clocks"):
+            own_poses = isinstance(wanted, PosedRecipe)  # it estimates them anyway
+            checked = self_calibrated(recording, "given" if own_poses else poses, clocks, seed)
+            recording = checked.recording
+        origin = _poses(recording, wanted, "poses" in checked.changed)
+        for text in (f"poses: {origin}", *recording.notes):
             _say(console, text)
         request = FitRequest(steps, on, seed)
-        saved = _fitted(wanted, recording, request, out, console)
+        saved = _fitted(wanted, recording, request, out, console, checked.changed)
         times["fit"] = saved.provenance.fit_seconds
         cameras = saved.provenance.cameras
         with _timed(times, "sheet"):
@@ -93,16 +103,18 @@ def fit(
         judged = None
         if recording.scene and recording.held_out:
             with _timed(times, "held-out cameras"):
-                judged = judge_held_out(saved, recording.scene, out / PREDICTIONS)
+                views = held_out_views(recording.scene, recording.training, checked.changed, seed)
+                judged = judge_held_out(saved, recording.scene, views, out / PREDICTIONS)
         report = Report(
             about=saved.provenance,
             source=scene,
-            poses=poses,
-            given=recording.training.cameras,
+            poses=origin,
+            given=checked.given,
             held_out=recording.held_out,
             judged=judged,
             notes=(*recording.notes, f"the video is {slow_motion:.0f} times slower than the world"),
             facts=recording.facts,
+            columns=checked.columns,
             residuals=residuals(found),
             maker=found.maker,
             seconds=times,
@@ -129,20 +141,22 @@ def _scores(judged: HeldOutScores) -> str:
     return values or f"no score ({judged.notes[SHOWN[0]]})"
 
 
-def _poses(recording: Recording, method: Method) -> str:
+def _poses(recording: Recording, method: Method, adjusted: bool) -> str:
     """Return in words where the poses of a fit come from."""
     if isinstance(method, PosedRecipe):
         start = method.recipe.initialization
         return f"estimated by the method ({start}), then moved to those {recording.poses}"
-    return recording.poses
+    return f"{recording.poses}, then adjusted" if adjusted else recording.poses
 
 
-def _fitted(method: Method, recording: Recording, request: FitRequest, out: Path, console: Console) -> SavedModel:
+def _fitted(
+    method: Method, recording: Recording, request: FitRequest, out: Path, console: Console, changed: tuple[str, ...]
+) -> SavedModel:
     """Return the fitted model, which OUT then holds: that of an earlier run, or a new one.
 
     Raises UserError where OUT holds a model of another fit, and for a method whose models cannot be saved.
     """
-    path, about = out / MODEL, _provenance(method, recording, request)
+    path, about = out / MODEL, _provenance(method, recording, request, changed)
     if path.exists():
         saved = load_model(path, request.device)
         if _key(saved.provenance) != _key(about):
@@ -169,12 +183,14 @@ def _fitted_cameras(model: Any, given: tuple[Camera, ...]) -> tuple[Camera, ...]
     return getattr(getattr(model, "model", model), "cameras", ()) or given
 
 
-def _provenance(method: Method, recording: Recording, request: FitRequest) -> Provenance:
+def _provenance(method: Method, recording: Recording, request: FitRequest, changed: tuple[str, ...]) -> Provenance:
+    """Return what is known of a fit before it; `changed` is what of the recording was estimated anew."""
     version = getattr(method, "version", None) or harness()["version"]
     trained_on = tuple(getattr(method, "trained_on", ()))
     scene = recording.training
+    params = {**method.params, **({"estimated": list(changed)} if changed else {})}
     return Provenance(
-        method=MethodInfo(method.name, version, dict(method.params), request.seed, trained_on).as_dict(),
+        method=MethodInfo(method.name, version, params, request.seed, trained_on).as_dict(),
         scene=scene.id,
         scene_revision=scene.revision,
         split=recording.split,

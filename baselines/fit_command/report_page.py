@@ -51,6 +51,7 @@ class Report:
     judged: HeldOutScores | None  # the held-out cameras by their own spikes
     notes: tuple[str, ...]
     facts: Sequence[CameraFacts]
+    columns: Mapping[str, Mapping[str, str]]  # more of the table of cameras: head -> camera -> cell
     residuals: Mapping[str, float]  # dB, by camera
     maker: str  # of the images that residuals are against
     seconds: Mapping[str, float]  # by step
@@ -84,7 +85,9 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         "their noise is in it. Dead pixels never fire under uniform light, hot ones fire in the dark five times as "
         "often as the median pixel, the rate of flickering ones is not steady. Without recordings of light and "
         "darkness these are the pixels that differ from all of their neighbours. The gain is that of the camera "
-        "beside the array's.</p>",
+        "beside the array's. A clock is given beside the mean of all, at the middle of the clip, with its standard "
+        "error; a pose's error is the median distance of features from their points' projections, with the poses as "
+        "they were given.</p>",
         _held_out(report.judged) if report.judged else "",
         "<h2>Poses</h2>",
         f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
@@ -141,12 +144,13 @@ def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
 
 def _cameras_table(report: Report) -> str:
     heads = ["camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %"]
-    heads += ["dead", "hot", "flickering", "gain", "residual, dB"]
-    lines = ["".join(f"<th>{head}</th>" for head in heads)]
+    heads += ["dead", "hot", "flickering", "gain", *report.columns, "residual, dB"]
+    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
     focal = {camera.id: camera.fx for camera in report.about.cameras}
     for f in report.facts:
         cells = [f.camera, f"{focal[f.camera]:.1f}", f"{f.missing}", *(f"{v:.4f}" for v in (f.mean, f.low, f.high))]
         cells += [*(f"{n}" for n in (f.dead, f.hot, f.flickering)), f"{f.gain:.3f}"]
+        cells += [column.get(f.camera, "-") for column in report.columns.values()]
         cells.append(_decibel(report.residuals[f.camera]))
         lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
     rows = "".join(f"<tr>{line}</tr>" for line in lines)

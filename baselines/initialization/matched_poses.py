@@ -85,7 +85,7 @@ def bundle(
     poses. A view without a pose is left out.
     """
     with find_features(scene.cameras, images, seed, settings) as found:
-        seen = _read(found, settings.enlarge)
+        seen = read_matches(found, settings.enlarge)
         intrinsics = [camera.K for camera in scene.cameras]
         first = _first_poses(seen, guess, factor, intrinsics, seed, settings.guess_px)
         rough = Tolerance(settings.rough_error_px, settings.rough_angle_deg)
@@ -97,7 +97,8 @@ def bundle(
         return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images, settings.enlarge)
 
 
-def _read(found: Features, enlarge: int) -> Seen:
+def read_matches(found: Features, enlarge: int) -> Seen:
+    """Return features and matches as the database has them."""
     import pycolmap
 
     with pycolmap.Database.open(found.database) as database:

@@ -40,6 +40,7 @@ from spike4dgs.baselines.initialization.rig import (
     window_means,
 )
 from spike4dgs.baselines.spike_to_image.windows import window
+from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
@@ -153,7 +154,9 @@ def infer(
     device = choose_device(device, rasterizes=False)
     network = load_network(weights_path(), device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / settings.trained_px))
-    windows = [window(stream, scene.n_ticks // 2, network.config.ticks) for stream in scene.streams]
+    clocks = [scene.state(camera.id).clock for camera in scene.cameras]
+    middles = [local_ticks(clock, [scene.n_ticks // 2], scene.n_ticks)[0][0] for clock in clocks]
+    windows = [window(s, t, network.config.ticks) for s, t in zip(scene.streams, middles, strict=True)]
     spikes = np.stack(nearest_pixels(scene, windows))
     small = shrink(torch.from_numpy(spikes), factor)[None]
     cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)

@@ -29,6 +29,8 @@ from spike4dgs.baselines.initialization.plane_sweep import (
     sweep,
     widest_baseline,
 )
+from spike4dgs.benchmark.array.camera_state import Clock
+from spike4dgs.benchmark.array.shared_time import local_window
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -96,7 +98,10 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
     mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
     windows = _windows(scene.n_ticks, settings.window_ticks)
-    counts = [[s.counts(a, b).astype(np.int64) for a, b in windows] for s in scene.streams]
+    counts = [
+        [s.counts(*local_window(clock, a, b, s.n_ticks)).astype(np.int64) for a, b in windows]
+        for s, clock in zip(scene.streams, _clocks(scene), strict=True)
+    ]
     moving = _moving_pixels(scene, [np.stack(c) for c in counts])
     planes = find_range(scene.cameras, mean, settings)
     maps = [sweep(scene.cameras, mean, i, planes, settings=settings) for i in range(len(scene.cameras))]
@@ -124,7 +129,8 @@ def filled(scene: TrainingScene, cloud: Cloud, mean: Float32, settings: CloudSet
 
 def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
     """Return the mean radiance [C, H, W] of all views in a window."""
-    rates = np.stack([_rate(s, start, stop) for s in scene.streams])
+    clocks = zip(scene.streams, _clocks(scene), strict=True)
+    rates = np.stack([_rate(s, *local_window(clock, start, stop, s.n_ticks)) for s, clock in clocks])
     if flat_field and scene.calibrations:
         means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
     else:
@@ -137,6 +143,10 @@ def _marked(scene: TrainingScene, images: Float32) -> Float32:
     if seen := seen_pixels(scene):
         images[~np.stack(seen)] = -1
     return images
+
+
+def _clocks(scene: TrainingScene) -> list[Clock]:
+    return [scene.state(camera.id).clock for camera in scene.cameras]
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
 
@@ -22,8 +23,18 @@ def bad_pixels(scene: TrainingScene) -> list[NDArray[np.bool_]] | None:
 
 
 def missing_images(scene: TrainingScene, ticks: Sequence[int]) -> NDArray[np.bool_] | None:
-    """Return the images around which a camera's recording lacks most ticks, [T, C]; None where there are none."""
-    if not any(stream.gaps for stream in scene.streams):
+    """Return the images that a camera lacks at ticks of the array, [T, C]; None where there are none.
+
+    A camera lacks one where its recording lacks most ticks around its own tick, and where that is outside its clip.
+    """
+    clocks = [scene.state(camera.id).clock for camera in scene.cameras]
+    local = [local_ticks(clock, ticks, scene.n_ticks) for clock in clocks]
+    outside = np.array([[not i for i in inside] for _, inside in local]).T
+    if not outside.any() and not any(stream.gaps for stream in scene.streams):
         return None
     lacking = [~present(stream.gaps, scene.n_ticks) for stream in scene.streams]
-    return np.array([[own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for own in lacking] for t in ticks])
+    near = [
+        [own[max(0, t - NEAR_TICKS) : t + NEAR_TICKS].mean() > 0.5 for t in at]
+        for own, (at, _) in zip(lacking, local, strict=True)
+    ]
+    return outside | np.array(near).T

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from spike4dgs.benchmark.array.shared_time import local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.observations.pinholes import AtSensors
 from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
@@ -52,13 +53,16 @@ class SpikeCameras(nn.Module):
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:
     """Return spikes [V, H, W] float32 that the sample's views recorded in `ticks` ticks around its tick, and the ticks.
 
-    At the clip's ends the window is what is left of it: at least the tick itself. The spikes of bad pixels are NaN, and
-    those of a camera that lacks most ticks around the sample's.
+    At the clip's ends the window is what is left of it: at least the tick itself. Each camera's is by its own clock,
+    and is moved to the end of its clip where it would leave it. The spikes of bad pixels are NaN, and those of a camera
+    that lacks most ticks around the sample's.
     """
     start = sample.tick - ticks // 2
     first, last = max(0, start), min(scene.n_ticks, start + ticks)
     chosen = list(sample.views)
-    counts = np.stack([scene.streams[v].counts(first, last) for v in chosen]).astype(np.float32)
+    clocks = [scene.state(scene.cameras[v].id).clock for v in chosen]
+    windows = [local_window(clock, first, last, scene.n_ticks) for clock in clocks]
+    counts = np.stack([scene.streams[v].counts(*w) for v, w in zip(chosen, windows, strict=True)]).astype(np.float32)
     if bad := bad_pixels(scene):
         counts[np.stack(bad)[chosen]] = math.nan
     if (missing := missing_images(scene, [sample.tick])) is not None:

@@ -38,7 +38,8 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
 from spike4dgs.method import load_model
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
-QUICK = ("--budget", "0.02", "--device", "cpu")
+SHORT = ("--budget", "0.02", "--device", "cpu")
+QUICK = (*SHORT, "--poses", "given")
 
 
 def write_streams(folder: Path, name: str = "{}.dat") -> dict[str, SpikeStream]:
@@ -76,7 +77,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def fitted(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("fitted") / "out"
-    assert main(["fit", str(recorded), "--method", "tfp+4dgs", "--out", str(out), *QUICK]) == 0
+    assert main(["fit", str(recorded), "--method", "tfp+4dgs", "--out", str(out), *SHORT]) == 0
     return out
 
 
