@@ -212,12 +212,10 @@ def _plot(path: Path, found: Sequence[Outcome], methods: Sequence[str], exact: M
     axis = figure.subplots()
     width = 0.8 / len(methods)
     for i, method in enumerate(methods):
-        lost = {o.case.name: _lost(o, exact[method]) for o in found if o.method == method and o.case.fault != _EXACT}
-        at = [y for y, name in enumerate(names) if name in lost and lost[name][1] is not None]
-        values = [lost[names[y]][1] for y in at]
-        axis.barh(
-            [y + (i - (len(methods) - 1) / 2) * width for y in at], values, width, label=method, color=method_color(i)
-        )
+        lost = {o.case.name: _lost(o, exact[method])[1] for o in found if o.method == method}
+        bars = [(y, value) for y, name in enumerate(names) if (value := lost.get(name)) is not None]
+        shift = (i - (len(methods) - 1) / 2) * width
+        axis.barh([y + shift for y, _ in bars], [v for _, v in bars], width, label=method, color=method_color(i))
     axis.set_yticks(range(len(names)), [labels[name] for name in names])
     axis.invert_yaxis()
     axis.axvline(0, color="black", linewidth=0.8)

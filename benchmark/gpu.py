@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -51,7 +52,7 @@ def trial() -> str:
     import torch
 
     try:
-        from numba import cuda
+        cuda: Any = import_module("numba.cuda")
 
         def add_one(a: Any) -> None:
             a[0] += 1
