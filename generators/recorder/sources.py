@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
-from spike4dgs.generators.recorder.profile.profile import PACKET_BYTES, RigProfile, load_profile
+from spike4dgs.generators.recorder.profile.profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
 
 CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")
 SECONDS = 0.5  # default length of a recording
@@ -105,10 +105,15 @@ def _worse_source(
 
 
 def _scene_profile(scene: Scene, layout: str) -> RigProfile:
-    """Return a profile whose reads take about a millisecond, as 256 KiB of 400x250 do, also for small scenes."""
+    """Return a profile whose reads take about a millisecond, as 256 KiB of 400x250 do, also for small scenes.
+
+    A held-out camera is the primary where there is one: its clock is then the scene's, and the truth stays comparable.
+    """
     size = make_layout(PLAIN, int(scene.meta["width"]), int(scene.meta["height"])).frame_bytes
     packets = math.ceil(size * scene.rate_hz * _READ_S / PACKET_BYTES)
-    return scene_profile(scene, layout=layout, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
+    rig = scene_profile(scene, layout=layout, transfer_bytes=min(packets * PACKET_BYTES, RigProfile.transfer_bytes))
+    primary = scene.test[0] if scene.test else rig.cameras[0].id
+    return replace(rig, cameras=tuple(replace(c, role=PRIMARY if c.id == primary else SECONDARY) for c in rig.cameras))
 
 
 def truth(scene: Scene | None, n_ticks: int) -> Truth:
