@@ -76,7 +76,7 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         f'<video src="{escape(report.video)}" controls loop muted playsinline></video>',
         "<h2>Training views</h2>",
         f"<p>The {escape(report.maker)} image made from the spikes, the model's render, and their absolute "
-        "difference, at three times.</p>",
+        "difference, at three times. Pixels that were left out are white in the difference.</p>",
         _image(sheet.read_bytes(), "training views"),
         "<h2>Cameras</h2>",
         _cameras_table(report),
