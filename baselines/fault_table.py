@@ -42,7 +42,7 @@ class Case:
     @property
     def name(self) -> str:
         """The name of its folder."""
-        return "-".join((self.fault, *self.size.split())).replace(" ", "-").replace("%", "pc").replace("°", "deg")
+        return "-".join((*self.fault.split(), *self.size.split())).replace("%", "percent").replace("°", "deg")
 
 
 CASES = (
