@@ -179,7 +179,7 @@ def _lost(outcome: Outcome, exact: Outcome) -> list[float | None]:
 def _markdown(found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> str:
     header = [f"{m}, dB" for m in methods] + [f"{m}, moving, dB" for m in methods]
     lines = [f"| fault | size | {' | '.join(header)} |", "|" + "---|" * (2 + len(header))]
-    by_case: dict[Case | str, dict[str, Outcome]] = {}
+    by_case: dict[str, dict[str, Outcome]] = {}
     for o in found:
         by_case.setdefault(o.case.name, {})[o.method] = o
     for outcomes in by_case.values():
@@ -206,8 +206,8 @@ def _text(value: float | None) -> str:
 
 def _plot(path: Path, found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> None:
     """Plot the dB lost where things move, a bar for each fault and method."""
-    names = [c for c in dict.fromkeys(o.case.name for o in found) if c != CASES[0].name]
-    labels = {o.case.name: f"{o.case.fault}, {o.case.size}" for o in found}
+    labels = {o.case.name: f"{o.case.fault}, {o.case.size}" for o in found if o.case.fault != _EXACT}
+    names = list(labels)
     figure = new_figure((8.0, 1.2 + 0.35 * max(1, len(names))))
     axis = figure.subplots()
     width = 0.8 / len(methods)
@@ -216,7 +216,7 @@ def _plot(path: Path, found: Sequence[Outcome], methods: Sequence[str], exact: M
         bars = [(y, value) for y, name in enumerate(names) if (value := lost.get(name)) is not None]
         shift = (i - (len(methods) - 1) / 2) * width
         axis.barh([y + shift for y, _ in bars], [v for _, v in bars], width, label=method, color=method_color(i))
-    axis.set_yticks(range(len(names)), [labels[name] for name in names])
+    axis.set_yticks(range(len(names)), list(labels.values()))
     axis.invert_yaxis()
     axis.axvline(0, color="black", linewidth=0.8)
     axis.set_xlabel("dB lost where things move, held-out camera")

@@ -31,8 +31,8 @@ _CSS = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.2rem; margin-top: 2rem; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; }
-th, td { padding: .2rem .8rem .2rem 0; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
+.scroll { overflow-x: auto; font-size: 13px; } table { border-collapse: collapse; }
+th, td { padding: .2rem .6rem .2rem 0; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
 th { font-weight: 600; } th:first-child, td:first-child, .facts td { text-align: left; white-space: normal; }
 .facts td:first-child { white-space: nowrap; font-weight: 600; vertical-align: top; }
 img, video { max-width: 100%; height: auto; background: #fff; } code { overflow-wrap: anywhere; }

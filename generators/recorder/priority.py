@@ -1,7 +1,7 @@
 """Real-time priority during a capture, so that no other program delays a reading thread for longer than its reads last.
 
-Measured beside programs that kept two cores busy: ordinary threads waited for up to 2 s to run, and one emulated camera
-lost 80 to 160 MB unseen in 4 s. With real-time priority four cameras lost nothing. A better nice value did not suffice.
+Beside programs that keep all cores busy an ordinary thread may wait for longer than the reads last, and a camera then
+loses data unseen. A better nice value does not suffice.
 """
 
 from __future__ import annotations
