@@ -38,6 +38,7 @@ class Case:
     fault: str
     size: str
     worse: Mapping[str, float]
+    lens: bool = False  # of the scene that was made with lenses
 
     @property
     def name(self) -> str:
@@ -65,6 +66,11 @@ CASES = (
         {"offset_ticks": 3, "drift_ppm": 20, "dropped": 0.001, "bad_pixels": 40, "gain": 0.02, "pose_deg": 0.1},
     ),
 )
+LENS_CASES = (
+    Case("lens", "known", {}, lens=True),
+    Case("lens", "10 % wrong", {"lens": 0.1}, lens=True),
+    Case("lens", "ignored", {"lens": 1}, lens=True),
+)
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,7 @@ def make_fault_table(record: Recorder, imperfections: Callable[..., Any]) -> Cal
     def fault_table(
         scene: Positional[Path],
         *,
+        lens_scene: Path | None = None,
         methods: tuple[str, ...] = ("spike4dgs-x", "spk2img+stg"),
         out: Path = Path("runs/faults"),
         budget: str = "quick",
@@ -96,28 +103,37 @@ def make_fault_table(record: Recorder, imperfections: Callable[..., Any]) -> Cal
 
         Args:
             scene: A made scene with ground truth.
+            lens_scene: The same scene made with `make-dataset --lens`, for the rows of lens distortion; its held-out
+                camera is judged through its lens.
             methods: Methods by name.
             out: Folder for table.md, table.csv, table.json and table.png; captures and fits are kept there too.
             budget: quick, standard (4 times the steps), or a multiple of quick.
             seed: Seed of the imperfections and of the fits.
             device: auto, cpu or cuda.
         """
-        truth = open_scene(scene)
-        if not truth.targets:
-            raise problem(scene, "a scene with ground truth", "none", "make one with `spike4dgs make-dataset`")
+        truth = _with_truth(scene)
+        curved = None if lens_scene is None else _with_truth(lens_scene)
         found: list[Outcome] = []
-        for case in CASES:
+        for case in (*CASES, *(LENS_CASES if curved else ())):
+            shown = curved if curved and case.lens else truth
             capture = out / "captures" / case.name
-            _capture(record, imperfections(**case.worse), scene, capture, seed)
+            _capture(record, imperfections(**case.worse), shown.root, capture, seed)
             for method in methods:
                 folder = out / "fits" / case.name / method
-                found.append(_outcome(case, method, capture, folder, truth, budget=budget, seed=seed, device=device))
+                found.append(_outcome(case, method, capture, folder, shown, budget=budget, seed=seed, device=device))
                 about = {"command": command_line(), "harness": harness(), "environment": environment("cpu")}
                 _write(out, found, {"scene": truth.id, "budget": budget, "seed": seed, **about})
         print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
         return 0
 
     return fault_table
+
+
+def _with_truth(scene: Path) -> Scene:
+    opened = open_scene(scene)
+    if not opened.targets:
+        raise problem(scene, "a scene with ground truth", "none", "make one with `spike4dgs make-dataset`")
+    return opened
 
 
 def _capture(record: Recorder, worse: Any, scene: Path, out: Path, seed: int) -> None:

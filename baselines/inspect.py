@@ -15,6 +15,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.inputs.numbers import MAX_HZ
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -216,8 +217,8 @@ def _open(
         raise problem(
             path, "--width, --height and --fps for a headerless stream", f"no {missing}", "state the camera's"
         )
-    if fps <= 0:
-        raise problem("--fps", "a positive rate", f"{fps:g}", "state the camera's")
+    if not 0 < fps <= MAX_HZ:
+        raise problem("--fps", f"a positive rate, {MAX_HZ:g} at most", f"{fps:g}", "state the camera's")
     return {path.stem: (open_stream(path, width, height, fps, rows_bottom_up=not top_down), None)}
 
 

@@ -40,6 +40,7 @@ class NearestView:
     images: ImageMaker
     images_name: str
     description: str = "the nearest training camera's image, without any reconstruction"
+    given: tuple[str, ...] = ("poses",)
     params: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:

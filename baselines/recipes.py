@@ -32,9 +32,9 @@ from spike4dgs.baselines.initialization.msdi import (
 from spike4dgs.baselines.initialization.rig import RigSettings, rig
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.spike_to_image.table import IMAGES
-from spike4dgs.benchmark.method import Method, Recipe
+from spike4dgs.benchmark.method import GIVEN, Method, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
 from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.radiance_field import RADIANCE_FIELD
@@ -139,7 +139,7 @@ SUPERVISED = tuple(
 )
 
 # The initialisations that estimate poses; scored at the calibrated held-out pose and at the refined one. First the rows
-# of the track `uncalibrated`: those of tables 1 and 2 with COLMAP's poses, or with those that MSDI's points begin.
+# with `--poses estimated`: those of tables 1 and 2 with COLMAP's poses, or with those that MSDI's points begin.
 _BY_NAME = {recipe.name: recipe for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND)}
 POSED = (
     *(
@@ -166,11 +166,26 @@ POSED = (
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
 
+# Losses that compare recorded spikes with those of the camera's calibrated response (`supervision.spike_cameras`).
+_CALIBRATED_LOSSES = {"spike", "pixel+spike", "spss"}
+
+
+def _with_given(method: RecipeMethod) -> RecipeMethod:
+    """Return a method that says what it is given: by its images, first points and loss, and who estimates the poses."""
+    corrected = [getattr(method.settings[part], FLAT_FIELD, False) for part in ("images", "initialization")]
+    own_loop = method.recipe.motion in PARTS.algorithms
+    calibrated = any(corrected) or method.recipe.initialization.startswith("msdi")
+    calibrated |= method.recipe.supervision in _CALIBRATED_LOSSES and not own_loop
+    posed = isinstance(method, PosedRecipe)
+    method.given = tuple(name for name, used in zip(GIVEN, (not posed, calibrated), strict=True) if used)
+    return method
+
+
 METHODS: dict[str, Method] = {
     **{
-        recipe.name: RecipeMethod(recipe, PARTS, description=describe(recipe))
+        recipe.name: _with_given(RecipeMethod(recipe, PARTS, description=describe(recipe)))
         for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)
     },
-    **{recipe.name: PosedRecipe(recipe, PARTS, description=describe(recipe)) for recipe in POSED},
+    **{recipe.name: _with_given(PosedRecipe(recipe, PARTS, description=describe(recipe))) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
 }

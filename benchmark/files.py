@@ -8,13 +8,20 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
+import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+
+MOST_BYTES = 16 << 20  # of a text: a record of many scenes has some MB; parsed, JSON can take 25 times its size
+MOST_DEPTH = 64  # of nested JSON values; programs that walk along them need a depth for each
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 _ROOM = ("room for the file", "free some disk space, or choose another folder")
 _ACCESS = ("a folder that may be written to", "change its permissions, or choose another folder")
@@ -89,24 +96,96 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON atomically, with sorted keys; NaN and infinity are refused (ValueError), not written."""
-    write_text(path, json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n")
+    write_text(path, json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """Return the text that `write_json` writes: equal values have equal texts."""
+    return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
+
+
+def read_text(path: Path, what: str, most_bytes: int = MOST_BYTES) -> str:
+    """Read UTF-8 text. `what` names the kind of file for the error.
+
+    Raises UserError where the file is missing, unreadable or no plain file, where it has more than `most_bytes`, and
+    ValueError (UnicodeError) for bytes that are no UTF-8.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise problem(path, what, "a folder", "check the path")
+        if not stat.S_ISREG(status.st_mode):
+            raise problem(path, what, "no plain file", "check the path")
+        if status.st_size > most_bytes:
+            raise problem(path, f"{what}, {most_bytes} bytes at most", f"{status.st_size}", "check the path")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise problem(path, what, "no such file", "check the path") from None
+    except OSError as e:
+        raise problem(path, what, (e.strerror or "an unreadable file").lower(), "check the path") from None
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
     """Read a JSON object. `what` names the kind of file for the error.
 
-    Raises UserError where the file is missing, is not JSON, or is not an object.
+    Raises UserError where the file is missing, is not JSON, is not an object, or breaks a bound of `parse_json`.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except FileNotFoundError:
-        raise problem(path, what, "no such file", "check the path") from None
-    except IsADirectoryError:
-        raise problem(path, what, "a folder", "check the path") from None
-    except (ValueError, RecursionError) as e:  # bad syntax, bad UTF-8, NaN or infinity
+        value = parse_json(read_text(path, what))
+    except ValueError as e:
         raise problem(path, f"{what} (JSON)", f"damaged text ({e})", "restore the file or make it again") from None
     if not isinstance(value, dict):
         raise problem(path, f"{what} (a JSON object)", type(value).__name__, "check that it is the right file")
+    return value
+
+
+def parse_json(text: str) -> Any:
+    """Return the value of a JSON text.
+
+    Raises ValueError for bad syntax, and for what other readers of the text may take in another way: a key twice in an
+    object, numbers beyond 64 bits or double precision, NaN and infinity, half of a surrogate pair, and values nested
+    more than MOST_DEPTH deep.
+    """
+    try:
+        value = json.loads(
+            text,
+            object_pairs_hook=_object,
+            parse_int=_integer,
+            parse_float=_float,
+            parse_constant=_refuse_constant,
+        )
+    except RecursionError:
+        raise ValueError("values nested too deep") from None
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(MOST_DEPTH):
+        level = [v for c in level for v in (c.values() if isinstance(c, dict) else c) if isinstance(v, dict | list)]
+        if not level:
+            break
+    else:
+        raise ValueError(f"values nested more than {MOST_DEPTH} deep")
+    if _SURROGATE.search(text):
+        json.dumps(value, ensure_ascii=False).encode()
+    return value
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"the key {twice[:80]!r} twice in an object")
+    return found
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > 20 or not -(2**63) <= (value := int(digits)) < 2**64:
+        raise ValueError(f"an integer of {len(digits)} digits, which 64 bits do not hold")
+    return value
+
+
+def _float(digits: str) -> float:
+    if not math.isfinite(value := float(digits)):
+        raise ValueError(f"{digits[:20]} is too large for double precision")
     return value
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,6 +27,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
 GROUP = "spike4dgs.methods"
+GIVEN = ("poses", "flat-field")  # what a method may be given beside streams, clock and intrinsics
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Recipe:
 
 SCALES = {"quick": 1.0, "standard": 4.0}  # quick: at most 90 s a fit on two cores, 200x125 pixels, 20 ms
 PAPER = "paper"
+MAX_BUDGET = 1e6  # as in common.schema.json
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ def make_budget(text: str) -> Budget:
         scale = SCALES[text] if text in SCALES else float(text)
     except ValueError:
         scale = 0.0
-    if not 0 < scale < float("inf"):
-        expected = f"{', '.join(SCALES)}, {PAPER}, or a positive number"
+    if not 0 < scale <= MAX_BUDGET:
+        expected = f"{', '.join(SCALES)}, {PAPER}, or a positive number, {MAX_BUDGET:g} at most"
         raise problem("--budget", expected, repr(text), "use quick for a first look")
     return Budget(scale)
 
@@ -117,10 +119,11 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Six attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
-    the data sets that learned parts have seen, `refines_views`: its models have `refine` (see `refinement`),
-    `description`, one line for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called
-    before the clock of a fit starts, and `rasterizes`: False lets it run on a GPU without numba-cuda.
+    Seven attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
+    the data sets that learned parts have seen, `given`, which of `GIVEN` it uses (all if absent; tracks of the
+    leaderboard withhold some), `refines_views`: its models have `refine` (see `refinement`), `description`, one line
+    for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called before the clock of a fit
+    starts, and `rasterizes`: False lets it run on a GPU without numba-cuda.
     """
 
     name: str
@@ -129,6 +132,16 @@ class Method(Protocol):
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views and return the model."""
         ...
+
+
+def training_for(method: Method, scene: TrainingScene) -> TrainingScene:
+    """Return what a method gets of a scene: no calibration recordings if it does not say that it is given them.
+
+    Poses remain: the estimated ones are brought to the rig's frame, in which held-out cameras are given.
+    """
+    if "flat-field" in getattr(method, "given", GIVEN):
+        return scene
+    return replace(scene, recordings=(None,) * len(scene.cameras))
 
 
 def check_protocol(method: Any, source: str) -> None:

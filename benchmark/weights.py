@@ -6,8 +6,8 @@ A part that needs weights states its facts, as a `WeightFile` or a `NamedWeights
     read_header(path, ...), read_tensors(path, ...)      its metadata; its tensors
     load_into(network, tensors, path)                    the network with them, ready to run
 
-Nothing is downloaded, and no code of a file runs. Files are hashed once per process; torch hub does not hash files that
-it has already.
+Nothing is downloaded here (`spike4dgs download weights` does that), and no code of a file runs. Files are hashed once
+per process; torch hub does not hash files that it has already.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.inputs.tensor_header import check_header
 
 if TYPE_CHECKING:  # torch takes seconds to import and is needed only where there are weights
     from torch import Tensor, nn
@@ -29,7 +30,9 @@ if TYPE_CHECKING:  # torch takes seconds to import and is needed only where ther
     NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 VARIABLE = "SPIKE4DGS_WEIGHTS"
+_DAMAGED = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError)
 TORCHVISION = "https://download.pytorch.org/models/"
+_TORCHVISION_LICENCE = "BSD-3-Clause (torchvision); trained on ImageNet, whose terms are for non-commercial research"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,14 @@ class WeightFile:
     sha256: str | None
     purpose: str
     source: str  # where users find it
+    licence: str = "not stated"
+    remote_name: str | None = None  # its name at the source, where that is another one
+
+    @property
+    def address(self) -> tuple[str, str] | None:
+        """The folder and the name that it can be fetched by; None where the source is a page for people."""
+        folder, _, name = self.source.rpartition("/")
+        return (folder, name) if name == (self.remote_name or self.name) else None
 
     @property
     def description(self) -> str:
@@ -60,7 +71,8 @@ class WeightFile:
     @property
     def fix(self) -> str:
         """The advice where the file is missing."""
-        return f"get it from {self.source} and put it there, or set {VARIABLE} to the folder that holds it"
+        command = "run `spike4dgs download weights`, or " if self.address else ""
+        return f"{command}get it from {self.source} and put it there, or set {VARIABLE} to the folder that holds it"
 
     @property
     def candidates(self) -> list[Path]:
@@ -80,6 +92,7 @@ class NamedWeights:
     variable: str
     fix: str  # the advice where the file is missing
     shipped: Path | None = None
+    download: WeightFile | None = None  # what `spike4dgs download weights` fetches; found where it puts it
 
     @property
     def need(self) -> str:
@@ -90,6 +103,8 @@ class NamedWeights:
     def candidates(self) -> list[Path]:
         """The path where the file lies. The shipped file never takes the place of one that was asked for."""
         path = _given(self.variable) or self.shipped
+        if path is None and self.download is not None:
+            return [found for found in self.download.candidates if found.is_file()][:1]
         return [] if path is None else [path]
 
 
@@ -112,6 +127,7 @@ ALEXNET = WeightFile(
     "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
     "AlexNet trunk of LPIPS",
     f"{TORCHVISION}alexnet-owt-7be5be79.pth",
+    _TORCHVISION_LICENCE,
 )
 VGG16 = WeightFile(
     "vgg16-397923af.pth",
@@ -119,6 +135,7 @@ VGG16 = WeightFile(
     "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
     "VGG-16 trunk of LPIPS",
     f"{TORCHVISION}vgg16-397923af.pth",
+    _TORCHVISION_LICENCE,
 )
 SQUEEZENET = WeightFile(
     "squeezenet1_1-b8a52dc0.pth",
@@ -126,6 +143,7 @@ SQUEEZENET = WeightFile(
     "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
     "SqueezeNet 1.1 trunk of LPIPS",
     f"{TORCHVISION}squeezenet1_1-b8a52dc0.pth",
+    _TORCHVISION_LICENCE,
 )
 METAIQA = WeightFile(
     "metaiqa_resnet18.pth",
@@ -133,6 +151,7 @@ METAIQA = WeightFile(
     None,
     "MetaIQA network as a state dict",
     "https://github.com/zhuhancheng/MetaIQA",
+    "its repository states none: ask the authors",
 )
 
 
@@ -177,9 +196,10 @@ def read_header(path: Path, key: str, expected: str, fix: str) -> str:
     import safetensors
 
     try:
+        check_header(path)
         with safetensors.safe_open(path, framework="np") as f:
             meta: dict[str, str] = f.metadata() or {}
-    except (safetensors.SafetensorError, OSError) as e:
+    except (safetensors.SafetensorError, OSError, ValueError) as e:
         raise unreadable(path, expected, e, fix) from None
     if key not in meta:
         raise problem(path, f"metadata {key}", ", ".join(meta) or "none", fix)
@@ -195,8 +215,9 @@ def read_tensors(path: Path, expected: str, fix: str) -> dict[str, Tensor]:
     from safetensors.torch import load_file
 
     try:
+        check_header(path)
         return load_file(path)
-    except (SafetensorError, OSError) as e:
+    except (SafetensorError, OSError, *_DAMAGED) as e:
         raise unreadable(path, expected, e, fix) from None
 
 
@@ -212,7 +233,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
         return read_tensors(path, expected, fix)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, OSError) as e:
+    except (pickle.UnpicklingError, EOFError, OSError, *_DAMAGED) as e:
         raise unreadable(path, expected, e, fix) from None
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise problem(path, "a mapping from names to tensors", type(state).__name__, fix)

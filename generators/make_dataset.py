@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from spike4dgs.benchmark.runs.executors import Run
 
 T = TypeVar("T")
+_MOST_SECONDS = 60  # a length of 0.02 renders for minutes
 _LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
 
 
@@ -39,11 +41,13 @@ def make_dataset(
     sub_ticks: bool = True,
     whole_frames: bool = False,
     lens: tuple[float, ...] = (),
+    lens_spread: float = 0.0,
     workers: int = 1,
     scheduler: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     audit: bool = False,
     replace: bool = False,
+    check: Path | None = None,
 ) -> int:
     """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
 
@@ -56,7 +60,7 @@ def make_dataset(
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
         out: Folder in which the scene folders appear.
         seed: Seed of all random numbers: the world's details, the rendering, the sensors.
-        variant: Variant of the world; 0 is the public benchmark.
+        variant: Variant of the world; 0 is the public benchmark, 9000 and up are kept for hidden seasons.
         seconds: Length of the clip if not the profile's, in whole milliseconds.
         gain_map: Give every pixel its own sensitivity.
         dark_map: Give every pixel its own dark rate.
@@ -66,16 +70,21 @@ def make_dataset(
         whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
         lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first of them, such as -0.15 0.03.
             Streams, other recordings and ground truth all show it. The scene's id ends in -lens.
+        lens_spread: Largest share by which a camera's coefficients differ from --lens, such as 0.3; the seed draws it.
         workers: Processes that render.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
         device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
         audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
         replace: Make damaged scenes, and scenes with other settings, again.
+        check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
+            they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
+            world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.
     """
     from rich.console import Console
 
     from spike4dgs.benchmark.runs.executors import executor
     from spike4dgs.benchmark.scene.cameras import check_lens
+    from spike4dgs.generators.check.check import check_scenes, find_references
     from spike4dgs.generators.rendering.mitsuba_variant import choose_device, pick_variant
     from spike4dgs.generators.tasks import cameras_of
 
@@ -84,6 +93,7 @@ def make_dataset(
         raise problem("worlds", "names or --all", "both", "leave one out")
     switches: dict[str, Any] = {
         "lens": _lens(lens, audit),
+        "lens_spread": _lens_spread(lens_spread, lens),
         "gain_map": gain_map,
         "dark_map": dark_map,
         "shot_noise": shot_noise,
@@ -97,7 +107,10 @@ def make_dataset(
         raise problem("worlds", "at least one world, or --all", "none", f"choose among {_names()}")
     if seed < 0 or variant < 0:
         raise problem("--seed and --variant", "numbers from 0 up", f"{seed}, {variant}", "correct them")
+    if is_reserved(variant):
+        console.print(f"variant {variant} is kept for hidden seasons: train nothing on it, and enter no scores of it")
     choose_device(device)
+    references = find_references(check, [job.id for job in jobs]) if check else {}
     todo = [job for job in jobs if not _is_done(job, out, replace)]
     for job in jobs:
         if job not in todo:
@@ -109,11 +122,17 @@ def make_dataset(
             fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
             raise problem("--lens", "Mitsuba's LLVM or CUDA variant", chosen, fix)
         for job in todo if lens else ():
-            check_lens(cameras_of(job)[0], "--lens")
+            for camera in cameras_of(job):
+                check_lens(camera, "--lens")
     with executor(workers, scheduler) as run:
         for number, job in enumerate(todo, start=1):
             _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
-    return 0
+
+        def make(job: Job, folder: Path) -> None:
+            if not _is_done(job, folder, False):
+                _make(job, folder, run, False, console, ", other noise")
+
+        return check_scenes(jobs, out, references, make) if check else 0
 
 
 def _make(job: Job, out: Path, run: Run, with_audit: bool, console: Any, which: str) -> None:
@@ -138,10 +157,10 @@ def _job(world: str, profile: str, seed: int, variant: int, seconds: float | Non
     if profile not in PROFILES:
         raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(profile), "correct the name")
     length = PROFILES[profile].seconds if seconds is None else seconds
-    ticks = length * RATE_HZ if math.isfinite(length) else -1.0
-    if ticks < 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
+    ticks = length * RATE_HZ if length <= _MOST_SECONDS else -1.0
+    if not ticks >= 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
         fix = "give seconds such as 0.02"
-        raise problem("--seconds", "whole milliseconds, at least 0.002", str(seconds), fix)
+        raise problem("--seconds", f"whole milliseconds, from 0.002 to {_MOST_SECONDS:g}", str(seconds), fix)
     return Job(world, variant, seed, profile, PROFILES[profile], round(ticks) / RATE_HZ, **switches)
 
 
@@ -154,6 +173,15 @@ def _lens(values: tuple[float, ...], audit: bool) -> tuple[float, ...]:
     if values and audit:
         raise problem("--audit", "pinhole cameras, which Mitsuba's own sensor can be", "--lens", "leave one out")
     return make_distortion(values)
+
+
+def _lens_spread(share: float, lens: tuple[float, ...]) -> float:
+    """Return the share by which lenses differ. Raises UserError for one outside [0, 1), and where there is no lens."""
+    if not 0 <= share < 1:
+        raise problem("--lens-spread", "a share from 0 to below 1", f"{share:g}", "correct it")
+    if share and not lens:
+        raise problem("--lens-spread", "the mean lens, --lens", "none", "give both, or leave both out")
+    return share
 
 
 def _all_names() -> list[str]:

@@ -51,7 +51,9 @@ class Job:
     adaptive: bool = True  # False: every pixel that changes, at every tick
     sub_ticks: bool = True  # False: never render instants inside a tick
     whole_frames: bool = False  # True: every pixel of every key
-    lens: Distortion = ()  # of every camera
+    lens: Distortion = ()  # of every camera, or their mean
+    lens_spread: float = 0.0  # largest share by which a camera's coefficients differ from it
+    noise: int = 0  # another number gives the rendering other noise, and changes nothing else
 
     @property
     def id(self) -> str:
@@ -61,6 +63,11 @@ class Job:
         """
         length = "" if self.seconds == self.profile.seconds else f"-{self.seconds * 1000:g}ms"
         return f"{self.world}-{self.variant}-{self.profile_name}{length}" + ("-lens" if self.lens else "")
+
+    @property
+    def render_seed(self) -> int:
+        """Seed of the rendering's random numbers; ground truth uses the next one."""
+        return self.seed + 1000 * self.noise
 
     @property
     def n_ticks(self) -> int:
@@ -75,7 +82,7 @@ class Job:
             "kind": "mitsuba",
             "world": self.world,
             "variant": self.variant,
-            "seed": self.seed,
+            "seed": self.seed if self.seed < 2**63 else str(self.seed),  # readers of JSON keep 64 bits
             "profile": self.profile_name,
             "seconds": self.seconds,
             "sampling": profile,
@@ -86,6 +93,8 @@ class Job:
             "sub_ticks": self.sub_ticks,
             "whole_frames": self.whole_frames,
             **({"lens": list(self.lens)} if self.lens else {}),
+            **({"lens_spread": self.lens_spread} if self.lens_spread else {}),
+            **({"noise": self.noise} if self.noise else {}),
         }
 
     @property

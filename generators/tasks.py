@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.array.lens import Distortion
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
@@ -33,9 +34,16 @@ def world_of(job: Job) -> WorldScene:
 
 @lru_cache(maxsize=1)
 def cameras_of(job: Job) -> tuple[Camera, ...]:
-    """Return the cameras of a job's profile."""
+    """Return the cameras of a job's profile, each with its own lens where lenses differ."""
     p = job.profile
-    return tuple(replace(c, distortion=job.lens) for c in cameras(world_of(job), p.width, p.height, p.views))
+    rig = cameras(world_of(job), p.width, p.height, p.views)
+    return tuple(replace(c, distortion=_lens_of(job, view)) for c, view in zip(rig, p.views, strict=True))
+
+
+def _lens_of(job: Job, view: int) -> Distortion:
+    """Return the lens of a camera: the job's, stronger or weaker by a share that the seed draws."""
+    share = np.random.default_rng([job.seed, view, *b"lens"]).uniform(-1, 1) * job.lens_spread
+    return tuple(k * (1 + float(share)) for k in job.lens)
 
 
 @lru_cache(maxsize=1)
@@ -79,7 +87,11 @@ class RenderStatic(_Task):
         """Return the static parts of the scene."""
         p = self.job.profile
         renderer = MultiViewRenderer(
-            world_of(self.job), cameras_of(self.job), seed=self.job.seed, spp=p.spp, background_spp=p.background_spp
+            world_of(self.job),
+            cameras_of(self.job),
+            seed=self.job.render_seed,
+            spp=p.spp,
+            background_spp=p.background_spp,
         )
         first = _target_renderer(self.job, cameras_of(self.job), None).static_on(renderer.static.background).first
         return StaticParts(renderer.static, first, _surface_points(renderer))
@@ -97,7 +109,7 @@ class RenderKeys(_Task):
         return MultiViewRenderer(
             world_of(job),
             cameras_of(job),
-            seed=job.seed,
+            seed=job.render_seed,
             spp=p.spp,
             background_spp=p.background_spp,
             static=self.static,
@@ -155,7 +167,7 @@ def _target_renderer(job: Job, views: Sequence[Camera], static: StaticViews | No
     return MultiViewRenderer(
         world_of(job),
         views,
-        seed=job.seed + 1,
+        seed=job.render_seed + 1,
         spp=p.target_spp,
         background_spp=background_spp,
         color=True,

@@ -1,23 +1,36 @@
-"""The leaderboard: submissions, verification, ranks, and the committed entries."""
+"""The leaderboard: tracks, submissions, verification, ranks, and the committed entries."""
 
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from spike4dgs.leaderboard.entry import read_entry
-    from spike4dgs.leaderboard.rank import rank_entries, write_leaderboard
-    from spike4dgs.leaderboard.submit_command import submit
+    from spike4dgs.leaderboard.entry import read_entries
+    from spike4dgs.leaderboard.rank import rank_entries, write_boards
+    from spike4dgs.leaderboard.submit_command import submit_all
+    from spike4dgs.leaderboard.tracks import current_release, place_of
     from spike4dgs.leaderboard.verify import verify_record
+    from spike4dgs.leaderboard.verify_command import verify_leaderboard
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "entry": ("read_entry",),
-            "rank": ("rank_entries", "write_leaderboard"),
-            "submit_command": ("submit",),
+            "entry": ("read_entries",),
+            "rank": ("rank_entries", "write_boards"),
+            "submit_command": ("submit_all",),
+            "tracks": ("current_release", "place_of"),
             "verify": ("verify_record",),
+            "verify_command": ("verify_leaderboard",),
         },
     )
 
-__all__ = ["rank_entries", "read_entry", "submit", "verify_record", "write_leaderboard"]
+__all__ = [
+    "current_release",
+    "place_of",
+    "rank_entries",
+    "read_entries",
+    "submit_all",
+    "verify_leaderboard",
+    "verify_record",
+    "write_boards",
+]

@@ -1,76 +1,203 @@
-"""An entry of the leaderboard: a result record with its label.
+"""An entry of the leaderboard: a result record with what was verified of it.
 
-    LEADERBOARD/entries/DATASET/METHOD.json         one record per method, labelled verified or self-reported
-    LEADERBOARD/entries/DATASET/METHOD@SPLIT.json   the same on another split than the default one
+    LEADERBOARD/entries/RELEASE-TRACK@REVISION/METHOD.json          of a track
+    LEADERBOARD/entries/RELEASE-TRACK@REVISION/METHOD@seed-K.json   another seed than 0
+    LEADERBOARD/local/SCENE+N@REVISION/METHOD.json                  of any other scenes, revisions or split
+    LEADERBOARD/archive/SCENE+N@REVISION/METHOD.json                from before release 1
 
-DATASET is the ids of the scenes, joined by "+".
+REVISION begins the hash of the scenes' revisions and the split (`tracks.dataset_revision`). Paths follow from the
+record's scenes, revisions, split, method and seed alone. Hidden files are no entries: a killed process may leave some.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.environment import utc_now
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.results.record import Record, check_record, with_later_metrics
-from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.results.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.leaderboard.ledger import NAME as LEDGER
+from spike4dgs.leaderboard.ledger import Ledger, add_line, read_ledger
+from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, place_of
 
-SCHEMA = "spike4dgs-entry/1"
-VERIFIED, SELF_REPORTED = "verified", "self-reported"
+SCHEMA = "spike4dgs-entry/2"
+CLAIMED, RE_SCORED, RE_FITTED = LABELS = ("claimed", "re-scored", "re-fitted")  # from the weakest to the strongest
+FOLDERS = (PUBLIC, LOCAL, ARCHIVE)
+BOARD = "leaderboard.json"
+WAIT_S = 600.0  # for other submissions; one takes a second under the lock
 Entry = dict[str, Any]
+_LARGEST = 1e15  # of any number: sums and squares of such numbers stay finite
+_RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt") for i in range(10))}  # on Windows
 
 
-def entry_name(record: Mapping[str, Any]) -> str:
-    """Return the path of a record's entry below `entries/`, without suffix: dataset, method, and split if not default.
+def check_folder(leaderboard: Path) -> None:
+    """Raise UserError unless a folder is a leaderboard, or new, or empty; an empty path is the working folder."""
+    if any((leaderboard / name).exists() for name in (*FOLDERS, BOARD)):
+        return
+    if leaderboard == Path() or leaderboard.exists() and (not leaderboard.is_dir() or _visible(leaderboard)):
+        found = "the working folder" if leaderboard == Path() else "something else"
+        raise problem("--leaderboard", f"a leaderboard or a new folder at {leaderboard}", found, "name another folder")
 
-    >>> entry_name({"method": {"name": "tfp+4dgs"}, "dataset": {"name": "car-0-small", "split": "corner"}})
-    'car-0-small/tfp+4dgs@corner'
+
+def _visible(folder: Path) -> bool:
+    return any(not p.name.startswith(".") for p in folder.iterdir())
+
+
+def file_name(record: Mapping[str, Any]) -> str:
+    """Return the name of a record's entry, without suffix: the method, and the seed where it is not 0.
+
+    >>> file_name({"method": {"name": "tfp+4dgs", "seed": 3}})
+    'tfp+4dgs@seed-3'
     """
-    name, split = str(record["method"]["name"]), record["dataset"]["split"]
-    return f"{record['dataset']['name']}/{name if split == DEFAULT_SPLIT else f'{name}@{split}'}"
+    seed = record["method"]["seed"]
+    return str(record["method"]["name"]) + (f"@seed-{seed}" if seed else "")
 
 
-def read_entry(path: Path) -> Entry:
-    """Read an entry. Raises UserError where it is damaged or invalid, or where its file name is not its record's."""
-    entry = read_json(path, "a leaderboard entry")
-    check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), path, "submit the record again")
-    entry = {**entry, "record": with_later_metrics(entry["record"])}
-    check_record(entry["record"], path)
-    found = f"{path.parent.name}/{path.stem}"
-    if (name := entry_name(entry["record"])) != found:
-        raise problem(path, f"the entry of {found}", name, "rename the file or its folder")
+def entry_path(record: Mapping[str, Any], archived: bool = False) -> str:
+    """Return the path of a record's entry below the leaderboard.
+
+    Raises UserError for names that cannot be file names everywhere.
+    """
+    name, seed = record["method"]["name"], record["method"]["seed"]
+    check_method_name(name)
+    if name.partition(".")[0].casefold() in _RESERVED or name.endswith("."):
+        raise problem("method", "a name that every system takes as a file's", repr(name), "rename the method")
+    if seed is not None and not 0 <= seed < 2**63:
+        raise problem("method", "a seed from 0 up, of 64 bits", str(seed)[:40], "choose another seed")
+    folder = place_of(record).folder
+    return (
+        f"{ARCHIVE}/{folder.partition('/')[2]}/{file_name(record)}.json"
+        if archived
+        else (f"{folder}/{file_name(record)}.json")
+    )
+
+
+def read_entry(leaderboard: Path, path: str, ledger: Ledger) -> Entry:
+    """Read the entry at `path` below the leaderboard.
+
+    Raises UserError where it is damaged or invalid, where it belongs to another path, and where the ledger has no line
+    for it.
+    """
+    where = leaderboard / path
+    entry = read_json(where, "a leaderboard entry")
+    if entry.get("schema") != SCHEMA:
+        raise problem(where, f"schema '{SCHEMA}'", repr(entry.get("schema"))[:80], "submit the record again")
+    check_numbers(entry, where)
+    sha256 = sha256_json(entry)
+    check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), where, "submit the record again")
+    entry = {**entry, "record": checked(entry["record"], where)}
+    if (name := entry_path(entry["record"], path.startswith(ARCHIVE))) != path:
+        raise problem(where, f"the entry of {path}", f"that of {name}", "restore the file, or submit its record again")
+    if (sha256, path) not in ledger:
+        fix = "restore the entry, or submit its record again with --replace"
+        raise problem(where, f"an entry as {LEDGER} lists it", "another one, as after an edit by hand", fix)
     return entry
 
 
-def write_entry(leaderboard: Path, record: Record, label: str, unverified: list[str], replace: bool) -> Entry:
+def checked(record: Record, where: Path) -> Record:
+    """Return a record with later metrics as null. Raises UserError where it is invalid."""
+    check_form(record, where)
+    record = with_later_metrics(record)
+    check_record(record, where)
+    return record
+
+
+def check_numbers(value: Any, where: Path) -> None:
+    """Raise UserError unless all numbers of a JSON value are finite and moderate, so that no arithmetic overflows."""
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, Mapping):
+            waiting += item.values()
+        elif isinstance(item, list):
+            waiting += item
+        elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:  # NaN compares false
+            found = f"an integer of {len(str(abs(item)))} digits" if isinstance(item, int) else str(item)
+            raise problem(where, f"numbers within +-{_LARGEST:g}", found, "score the predictions again")
+
+
+def entry_paths(leaderboard: Path, *folders: str) -> Iterator[str]:
+    """Yield the paths of the entries in the given ones of `FOLDERS`, sorted; hidden files are none."""
+    for folder in folders:
+        for path in sorted((leaderboard / folder).glob("*/*.json")):
+            name = path.relative_to(leaderboard)
+            if not any(part.startswith(".") for part in name.parts):
+                yield name.as_posix()
+
+
+def read_entries(leaderboard: Path, *folders: str) -> tuple[dict[str, Entry], dict[str, str]]:
+    """Return the entries by path, and why others were refused, by path: those do not block the leaderboard."""
+    ledger, entries, refused = read_ledger(leaderboard), dict[str, Entry](), dict[str, str]()
+    for path in entry_paths(leaderboard, *folders):
+        try:
+            entries[path] = read_entry(leaderboard, path, ledger)
+        except UserError as e:
+            refused[path] = str(e).removeprefix(f"{leaderboard / path}: ")
+    return entries, refused
+
+
+def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, Any], replace: bool) -> Entry:
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
-    An entry that makes the same claim takes over a better label and a shorter list of unverified scores. Raises
-    UserError where the method has another record there, unless `replace`.
+    An entry that makes the same claim takes over a better verification. The caller holds the leaderboard's lock. Raises
+    UserError where the method has another record there, unless `replace`, and where another method's name differs by
+    case alone.
     """
-    path = leaderboard / "entries" / f"{entry_name(record)}.json"
-    checked = {"label": label, "unverified": unverified}
-    entry: Entry = {"schema": SCHEMA, **checked, "submitted": utc_now(), "record": record}
-    if path.is_file():
-        old = read_entry(path)
-        if _claim(old["record"]) == _claim(record):
-            if _confidence(entry) <= _confidence(old):
-                return old
-            entry = {**old, **checked}
-        elif not replace:
-            fix = "pass --replace to put the new record in its place"
-            raise problem(path, "no entry of this method, or the same record", "another record", fix)
+    name = entry_path(record)
+    path = leaderboard / name
+    for other in entry_paths(leaderboard, name.partition("/")[0]):
+        if other != name and other.casefold() == name.casefold():
+            fix = "rename the method: some file systems take the two for one"
+            raise problem(path, "a name that differs by more than case", other, fix)
+    entry: Entry = {
+        "schema": SCHEMA,
+        "submitted": utc_now(),
+        "verification": dict(verification),
+        "record": record,
+    }
+    if path.exists():
+        try:
+            old = read_entry(leaderboard, name, read_ledger(leaderboard))
+        except UserError:
+            if not replace:
+                raise
+        else:
+            if _claim(old["record"]) == _claim(record):
+                if _confidence(entry) <= _confidence(old):
+                    return old
+                entry = {**old, "verification": dict(verification)}
+            elif not replace:
+                fix = "pass --replace to put the new record in its place"
+                raise problem(path, "no entry of this method, or the same record", "another record", fix)
+    # First the ledger: a process that is killed in between leaves a line too many, never an entry without one.
+    add_line(leaderboard, sha256_json(entry), name)
     write_json(path, entry)
     return entry
 
 
-def _confidence(entry: Entry) -> tuple[bool, int]:
-    return entry["label"] == VERIFIED, -len(entry["unverified"])
+def lock(leaderboard: Path) -> Any:
+    """Return the leaderboard's lock, a context manager that waits for other submissions."""
+    expected = "a leaderboard that other submissions leave in time"
+    return locked(leaderboard / ".lock", leaderboard, expected, WAIT_S)
+
+
+def remove_parts(leaderboard: Path) -> None:
+    """Remove what killed processes left half written. The caller holds the leaderboard's lock."""
+    for pattern in (".*.part*", *(f"{folder}/*/.*.part*" for folder in FOLDERS)):
+        for part in leaderboard.glob(pattern):
+            part.unlink(missing_ok=True)
+
+
+def _confidence(entry: Entry) -> tuple[int, int, int]:
+    v = entry["verification"]
+    measured = sum(t["noise_share"] is not None for t in v["truth"].values())
+    return LABELS.index(v["label"]), -len(v["unverified"]), measured
 
 
 def _claim(record: Mapping[str, Any]) -> str:

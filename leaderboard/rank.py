@@ -1,82 +1,212 @@
-"""Rank the entries: leaderboard.json has the rows of each dataset, split and protocol, made from the entries alone."""
+"""Rank the entries: the boards are made from the entries and the release alone.
+
+    leaderboard.json   the boards of the release's tracks
+    local.json         boards of other scenes, revisions or splits, with the reason
+    archive.json       entries from before release 1, without ranks
+
+A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration. Those
+are re-scored or re-fitted, complete, and without flags. Every other entry is a row of its own after them, without rank.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
-from spike4dgs.benchmark.results.record import Record, is_complete
-from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
+from spike4dgs.benchmark.results.record import COSTS, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.entry import Entry, entry_name, read_entry
+from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry, read_entries
+from spike4dgs.leaderboard.flags import flags_of
+from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of
 
-SCHEMA = "spike4dgs-leaderboard/1"
-
-
-def write_leaderboard(folder: Path) -> dict[str, Any]:
-    """Write leaderboard.json from the entries and return its content. Equal entries give equal bytes."""
-    entries = [read_entry(p) for p in sorted((folder / "entries").glob("*/*.json"))]
-    boards: dict[str, list[Entry]] = {}
-    for entry in entries:
-        contest = {"dataset": entry["record"]["dataset"], "protocol": entry["record"]["protocol"]}
-        boards.setdefault(json.dumps(contest, sort_keys=True), []).append(entry)
-    keys = ("id", "title", "definition", "higher_is_better", "implementation", "takes", "unit", "digits")
-    board = {
-        "schema": SCHEMA,
-        "primary": PRIMARY,
-        "metrics": [{key: getattr(m, key) for key in keys} for m in METRICS.values()],
-        "boards": [{**json.loads(contest), "rows": rank_entries(boards[contest])} for contest in sorted(boards)],
-    }
-    path = folder / "leaderboard.json"
-    check_schema(board, load_schema("spike4dgs.leaderboard", "leaderboard.schema.json"), path, "restore the entries")
-    write_json(path, board)
-    return board
+SCHEMA = "spike4dgs-leaderboard/2"
+FILES = {PUBLIC: BOARD, LOCAL: "local.json", ARCHIVE: "archive.json"}
+_BEFORE = "before release 1: these scenes' bytes are not those of the release"
 
 
-def rank_entries(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return the rows of one board, best first: complete records are ranked, the others follow without a rank.
+def write_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
+    """Write the boards from the entries and return them by folder. Equal entries give equal bytes.
 
-    Of equal values the one submitted first comes first.
+    A file without entries is removed, except leaderboard.json. The caller holds the leaderboard's lock.
     """
+    boards = make_boards(leaderboard)
+    for folder, name in FILES.items():
+        if folder in boards:
+            write_json(leaderboard / name, boards[folder])
+        else:
+            (leaderboard / name).unlink(missing_ok=True)
+    return boards
+
+
+def make_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
+    """Return the content of the boards by folder: always that of the tracks, the others where they have entries."""
+    schema = load_schema("spike4dgs.leaderboard", "leaderboard.schema.json")
+    keys = ("id", "title", "definition", "higher_is_better", "implementation", "takes", "unit", "digits")
+    found = {}
+    for folder, name in FILES.items():
+        entries, refused = read_entries(leaderboard, folder)
+        if folder != PUBLIC and not entries and not refused:
+            continue
+        board = {
+            "schema": SCHEMA,
+            "release": current_release().number,
+            "primary": PRIMARY,
+            "metrics": [{key: getattr(m, key) for key in keys} for m in METRICS.values()],
+            "boards": list(_public(entries) if folder == PUBLIC else _others(entries, folder)),
+            "refused": [{"entry": path, "reason": reason} for path, reason in sorted(refused.items())],
+        }
+        check_schema(board, schema, leaderboard / name, "restore the entries")
+        found[folder] = board
+    return found
+
+
+def _public(entries: Mapping[str, Entry]) -> Iterable[dict[str, Any]]:
+    release = current_release()
+    places = {path: place_of(entry["record"]).tracks for path, entry in entries.items()}
+    for track in release.tracks:
+        of_track = {path: entry for path, entry in entries.items() if track.name in places[path]}
+        if of_track:
+            facts = {"track": track.name, "title": track.title, "withheld": sorted(track.withheld), "why": ""}
+            yield _board(facts, of_track)
+
+
+def _others(entries: Mapping[str, Entry], folder: str) -> Iterable[dict[str, Any]]:
+    by_folder: dict[str, dict[str, Entry]] = {}
+    for path, entry in entries.items():
+        by_folder.setdefault(path.rpartition("/")[0], {})[path] = entry
+    for name, of_board in sorted(by_folder.items()):
+        why = _BEFORE if folder == ARCHIVE else place_of(next(iter(of_board.values()))["record"]).why
+        title = name.partition("/")[2].partition("@")[0]
+        nothing: dict[str, Any] = {"track": None, "title": title, "withheld": [], "why": why}
+        yield _board(nothing, of_board, ranked=folder != ARCHIVE)
+
+
+def _board(facts: Mapping[str, Any], entries: Mapping[str, Entry], ranked: bool = True) -> dict[str, Any]:
+    record = next(iter(entries.values()))["record"]
+    return {
+        **facts,
+        "dataset": record["dataset"],
+        "revision": dataset_revision(record["dataset"]),
+        "protocol": record["protocol"],
+        "rows": rank_entries(entries, ranked),
+    }
+
+
+def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict[str, Any]]:
+    """Return the rows of one board, best first; of equal values the one submitted first comes first.
+
+    `entries` are by path. Without `ranked` no row has a rank.
+    """
+    groups: dict[str, list[str]] = {}
+    for path, entry in sorted(entries.items()):
+        groups.setdefault(_configuration(entry) if ranked and may_be_ranked(entry) else path, []).append(path)
+    rows = [(key not in entries, _row([entries[path] for path in paths], paths)) for key, paths in groups.items()]
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
 
-    def order(entry: Entry) -> tuple[float, str, str]:
-        value = entry["record"]["mean"][PRIMARY] if is_complete(entry["record"]) else None
-        name = entry["record"]["method"]["name"]
-        return (math.inf if value is None else sign * value, entry["submitted"], name)
+    def order(row: tuple[bool, dict[str, Any]]) -> tuple[bool, float, str, str]:
+        value = row[1]["mean"][PRIMARY]
+        return not row[0], math.inf if value is None else sign * value, row[1]["submitted"], row[1]["entries"][0]
 
-    rows = []
-    for position, entry in enumerate(sorted(entries, key=order), start=1):
-        record = entry["record"]
-        seconds = [cell["fit_seconds"] for cell in record["scenes"].values()]
-        rows.append(
-            {
-                "rank": None if order(entry)[0] == math.inf else position,
-                "method": record["method"]["name"],
-                "label": entry["label"],
-                "unverified": entry["unverified"],
-                "submitted": entry["submitted"],
-                "entry": f"entries/{entry_name(record)}.json",
-                "mean": record["mean"],
-                "status": {scene: cell["status"] for scene, cell in record["scenes"].items()},
-                "fit_seconds": None if None in seconds else math.fsum(seconds),
+    return [
+        {"rank": position if counts else None, **row}
+        for position, (counts, row) in enumerate(sorted(rows, key=order), start=1)
+    ]
+
+
+def may_be_ranked(entry: Entry) -> bool:
+    """Return whether an entry is re-scored or re-fitted, complete and without flags."""
+    record = entry["record"]
+    complete = is_complete(record) and record["mean"][PRIMARY] is not None
+    return complete and entry["verification"]["label"] != CLAIMED and not flags_of(entry)
+
+
+def _configuration(entry: Entry) -> str:
+    """Return what the seeds of a method have in common: all of the method but the seed, and budgets and devices."""
+    record = entry["record"]
+    method = {k: v for k, v in record["method"].items() if k != "seed"}
+    cells = {scene: cell["budget"] for scene, cell in record["scenes"].items()}
+    return json.dumps([method, cells], sort_keys=True)
+
+
+def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
+    """Return the row of one method's entries, which are several only if all may be ranked."""
+    records, checks = [e["record"] for e in entries], [e["verification"] for e in entries]
+    first = records[0]
+    return {
+        "method": first["method"]["name"],
+        "label": min((c["label"] for c in checks), key=LABELS.index),
+        "flags": flags_of(entries[0]) if len(entries) == 1 else [],
+        "seeds": sorted({r["method"]["seed"] or 0 for r in records}),
+        "entries": list(paths),
+        "submitted": min(e["submitted"] for e in entries),
+        "mean": {metric: _mean(r["mean"][metric] for r in records) for metric in METRICS},
+        "unverified": [m for m in METRICS if any(m in c["unverified"] for c in checks)],
+        "status": {scene: cell["status"] for scene, cell in first["scenes"].items()},
+        "given": first["method"].get("given", list(GIVEN)),
+        "trained_on": first["method"]["trained_on"],
+        "costs": {
+            cost: {
+                "claimed": _mean(_of_scenes(cost, r["scenes"]) for r in records),
+                "re-fitted": _mean(_of_scenes(cost, c["refit"]["costs"] if c["refit"] else {}) for c in checks),
             }
-        )
-    return rows
+            for cost in COSTS
+        },
+        "code": {
+            "claimed": sorted({_code(r["harness"]) for r in records}),
+            "verifier": sorted({_code(c["by"]["harness"]) for c in checks if c["by"]}),
+        },
+    }
 
 
-def standing(board: Mapping[str, Any], record: Record) -> str:
-    """Return the rank of a record on its board in words, such as "rank 1 of 3 on car-0-small"."""
-    dataset = record["dataset"]
-    where = dataset["name"] + ("" if dataset["split"] == DEFAULT_SPLIT else f", split {dataset['split']}")
-    for contest in board["boards"]:
-        for row in contest["rows"]:
-            if row["entry"] == f"entries/{entry_name(record)}.json":
-                ranked = "not ranked" if row["rank"] is None else f"rank {row['rank']} of {len(contest['rows'])}"
-                return f"{ranked} on {where}"
-    return "not listed"
+def _of_scenes(cost: str, cells: Mapping[str, Mapping[str, Any]]) -> float | None:
+    """Return a cost over scenes: the sum of fit times, the mean of others; None where a scene has none."""
+    mean = _mean(cell[cost] for cell in cells.values())
+    return mean if mean is None or cost != "fit_seconds" else mean * len(cells)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean; None where a value is None, and for no values."""
+    found = list(values)
+    numbers = [v for v in found if v is not None]
+    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(found) else None
+
+
+def _code(harness: Mapping[str, Any]) -> str:
+    commit = harness["commit"][:9] if harness["commit"] else "no commit"
+    return f"{harness['version']} {commit}{' with changes' if harness['dirty'] else ''}"
+
+
+def standing(boards: Mapping[str, Mapping[str, Any]], path: str) -> str:
+    """Return where the entry at `path` stands, such as "rank 1 of 3 on outdoor-small (release 1, revision ...)"."""
+    found = []
+    for folder, file in boards.items():
+        for board in file["boards"]:
+            ranked = sum(row["rank"] is not None for row in board["rows"])
+            for row in (r for r in board["rows"] if path in r["entries"]):
+                rank = f"rank {row['rank']} of {ranked}" if row["rank"] else f"not ranked ({reason(row)})"
+                found.append(f"{rank} on {board_name(board, folder, file['release'])}")
+    return "; ".join(found) or "not listed"
+
+
+def reason(row: Mapping[str, Any]) -> str:
+    """Return the reason why a row has no rank."""
+    if row["flags"]:
+        return "; ".join(row["flags"])
+    if missing := [f"{scene} {status}" for scene, status in row["status"].items() if status != "ok"]:
+        return ", ".join(missing)
+    return "nothing was computed again" if row["label"] == CLAIMED else f"no {PRIMARY}"
+
+
+def board_name(board: Mapping[str, Any], folder: str, release: str) -> str:
+    """Return a board's name with its revision, for messages."""
+    revision = f"revision {board['revision'][:12]}"
+    if folder == PUBLIC:
+        return f"{board['track']} (release {release}, {revision})"
+    split = board["dataset"]["split"]
+    return f"the {folder} board {board['title']} ({revision}, split {split})"

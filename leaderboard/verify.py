@@ -1,12 +1,13 @@
 """Verify a record: hash and score the predictions again, and compare every value with the record's.
 
 Fit time, speed and memory cannot be computed again: they must equal those in prediction.json. Metrics whose weights
-this machine lacks are not compared.
+this machine lacks are not compared. The predictions are compared with the truth and its noise (`truth_check`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
@@ -14,15 +15,33 @@ from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.record import COSTS, Cell, Record, same_value
 from spike4dgs.benchmark.results.score import open_for, prediction_folders, score_scene
+from spike4dgs.benchmark.results.targets import has_truth
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings
 
 GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ
 
 
-def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequence[Scene]) -> set[str]:
-    """Hash and score the predictions of every scored scene again; return the metrics that could not be computed.
+@dataclass(frozen=True)
+class Rescored:
+    """What came of scoring again: the metrics that could not be computed, and by scene the check beside the truth."""
 
-    Raises UserError where a scene, a hash, the method or a score differs from the record.
+    unverified: frozenset[str]
+    truth: Mapping[str, TruthCheck]
+
+
+def verify_record(
+    record: Record,
+    where: Path,
+    predictions: Path,
+    scenes: Sequence[Scene],
+    second_renderings: SecondRenderings = no_renderings,
+    fitted: Mapping[str, str] | None = None,
+) -> Rescored:
+    """Hash and score the predictions of every scored scene again, and check them beside the truth.
+
+    `fitted`: scene id -> revision of the training part that the method was given instead of the scene. Raises
+    UserError where a scene, a hash, the method or a score differs from the record.
     """
     used = [s for s in scenes if s.id in record["scenes"]]
     for scene in used:
@@ -31,16 +50,19 @@ def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequen
             fix = "give the scene that was scored, or score again"
             raise problem(scene.root, f"scene revision {revision[:16]}...", f"{scene.revision[:16]}...", fix)
     folders = prediction_folders(predictions, used)
-    available, unverified = select_metrics(), set[str]()
+    available, unverified, truth = select_metrics(), set[str](), dict[str, TruthCheck]()
     for scene in used:
         cell = record["scenes"][scene.id]
         if cell["status"] != "ok":
             continue
-        found = open_for(folders[scene.id], scene)
+        found = open_for(folders[scene.id], scene, fitted)
         if found.sha256 != cell["predictions_sha256"]:
             expected = f"predictions {cell['predictions_sha256'][:16]}..."
             raise problem(found.root, expected, f"{found.sha256[:16]}...", "give the predictions that were scored")
-        if found.info.method.as_dict() != record["method"]:
+        method, claimed = found.info.method.as_dict(), record["method"]
+        if "given" not in method:  # older predictions do not have the key
+            claimed = {k: v for k, v in claimed.items() if k != "given"}
+        if method != claimed:
             expected = f"predictions of {record['method']['name']} as in the record"
             raise problem(found.root, expected, f"{found.info.method}"[:200], "score the predictions again")
         computed = score_scene(found, scene, available.among(cell["computed"]))
@@ -48,7 +70,9 @@ def verify_record(record: Record, where: Path, predictions: Path, scenes: Sequen
         shared = {m for m, sha256 in computed["computed"].items() if cell["computed"][m] == sha256}
         _check_same(cell, computed, shared, f"{where}, scene {scene.id}")
         unverified |= cell["computed"].keys() - shared
-    return unverified
+        if has_truth(scene):
+            truth[scene.id] = check_truth(found, scene, second_renderings)
+    return Rescored(frozenset(unverified), truth)
 
 
 def _check_same(claimed: Cell, computed: Cell, metrics: Collection[str], where: str) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.method import FitRequest, Model, Recipe
+from spike4dgs.benchmark.method import GIVEN, FitRequest, Model, Recipe
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fitted_model import FittedModel, MotionSpec
@@ -102,6 +102,7 @@ class RecipeMethod:
         self.settings = follow_images(found, recipe.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
         self.rasterizes = self.algorithm.rasterizes
+        self.given: tuple[str, ...] = GIVEN
         self.trained_on: tuple[str, ...] = ()
         if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on

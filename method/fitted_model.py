@@ -11,11 +11,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.inputs.numbers import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
 from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.model_files.modules import make_filled
 from spike4dgs.method.model_files.names import BACKGROUND, from_file_names, motion_settings, to_file_names
 from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
 from spike4dgs.method.observations.pinholes import through_lens
@@ -23,6 +25,8 @@ from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import join
 from spike4dgs.method.torch_state import one_torch_thread
+
+_MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +45,22 @@ class MotionSpec:
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any], where: str) -> MotionSpec:
-        """Return the spec that `as_dict` gave, or an earlier version's. Raises UserError for unknown settings."""
-        extent = {**value["extent"], **{k: torch.tensor(value["extent"][k]) for k in ("low", "high")}}
+        """Return the spec that `as_dict` gave, or an earlier version's.
+
+        Raises UserError for unknown settings, and KeyError, TypeError or ValueError for values that are none.
+        """
+        e = dict(value["extent"])
+        low, high = (torch.tensor([number(v, -MAX_LENGTH, MAX_LENGTH) for v in e.pop(key)]) for key in ("low", "high"))
+        scale, ticks = positive(e.pop("scale"), MAX_LENGTH), whole(e.pop("n_ticks"), 1, MAX_TICKS)
+        extent = Extent(low, high, scale, ticks, whole(e.pop("width"), 1, MAX_SIDE))
+        if e or len(low) != 3 or len(high) != 3:
+            raise ValueError(f"an extent of low, high, scale, n_ticks and width, and not {shown(value['extent'])}")
         defaults = MOTIONS[value["name"]].defaults
-        settings = make_settings(motion_settings(value["settings"], defaults), where, defaults)
-        return cls(value["name"], Extent(**extent), settings)
+        settings = make_settings(motion_settings(dict(value["settings"]), defaults), where, defaults)
+        for setting in asdict(settings).values():
+            if type(setting) is int:  # of layers, levels, features: loops have so many turns
+                whole(setting, 0, _MOST_OF_ANYTHING)
+        return cls(value["name"], extent, settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +121,20 @@ class FittedModel:
     def from_file(cls, file: ModelFile, device: str) -> FittedModel:
         """Return the model that `save` wrote.
 
-        Raises KeyError, TypeError, RuntimeError or UserError for another version's.
+        Raises KeyError, TypeError, ValueError, RuntimeError or UserError for another version's.
         """
         spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
-        motion = MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator())
-        motion.load_state_dict(file.part("motion"))
-        *pieces, background = (
-            Gaussians.from_tensors({k: v.to(device) for k, v in from_file_names(file.part(part)).items()})
-            for part in (*(f"piece{i}" for i in range(file.config["pieces"])), BACKGROUND)
+        motion = make_filled(
+            lambda: MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator()), file.part("motion")
         )
-        return cls(tuple(pieces), background, motion.to(device), file.provenance.duration_us, device, spec)
+        count = whole(file.config["pieces"], 1, len(file.tensors))
+        *pieces, background = (
+            Gaussians.from_file({k: v.to(device) for k, v in from_file_names(file.part(part)).items()})
+            for part in (*(f"piece{i}" for i in range(count)), BACKGROUND)
+        )
+        made = cls(tuple(pieces), background, motion.to(device), file.provenance.duration_us, device, spec)
+        made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
+        return made
 
 
 def count_bytes(tensors: Iterable[Tensor]) -> int:

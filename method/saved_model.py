@@ -48,6 +48,6 @@ def load_model(path: Path | str, device: str = "cpu") -> SavedModel:
         raise problem(path, f"a model of kind {', '.join(KINDS)}", repr(file.kind), FIX)
     try:
         return SavedModel(KINDS[file.kind](file, device), file.provenance)
-    except (KeyError, TypeError, ValueError, RuntimeError) as e:  # tensors or settings of another version
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as e:  # another version
         found = f"one that this version cannot read ({type(e).__name__}: {e})"
         raise problem(path, "a fitted model", found[:400], FIX) from None

@@ -29,7 +29,7 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.weights import NamedWeights, find_weights
+from spike4dgs.benchmark.weights import NamedWeights, WeightFile, find_weights
 from spike4dgs.method.initialization import Start
 from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 from spike4dgs.method.settings import Settings
@@ -37,11 +37,21 @@ from spike4dgs.method.settings import Settings
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+FILE = WeightFile(
+    "dust3r_vitlarge_512_dpt.safetensors",
+    None,
+    None,
+    "DUSt3R's network, 2.28 GB",
+    "hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt/model.safetensors",
+    "CC BY-NC-SA 4.0",
+    remote_name="model.safetensors",
+)
 WEIGHTS = NamedWeights(
     "DUSt3R's weights, model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence "
     "CC BY-NC-SA 4.0)",
     variable="SPIKE4DGS_DUST3R",
     fix="get the file and set SPIKE4DGS_DUST3R to its path",
+    download=FILE,
 )
 
 
@@ -56,6 +66,11 @@ class Dust3rSettings(Settings):
 
 
 DEFAULTS = Dust3rSettings()
+
+
+def weight_file() -> WeightFile:
+    """Return the facts of the weight file that `spike4dgs download weights` fetches."""
+    return FILE
 
 
 def weights_path() -> Path:

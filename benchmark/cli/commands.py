@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand: its function, a summary, and a command line that people can copy.
+    """A subcommand, of one word or two: its function, a summary, and a command line that people can copy.
 
     A command that calls functions of other rooms `needs` them: its target is then called with them and returns the
     command's function.
@@ -74,7 +74,11 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.benchmark.runs.run_command:make_run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
-        needs=("spike4dgs.leaderboard.submit_command:submit_all", "spike4dgs.baselines.speed.images:images"),
+        needs=(
+            "spike4dgs.leaderboard.submit_command:submit_all",
+            "spike4dgs.baselines.speed.images:images",
+            "spike4dgs.leaderboard.tracks:track_scenes",
+        ),
     ),
     "methods": Command(
         "spike4dgs.benchmark.runs.methods_command:methods",
@@ -101,9 +105,46 @@ COMMANDS: dict[str, Command] = {
         "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
     ),
     "submit": Command(
-        "spike4dgs.leaderboard.submit_command:submit",
+        "spike4dgs.leaderboard.submit_command:make_submit",
         "verify a result record and enter it into the leaderboard",
         "submit r.json --predictions runs/small/predictions/tfp+4dgs --scenes data/car-0-small data/turntable-0-small",
+        needs=("spike4dgs.generators.second_renderings:second_renderings",),
+    ),
+    "verify-leaderboard": Command(
+        "spike4dgs.leaderboard.verify_command:verify_leaderboard",
+        "check a leaderboard's release, entries and boards",
+        "verify-leaderboard leaderboard",
+    ),
+    "season make": Command(
+        "spike4dgs.leaderboard.season.make_command:make_season_make",
+        "draw secret seeds, make hidden scenes, write the commitments to them",
+        "season make 1 --worlds car turntable --secret ~/season-1",
+        needs=("spike4dgs.generators.make_dataset:make_dataset",),
+    ),
+    "season publish": Command(
+        "spike4dgs.leaderboard.season.publish_command:publish",
+        "write what may be public by now as tars: training parts, in the end whole scenes",
+        "season publish 1 --secret ~/season-1 --out public",
+    ),
+    "season predict": Command(
+        "spike4dgs.leaderboard.season.predict_command:predict",
+        "fit methods on published training parts and render the targets, to submit them",
+        "season predict car-9001-small turntable-9001-small --methods tfp+4dgs --out runs/season-1",
+    ),
+    "season score": Command(
+        "spike4dgs.leaderboard.season.score_command:score",
+        "score submitted predictions, or methods that are run first",
+        "season score 1 --secret ~/season-1 --predictions received/theirs --methods tfp+4dgs",
+    ),
+    "season reveal": Command(
+        "spike4dgs.leaderboard.season.reveal_command:reveal",
+        "publish the secret seeds of a season that is over",
+        "season reveal 1 --secret ~/season-1",
+    ),
+    "season check": Command(
+        "spike4dgs.leaderboard.season.check_command:check",
+        "check the seeds, scenes and scores of a season against its commitments",
+        "season check 0",
     ),
     "inspect": Command(
         "spike4dgs.baselines.inspect:inspect",
@@ -133,8 +174,30 @@ COMMANDS: dict[str, Command] = {
             "spike4dgs.baselines.initialization.dust3r:weights_path",
         ),
     ),
+    "download": Command(
+        "spike4dgs.benchmark.release.download.download_command:make_download",
+        "fetch the scenes of a track or a release, or parts of them",
+        "download outdoor-small --from https://example.org/spike4dgs/1 --out data",
+        needs=("spike4dgs.leaderboard.tracks:track_scenes",),
+    ),
+    "download weights": Command(
+        "spike4dgs.benchmark.release.download.weights_command:make_download_weights",
+        "fetch weight files of metrics and methods, their licences shown first",
+        "download weights lpips",
+        needs=("spike4dgs.baselines.initialization.dust3r:weight_file",),
+    ),
+    "release pack": Command(
+        "spike4dgs.benchmark.release.packing.release_commands:release_pack",
+        "pack scenes into a release that people can download",
+        "release pack data/car-0-small data/turntable-0-small --out releases/1",
+    ),
+    "release check": Command(
+        "spike4dgs.benchmark.release.packing.release_commands:release_check",
+        "check a release: a host's limits, its index, every byte",
+        "release check releases/1",
+    ),
     "verify": Command(
-        "spike4dgs.benchmark.scene.verify:verify",
+        "spike4dgs.benchmark.identity.verify:verify",
         "check every file of a scene against its manifest",
         "verify data/car-0-small",
     ),

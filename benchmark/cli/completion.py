@@ -28,12 +28,23 @@ def completion(shell: Positional[Shell]) -> int:
 
 def script(shell: Shell) -> str:
     """Return the completion script of a shell."""
-    first = {name: command.summary for name, command in COMMANDS.items()} | {"speed": SPEED_SUMMARY}
+    first = {name.partition(" ")[0]: command.summary for name, command in COMMANDS.items()} | {"speed": SPEED_SUMMARY}
     second = {
+        **verbs_of_two(),
         "speed": {name: command.summary for name, command in SPEED.items()},
         "completion": {name: f"the script for {name}" for name in ("bash", "zsh", "fish")},
     }
     return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](first, second)
+
+
+def verbs_of_two() -> dict[str, dict[str, str]]:
+    """Return the second words of the commands that have two, with their summaries, by the first."""
+    verbs: dict[str, dict[str, str]] = {}
+    for name, command in COMMANDS.items():
+        first, _, second = name.partition(" ")
+        if second:
+            verbs.setdefault(first, {})[second] = command.summary
+    return verbs
 
 
 def _bash(first: Words, second: Mapping[str, Words]) -> str:

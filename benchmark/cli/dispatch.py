@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import difflib
+import functools
 import importlib
 import inspect
 import sys
@@ -12,6 +15,9 @@ from typing import Any
 
 from spike4dgs.benchmark.cli.commands import COMMANDS, SPEED, SPEED_SUMMARY, Command
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.inputs.numbers import shown
+
+_MOST = 1e12  # of a number on the command line
 
 
 def load(name: str) -> Callable[..., Any]:
@@ -49,20 +55,62 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if name == "speed":
         return _speed(rest)
+    if verbs := {two: c for two, c in COMMANDS.items() if two.startswith(f"{name} ")}:
+        if rest and f"{name} {rest[0]}" in verbs:
+            name, rest = f"{name} {rest[0]}", rest[1:]
+        elif name not in COMMANDS:
+            return _verbs(name, rest, verbs)
     command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
 
     import tyro
 
     function = _load(command)
     return int(
-        tyro.cli(function, args=rest, prog=f"spike4dgs {name}", description=_description(function, command)) or 0
+        tyro.cli(_bounded(function), args=rest, prog=f"spike4dgs {name}", description=_description(function, command))
+        or 0
     )
+
+
+def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
+    """Show the verbs of a command of two words. Raises UserError for one that it has not."""
+    table = {two.removeprefix(f"{name} "): command for two, command in verbs.items()}
+    if rest and rest[0] not in ("-h", "--help"):
+        _find(rest[0], table, f"spike4dgs {name}")
+    print(_overview(f"spike4dgs {name}", table))
+    return 0
+
+
+def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity and 1e300."""
+
+    @functools.wraps(function)
+    def bounded(*args: Any, **kwargs: Any) -> Any:
+        for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
+            _check_numbers(f"--{name.replace('_', '-')}", value)
+        return function(*args, **kwargs)
+
+    return bounded
+
+
+def _check_numbers(option: str, value: Any) -> None:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            _check_numbers(f"{option}.{field.name.replace('_', '-')}", getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for item in value:
+            _check_numbers(option, item)
+    elif isinstance(value, int | float) and not abs(value) <= _MOST:
+        raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", shown(value), "correct it")
 
 
 def _speed(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview("spike4dgs speed", SPEED))
         return 0
+    for option, text in zip(arguments, arguments[1:], strict=False):
+        with contextlib.suppress(ValueError):
+            if not abs(float(text)) <= _MOST:
+                raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", text[:60], "correct it")
     return int(_load(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -14,7 +15,9 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.imports.found_camera import Distort, Float64, FoundCamera, check_size, make_camera
 from spike4dgs.benchmark.scene.writer import colmap_distortion
 
-_POINT_BYTES = 43  # at least, in points3D.bin
+_MOST_BYTES = 1 << 28  # of cameras or images, these with their points
+_CAMERA_BYTES = 48  # at least, in cameras.bin
+_POSE_BYTES, _POINT_BYTES = 64, 24  # in images.bin: before the name of an image, and of each of its points
 _SAME = 1e-9  # relative: images of one camera that have the same pose
 
 
@@ -29,11 +32,12 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
 
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise problem(folder, "a COLMAP model (cameras.bin or cameras.txt, ...)", "none", "give its folder: sparse/0")
-    _check_points(folder / "points3D.bin")
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        with tempfile.TemporaryDirectory() as lean:
+            _write_cameras_and_poses(folder, Path(lean))
+            model = pycolmap.Reconstruction(lean)
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as e:
-        raise problem(folder, "a whole COLMAP model", f"a damaged one ({e})", "export it again") from None
+        raise problem(folder, "a whole COLMAP model", f"a damaged one ({str(e)[:200]})", "export it again") from None
     found: dict[str, FoundCamera] = {}
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
         name, camera = _stream_of(image.name, names), model.cameras[image.camera_id]
@@ -47,13 +51,43 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
     return found
 
 
-def _check_points(path: Path) -> None:
-    """Raise UserError where the file is too small for its points: pycolmap would take memory for all that it claims."""
-    if path.is_file():
-        with open(path, "rb") as file:
-            count = int.from_bytes(file.read(8), "little")
-        if path.stat().st_size < 8 + _POINT_BYTES * count:
-            raise problem(path, f"{count} points", "a shorter file", "export the model again")
+def _write_cameras_and_poses(folder: Path, out: Path) -> None:
+    """Write a copy of a model without points, rigs and frames: a camera and a pose for each image.
+
+    pycolmap believes the numbers in a file: it would read on for hours, or take memory for points that are not there.
+    Raises ValueError where the files contradict themselves.
+    """
+    kind = "bin" if (folder / "cameras.bin").is_file() else "txt"
+    cameras, images = (folder / f"{name}.{kind}" for name in ("cameras", "images"))
+    if cameras.stat().st_size > _MOST_BYTES or images.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"more than {_MOST_BYTES} bytes of cameras or images")
+    data = cameras.read_bytes()
+    if kind == "bin" and len(data) < 8 + _CAMERA_BYTES * int.from_bytes(data[:8], "little"):
+        raise ValueError(f"{int.from_bytes(data[:8], 'little')} cameras in {len(data)} bytes")
+    (out / cameras.name).write_bytes(data)
+    poses = _binary_poses if kind == "bin" else _text_poses
+    (out / images.name).write_bytes(poses(images.read_bytes()))
+    (out / f"points3D.{kind}").write_bytes(bytes(8) if kind == "bin" else b"")
+
+
+def _binary_poses(data: bytes) -> bytes:
+    """Return the text of images.bin without the images' points."""
+    parts, at = [data[:8]], 8
+    for _ in range(int.from_bytes(data[:8], "little")):
+        end = data.find(b"\0", at + _POSE_BYTES) + 1  # of the name
+        count = int.from_bytes(data[end : end + 8], "little")
+        if end == 0 or (stop := end + 8 + _POINT_BYTES * count) > len(data):
+            raise ValueError("images.bin ends within an image")
+        data[at + _POSE_BYTES : end].decode()  # ValueError for a name that is none
+        parts.append(data[at:end] + bytes(8))
+        at = stop
+    return b"".join(parts)
+
+
+def _text_poses(data: bytes) -> bytes:
+    """Return the text of images.txt without the images' points: of every two lines the second is empty."""
+    lines = [line for line in data.decode().split("\n") if not line.startswith("#")]  # ValueError for other bytes
+    return "".join(line + "\n\n" for line in lines[::2] if line.strip()).encode()
 
 
 def _stream_of(image: str, names: Collection[str]) -> str:

@@ -9,6 +9,8 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.imports.camera_files import read_camera_files
+from spike4dgs.benchmark.inputs.names import check_ids
+from spike4dgs.benchmark.inputs.numbers import MAX_GAIN, MAX_HZ, MAX_SIDE
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.spikecv import write_recorded_scene
 from spike4dgs.benchmark.scene.writer import stream_name
@@ -53,10 +55,13 @@ def import_dat(
         rows_top_down: The files store the top row first. The usual order of this camera is bottom row first.
         licence: Licence of the recording.
     """
-    if rate_hz <= 0 or radiance_gain <= 0:
+    if not (0 < rate_hz <= MAX_HZ and 0 < radiance_gain <= MAX_GAIN):
         found = f"{rate_hz:g}, {radiance_gain:g}"
-        raise problem("--rate-hz and --radiance-gain", "positive numbers", found, "correct it")
+        raise problem("--rate-hz and --radiance-gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
+    if max(width, height) > MAX_SIDE:
+        raise problem("--width and --height", f"at most {MAX_SIDE}", f"{width}, {height}", "correct it")
     files = {file.stem: file for file in _dat_files(path)}
+    check_ids(files, "camera", path, "rename the .dat file, after which the camera is called")
     sources = {
         name: open_stream(file, width, height, rate_hz, rows_bottom_up=not rows_top_down)
         for name, file in files.items()

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.imports.found_camera import (
     CENTRE,
     FoundCamera,
@@ -17,8 +16,10 @@ from spike4dgs.benchmark.imports.found_camera import (
     make_camera,
     with_brown_lens,
 )
+from spike4dgs.benchmark.inputs.yaml_file import read_yaml
 from spike4dgs.benchmark.scene.cameras import Camera
 
+_WHAT = "Kalibr's camera chain"
 _KEYS = "camera_model, intrinsics, distortion_model, distortion_coeffs, resolution"
 _DISTORTIONS = ("none", "radtan", "equidistant")
 
@@ -26,8 +27,8 @@ _DISTORTIONS = ("none", "radtan", "equidistant")
 def is_camchain(path: Path) -> bool:
     """Return whether a YAML file looks like Kalibr's: a map of maps with `camera_model`."""
     try:
-        chain = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError):  # OpenCV's first line, %YAML:1.0, is no YAML
+        chain = read_yaml(path, _WHAT)
+    except UserError:  # OpenCV's first line, %YAML:1.0, is no YAML
         return False
     return isinstance(chain, dict) and any(isinstance(c, dict) and "camera_model" in c for c in chain.values())
 
@@ -38,7 +39,7 @@ def read_camchain(path: Path, size: tuple[int, int]) -> dict[str, FoundCamera]:
     `T_cn_cnm1` takes coordinates of the camera before to this one's. Raises UserError where the file lacks a value or
     has another camera model than the pinhole.
     """
-    chain: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    chain: dict[Any, Any] = read_yaml(path, _WHAT)
     found, w2c = {}, np.eye(4)
     for i, (name, entry) in enumerate(sorted(chain.items(), key=lambda item: (len(str(item[0])), str(item[0])))):
         try:

@@ -25,9 +25,9 @@ from spike4dgs.benchmark.scene.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
 IMAGE_TABLE = 6  # images from spikes: no method is fitted
-TRACKS = ("calibrated", "uncalibrated")  # are methods given the rig's poses?
+POSES = ("given", "estimated")  # are methods given the rig's poses?
 UNCALIBRATED_NOTE = (
-    "How the published rows got their poses is not stated: the same values stand here and in the calibrated track."
+    "How the published rows got their poses is not stated: the same values stand here and where the poses are given."
 )
 MEAN = "mean"  # column of rows that are published without their scenes
 ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics
@@ -66,10 +66,10 @@ class PublishedTable:
 
 
 @cache
-def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
-    """Return a table as published; in the track `uncalibrated` its rows are methods that estimate poses themselves.
+def published(number: int, poses: str = POSES[0]) -> PublishedTable:
+    """Return a table as published; with `poses` "estimated" its rows are methods that estimate them themselves.
 
-    Raises UserError for a number that is none of those in `published_tables.json`, and for a table without that track.
+    Raises UserError for a number that is none of those in `published_tables.json`, and for a table without such rows.
     """
     text = (package_files("spike4dgs.benchmark.reports") / "published_tables.json").read_text(encoding="utf-8")
     tables = json.loads(text)
@@ -82,21 +82,21 @@ def published(number: int, track: str = TRACKS[0]) -> PublishedTable:
     rows = {m: {w: tuple(v) for w, v in r.items()} for m, r in table["rows"].items()}
     worlds, splits = tuple(table["worlds"]), tuple(table.get("splits", ()))
     title, note = table["title"], table["note"]
-    if track != TRACKS[0]:
-        rows = _without_poses(number, track, rows, tables["uncalibrated"])
+    if poses != POSES[0]:
+        rows = _without_poses(number, poses, rows, tables["uncalibrated"])
         title, note = f"{title}, poses estimated", f"{note} {UNCALIBRATED_NOTE}"
     return PublishedTable(number, title, tables["source"], note, worlds, ids, names, rows, splits)
 
 
 def _without_poses(
-    number: int, track: str, rows: Mapping[str, Any], partners: Mapping[str, str | None]
+    number: int, poses: str, rows: Mapping[str, Any], partners: Mapping[str, str | None]
 ) -> dict[str, Any]:
-    """Return the rows of the track `uncalibrated`, each with the published values of its partner."""
-    if track not in TRACKS:
-        raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
+    """Return the rows whose poses are estimated, each with the published values of its partner."""
+    if poses not in POSES:
+        raise problem("--poses", f"one of {', '.join(POSES)}", repr(poses), "correct the name")
     if not set(partners.values()) - {None} <= set(rows):
         fix = "each of its rows states its own poses; use --table 1 or 2"
-        raise problem("--track", f"calibrated for table {number}", track, fix)
+        raise problem("--poses", f"given for table {number}", poses, fix)
     return {name: rows[partner] if partner else {} for name, partner in partners.items()}
 
 

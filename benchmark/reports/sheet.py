@@ -46,7 +46,7 @@ def write_sheet(path: Path, scene: Scene, folders: Mapping[str, Path], records: 
                 _show_reason(ax, name, f"{cell['status']}: {cell['error']}")
                 ax_below.axis("off")
                 continue
-            prediction = read_exr(folders[name] / f"{target.name}.exr")
+            prediction = read_exr(folders[name] / f"{target.name}.exr", truth.shape)
             _show(ax, prediction, moving)
             values = cell["per_image"][target.name]
             psnr, dynamic = METRICS["psnr"], METRICS["psnr_dynamic"]

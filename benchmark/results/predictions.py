@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_file, write_json, write_text, writing
+from spike4dgs.benchmark.files import MOST_BYTES, read_json, sha256_file, write_bytes, write_json, write_text, writing
 from spike4dgs.benchmark.scene.images import read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -35,17 +35,24 @@ _LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """The identity of a method. `trained_on` lists the data sets that learned parts were trained on (contamination)."""
+    """The identity of a method.
+
+    `trained_on` lists the data sets that learned parts were trained on (contamination), `given` what of `method.GIVEN`
+    it was given; None stands for all, and for older records.
+    """
 
     name: str
     version: str | None = None
     params: dict[str, Any] = field(default_factory=dict)
     seed: int | None = None
     trained_on: tuple[str, ...] = ()
+    given: tuple[str, ...] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {**asdict(self), "trained_on": list(self.trained_on)}
+        """Return plain values for JSON; without `given` where it is None."""
+        given = {} if self.given is None else {"given": list(self.given)}
+        rest = {k: v for k, v in asdict(self).items() if k != "given"}
+        return {**rest, "trained_on": list(self.trained_on), **given}
 
 
 @dataclass(frozen=True)
@@ -77,10 +84,13 @@ class Predictions:
     sums: dict[str, str]  # relative path -> sha256
     sha256: str  # of the text of SHA256SUMS
 
-    def read(self, target: Target) -> NDArray[np.float32]:
-        """Read the predicted radiance of a target [H, W]. Raises UserError where the file differs from SHA256SUMS."""
+    def read(self, target: Target, shape: tuple[int, int] | None = None) -> NDArray[np.float32]:
+        """Read the predicted radiance of a target [H, W].
+
+        Raises UserError where the file differs from SHA256SUMS, and where the image is not of that `shape` (if given).
+        """
         self._check(f"{target.name}.exr")
-        return read_exr(self.root / f"{target.name}.exr")
+        return read_exr(self.root / f"{target.name}.exr", shape)
 
     def verify(self) -> None:
         """Hash every image. Raises UserError at the first that differs from SHA256SUMS."""
@@ -117,7 +127,8 @@ def read_info(root: Path) -> PredictionInfo:
     schema = load_schema("spike4dgs.benchmark", "prediction.schema.json")
     check_schema(data, schema, root / INFO, "correct it (see the predictions module for the smallest valid one)")
     values = {k: v for k, v in data.items() if k not in ("schema", "method")}
-    method = {**data["method"], "trained_on": tuple(data["method"].get("trained_on", ()))}
+    lists = {key: tuple(data["method"][key]) for key in ("trained_on", "given") if key in data["method"]}
+    method = {**data["method"], **lists}
     return PredictionInfo(method=MethodInfo(**method), **values)
 
 
@@ -125,6 +136,8 @@ def _read_sums(path: Path) -> tuple[bytes, dict[str, str]]:
     fix = "write it with `sha256sum */*.exr > SHA256SUMS`"
     if not path.is_file():
         raise problem(path, "the hashes of the images", "no such file", fix)
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise problem(path, f"the hashes of the images, {MOST_BYTES} bytes at most", f"{size}", fix)
     data = path.read_bytes()
     sums: dict[str, str] = {}
     for number, line in enumerate(data.decode("utf-8", errors="replace").splitlines(), start=1):
@@ -170,6 +183,12 @@ class PredictionWriter:
         lines = [f"{sha256_file(self._part / name)}  {name}\n" for name in sorted(self._names)]
         write_text(self._part / SUMS, "".join(lines))
         write_json(self._part / INFO, {"schema": SCHEMA, **asdict(info), "method": info.method.as_dict()})
+        self._finished = True
+
+    def copy(self, files: Mapping[str, bytes]) -> None:
+        """Write the files of a whole predictions folder, by their paths in it, in place of `add` and `finish`."""
+        for name, data in files.items():
+            write_bytes(self._part / name, data)
         self._finished = True
 
     def __exit__(

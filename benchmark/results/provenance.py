@@ -10,8 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.inputs.names import check_ids
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio, to_nerfstudio
+from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +50,11 @@ class Provenance:
 
 
 def read_provenance(value: Mapping[str, Any], where: str, fix: str) -> Provenance:
-    """Read the values of `as_dict`. Raises UserError where one is missing or of another type."""
-    try:
-        cameras = tuple(from_nerfstudio(str(c["camera"]), c, where) for c in value["cameras"])
-        found = Provenance(**{**value, "cameras": cameras})
-        wrong = [k for k in ("rate_hz", "n_ticks", "radiance_gain") if not 0 < float(getattr(found, k)) < float("inf")]
-        if wrong or not cameras or not isinstance(found.method["name"], str):
-            raise ValueError(f"bad {wrong or 'cameras or method'}")
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
-        raise problem(where, "method, scene, cameras and clock of a fit", repr(e), fix) from None
-    return found
+    """Read the values of `as_dict`. Raises UserError where one is missing, of another type or out of bounds."""
+    check_schema(dict(value), load_schema("spike4dgs.benchmark", "provenance.schema.json"), where, fix)
+    cameras = tuple(from_nerfstudio(c["camera"], c, where) for c in value["cameras"])
+    check_ids([c.id for c in cameras], "camera", where, fix)
+    return Provenance(**{**value, "cameras": cameras})
 
 
 @runtime_checkable

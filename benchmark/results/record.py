@@ -115,8 +115,8 @@ def check_form(record: Record, where: str | Path) -> None:
 
 def check_method_name(name: str) -> None:
     """Raise UserError unless a method's name can be part of file names."""
-    schema = load_schema("spike4dgs.benchmark", "result.schema.json")["$defs"]["method"]["properties"]["name"]
-    if not re.fullmatch(schema["pattern"], name):
+    schema = load_schema("spike4dgs.benchmark", "common.schema.json")["$defs"]["method"]
+    if not re.search(schema["pattern"], name):
         raise problem("method", "a name of letters, digits and + . _ -", repr(name), "rename the method")
 
 
@@ -139,14 +139,14 @@ def with_later_metrics(record: Record) -> Record:
 
 def _check_metric_names(values: Values, where: str) -> None:
     if set(values) != set(METRICS):
-        found = ", ".join(sorted(set(values) ^ set(METRICS)))
+        found = ", ".join(sorted(set(values) ^ set(METRICS)))[:200]
         raise problem(where, "exactly the metrics of the table", f"unknown or missing: {found}", _AGAIN)
 
 
 def _check_computed(cell: Cell, where: str) -> None:
     """Raise UserError for values of metrics that were not computed, and for metrics without value or note."""
     if unknown := sorted(cell["computed"].keys() - METRICS.keys()):
-        raise problem(where, "computed metrics of the table", ", ".join(unknown), _AGAIN)
+        raise problem(where, "computed metrics of the table", ", ".join(unknown)[:200], _AGAIN)
     for metric, sha256 in cell["computed"].items():
         weights = METRICS[metric].weights
         if (weights is None) != (sha256 is None) or (weights and weights.sha256 not in (None, sha256)):

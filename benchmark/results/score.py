@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -57,13 +57,16 @@ def score_scene(predictions: Predictions, scene: Scene, selection: Selection, wi
     }
 
 
-def open_for(root: Path, scene: Scene) -> Predictions:
-    """Open a predictions folder and check that it was made for this revision and split of this scene."""
+def open_for(root: Path, scene: Scene, fitted: Mapping[str, str] | None = None) -> Predictions:
+    """Open a predictions folder and check that it was made for this revision and split of this scene.
+
+    `fitted`: scene id -> revision of its training part, where methods were given that instead of the whole scene.
+    """
     predictions = open_predictions(root, targets_of(scene))
     info = predictions.info
     for what, found, expected in (
         ("scene", info.scene, scene.id),
-        ("scene revision", info.scene_revision, scene.revision),
+        ("scene revision", info.scene_revision, (fitted or {}).get(scene.id, scene.revision)),
         ("split", info.split or scene.meta["default_split"], scene.split),
     ):
         if found is not None and found != expected:
@@ -100,12 +103,12 @@ def _pairs(
 
 def _read(predictions: Predictions, scene: Scene, target: Target, compare: bool) -> tuple[Image, Image, Mask]:
     """Read and check a target's truth, prediction and moving region; without `compare` the truth is NaN."""
-    image, where = predictions.read(target), f"{predictions.root / target.name}.exr"
+    camera, where = scene.cameras[target.camera], f"{predictions.root / target.name}.exr"
+    image = predictions.read(target, (camera.height, camera.width))
     if compare:
         truth, moving = scene.ground_truth(target), scene.moving(target)
         check_images(truth, image, moving, where)
         return truth, image, moving
-    camera = scene.cameras[target.camera]
     nothing = np.zeros((camera.height, camera.width), np.float32)
     check_images(nothing, image, nothing > 0, where)
     return nothing * np.nan, image, nothing > 0
@@ -121,12 +124,17 @@ def prediction_folders(root: Path, scenes: Sequence[Scene]) -> dict[str, Path]:
     return {s.id: root / s.id for s in scenes}
 
 
-def score_predictions(root: Path | str, scenes: Sequence[Scene], selection: Selection | None = None) -> Record:
+def score_predictions(
+    root: Path | str,
+    scenes: Sequence[Scene],
+    selection: Selection | None = None,
+    fitted: Mapping[str, str] | None = None,
+) -> Record:
     """Score one method's predictions on several scenes and return the result record.
 
     `root` holds one predictions folder per scene id; for a single scene it may be that folder. Without `selection` all
-    metrics that this machine can compute are computed. A scene without a folder counts as skipped. Raises UserError for
-    bad predictions, and where the folders are of different methods.
+    metrics that this machine can compute are computed. A scene without a folder counts as skipped; `fitted` is as for
+    `open_for`. Raises UserError for bad predictions, and where the folders are of different methods.
     """
     root, selection = Path(root), selection or select_metrics()
     if not root.is_dir():
@@ -138,7 +146,7 @@ def score_predictions(root: Path | str, scenes: Sequence[Scene], selection: Sele
     for scene_id, folder in prediction_folders(root, scenes).items():
         scene = next(s for s in scenes if s.id == scene_id)
         if folder.is_dir():
-            predictions = open_for(folder, scene)
+            predictions = open_for(folder, scene, fitted)
             cells[scene_id] = score_scene(predictions, scene, selection)
             methods[scene_id] = predictions.info.method
         else:

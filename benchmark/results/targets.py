@@ -29,5 +29,5 @@ def targets_of(scene: Scene) -> tuple[Target, ...]:
 
 
 def has_truth(scene: Scene) -> bool:
-    """Return whether the scene has ground truth: it then lists targets."""
-    return bool(scene.targets)
+    """Return whether the scene has ground truth. One that lists targets may keep their images back."""
+    return any(f"images/{t.name}.exr" in scene.manifest.files for t in scene.targets)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,13 +26,14 @@ from spike4dgs.benchmark.environment import (
 )
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
-from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Progress, check_protocol
+from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Progress, check_protocol, training_for
 from spike4dgs.benchmark.results.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.results.provenance import Provenance, Savable
 from spike4dgs.benchmark.results.record import PROTOCOL
 from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
+from spike4dgs.benchmark.weights import WeightsError
 
 
 @dataclass(frozen=True)
@@ -49,20 +51,25 @@ class Job:
         """The method as records name it."""
         m = self.method
         version = getattr(m, "version", None) or harness()["version"]
-        return MethodInfo(m.name, version, dict(m.params), self.seed, tuple(getattr(m, "trained_on", ())))
+        given = None if (found := getattr(m, "given", None)) is None else tuple(found)
+        return MethodInfo(m.name, version, dict(m.params), self.seed, tuple(getattr(m, "trained_on", ())), given)
 
     @property
     def variants(self) -> tuple[MethodInfo, ...]:
-        """The method as it is, and with refined held-out cameras where it asks for that: one record each."""
+        """The method as it is, and with refined held-out cameras where it asks for that: one record each.
+
+        Refinement needs the held-out cameras' streams.
+        """
         refined = replace(self.info, name=self.method.name + SUFFIX)
-        return (self.info, refined) if getattr(self.method, "refines_views", False) else (self.info,)
+        has_streams = set(self.scene.test) <= set(self.scene.meta["streams"])
+        return (self.info, refined) if getattr(self.method, "refines_views", False) and has_streams else (self.info,)
 
     @property
     def key(self) -> str:
         """The content key under which predictions are found again."""
         return sha256_json(
             {
-                "method": self.info.as_dict(),
+                "method": replace(self.info, given=None).as_dict(),
                 "harness": harness()["version"],
                 "scene": self.scene.id,
                 "revision": self.scene.revision,
@@ -86,6 +93,23 @@ def is_done(job: Job, folder: Path) -> bool:
     return predictions.info.key == job.key
 
 
+@dataclass(frozen=True)
+class Failure:
+    """The end of a cell without predictions."""
+
+    status: str  # failed or skipped
+    reason: str
+    traceback: str
+
+
+def failure_of(error: Exception) -> Failure:
+    """Return the failure that an exception means. Call it where the exception is handled."""
+    if isinstance(error, WeightsError):
+        return Failure("skipped", error.reason, traceback.format_exc())  # records travel: no paths of this machine
+    reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return Failure("failed", reason, traceback.format_exc())
+
+
 def run_job(
     job: Job, folders: Sequence[Path], model_path: Path, work: Path, progress: Progress, note: Callable[[str], None]
 ) -> None:
@@ -95,7 +119,7 @@ def run_job(
     held-out cameras appear only in the calls to render, and refined ones are found after the fit.
     """
     request = FitRequest(job.budget, job.device, job.seed, progress)
-    model, fit_seconds = timed_fit(job.method, job.scene.training, request, work, note)
+    model, fit_seconds = timed_fit(job.method, training_for(job.method, job.scene.training), request, work, note)
     if isinstance(model, Savable):
         model.save(model_path, _provenance(job, fit_seconds))
     cameras = job.scene.cameras

@@ -36,19 +36,23 @@ class RunDisplay:
     def __exit__(self, *_: object) -> None:
         self._bars.stop()
 
+    def say(self, text: str) -> None:
+        """Print one line."""
+        self._console.print(text, highlight=False, markup=False)
+
     @contextmanager
     def cell(self, title: str) -> Iterator[ShownCell]:
         """Show one cell, and yield the callables to which it reports."""
         task = self._bars.add_task(title, total=None)
         label = f"[{self._done + 1}/{self._cells}] {title}"
-        self._console.print(label, highlight=False, markup=False)
+        self.say(label)
 
         def progress(done: int, total: int, note: str = "") -> None:
             self._bars.update(task, completed=done, total=total, description=f"{title} {note}")
             self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
 
         def note(text: str) -> None:
-            self._console.print(f"    {text}", highlight=False, markup=False)
+            self.say(f"    {text}")
 
         yield ShownCell(progress, note)
         self._done += 1

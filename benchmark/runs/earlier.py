@@ -16,13 +16,14 @@ from spike4dgs.benchmark.scene.scene import Scene
 
 
 def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return the other records in `folder` on the same scenes, revisions and split, oldest first; and what is left out.
+    """Return the records of other methods in a run's `folder` on the same scenes, revisions and split, oldest first.
 
-    What is left out is a file name and a reason each: other scenes, or no record that this version reads.
+    All seeds of a method come together. Also return what is left out, a file name and a reason each: other scenes, or
+    no record that this version reads.
     """
     names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
     found, left_out = [], []
-    for path in sorted(folder.glob("*.json")):
+    for path in sorted([*folder.glob("results/*.json"), *folder.glob("seed-*/results/*.json")]):
         if path.stem in names:
             continue
         try:
@@ -34,7 +35,21 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
             found.append(record)
         else:
             left_out.append(f"{path}: other scenes, revisions or split")
-    return sorted(found, key=lambda r: (r["created"], r["method"]["name"])), left_out
+    first: dict[str, str] = {}
+    for record in found:
+        name, created = record["method"]["name"], str(record["created"])
+        first[name] = min(created, first.get(name, created))
+
+    def order(record: Record) -> tuple[str, str, int]:
+        method = record["method"]
+        return first[method["name"]], method["name"], method["seed"] or 0
+
+    return sorted(found, key=order), left_out
+
+
+def of_one_seed(records: Sequence[Record]) -> list[Record]:
+    """Return the first record of each method, for images that show one."""
+    return list({r["method"]["name"]: r for r in reversed(records)}.values())[::-1]
 
 
 def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
@@ -49,7 +64,7 @@ def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
 
 
 def write_results(path: Path, records: Sequence[Record]) -> None:
-    """Write a tidy CSV file: a row for each method and scene, a column for each metric and cost."""
+    """Write a tidy CSV file: a row for each method, seed and scene, a column for each metric and cost."""
     out = io.StringIO()
     writer = csv.DictWriter(out, SCENE_COLUMNS, lineterminator="\n")
     writer.writeheader()

@@ -1,7 +1,7 @@
-"""Executors run tasks in this process, in several, or on a cluster, with the same results in the same order.
+"""Executors run tasks in this process, in several, or on a cluster, with the same results.
 
 An executor is a function `run(task, chunks)` that yields `task(chunk)` for every chunk, in order. The task travels to
-each worker once.
+each worker once. One of `unordered_executor` yields each result as soon as it is there, with its chunk's position.
 """
 
 from __future__ import annotations
@@ -9,18 +9,20 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 
 C = TypeVar("C")
 R = TypeVar("R")
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
+RunUnordered = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+WORKERS_DIED = "workers died"  # the result of a chunk that a cluster gives up
 _CONNECT_S = 10
 _task: Callable[[Any], Any] | None = None  # of a worker process
 
@@ -32,15 +34,36 @@ def executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Run]:
     Raises UserError for fewer than one worker, for both at once, where distributed is not installed, where the
     scheduler does not answer within 10 s or has no workers, and, while running, where a worker process dies.
     """
-    if workers < 1:
-        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
+    _check(workers, scheduler)
     if scheduler is None:
         yield here if workers == 1 else lambda task, chunks: _in_processes(task, chunks, workers)
-    elif workers != 1:
-        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
     else:
-        with _cluster(scheduler) as run:
-            yield run
+        with _cluster(scheduler) as client:
+            yield lambda task, chunks: _on_cluster(client, task, chunks)
+
+
+@contextmanager
+def unordered_executor(workers: int, scheduler: str | None) -> Iterator[RunUnordered]:
+    """Yield the executor for `workers` processes or a scheduler that gives each result as soon as it is there.
+
+    Results are pairs of a chunk's position and `task(chunk)`. A cluster runs the chunk of a lost worker again
+    elsewhere; one that loses several workers has the result WORKERS_DIED. Raises UserError as `executor` does, and,
+    while running, where the scheduler is lost.
+    """
+    _check(workers, scheduler)
+    if scheduler is None:
+        with _pool(None, workers) as pool:
+            yield lambda task, chunks: _as_ended({pool.submit(task, chunk): k for k, chunk in enumerate(chunks)})
+    else:
+        with _cluster(scheduler) as client:
+            yield lambda task, chunks: _as_arrived(client, _submit_with_task(client, task, chunks))
+
+
+def _check(workers: int, scheduler: str | None) -> None:
+    if workers < 1:
+        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
+    if scheduler is not None and workers != 1:
+        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
 
 
 def here(task: Callable[[C], R], chunks: Iterable[C]) -> Iterator[R]:
@@ -54,11 +77,21 @@ def chunked(items: Sequence[int], most: int = 16) -> list[list[int]]:
 
 
 def _in_processes(task: Callable[[C], R], chunks: Sequence[C], workers: int) -> Iterator[R]:
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
-    arguments = (task, threads, os.getpid())
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker, initargs=arguments)
-    try:
+    with _pool(task, workers) as pool:
         yield from _ordered([pool.submit(_work, chunk) for chunk in chunks])
+
+
+def _as_ended(futures: Mapping[Future[R], int]) -> Iterator[tuple[int, R]]:
+    return ((futures[future], future.result()) for future in as_completed(futures))
+
+
+@contextmanager
+def _pool(task: Callable[[Any], Any] | None, workers: int) -> Iterator[ProcessPoolExecutor]:
+    context = get_context("spawn")
+    arguments = (task, context.Value("i", 0), workers, os.getpid())
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
+    try:
+        yield pool
     except BrokenProcessPool:
         fix = "run the same command again, with fewer --workers if memory ran out"
         raise problem("a worker process", "that it ends its task", "it died (out of memory, or killed)", fix) from None
@@ -75,13 +108,19 @@ def _ordered(futures: list[Future[R]]) -> Iterator[R]:
         yield futures.pop().result()
 
 
-def _start_worker(task: Callable[[Any], Any], threads: int, parent: int) -> None:
+def _start_worker(task: Callable[[Any], Any] | None, started: Any, workers: int, parent: int) -> None:
+    """Take this worker's share of the cores, which libraries ask for as they load, and keep the task."""
     global _task
     _task = task
     threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
+    with started.get_lock():
+        index, started.value = started.value, started.value + 1
+    cores = sorted(os.sched_getaffinity(0))
+    share = cores[index % len(cores) :: workers]
+    os.sched_setaffinity(0, share)
     import drjit
 
-    drjit.set_thread_count(threads)
+    drjit.set_thread_count(len(share))
 
 
 def _die_with(parent: int) -> None:
@@ -97,7 +136,8 @@ def _work(chunk: Any) -> Any:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Run]:
+def _cluster(address: str) -> Iterator[Any]:
+    """Yield the client of a scheduler that has workers."""
     try:
         from distributed import Client
     except ImportError:
@@ -114,7 +154,7 @@ def _cluster(address: str) -> Iterator[Run]:
     with client:
         if not client.scheduler_info()["workers"]:
             raise problem("--scheduler", f"workers at {address}", "none", "start some: dask worker ADDRESS")
-        yield lambda task, chunks: _on_cluster(client, task, chunks)
+        yield client
 
 
 def _on_cluster(client: Any, task: Callable[[C], R], chunks: Sequence[C]) -> Iterator[R]:
@@ -123,6 +163,33 @@ def _on_cluster(client: Any, task: Callable[[C], R], chunks: Sequence[C]) -> Ite
     futures.reverse()
     while futures:  # a result is dropped on the cluster as soon as it is here
         yield futures.pop().result()
+
+
+def _submit_with_task(client: Any, task: Callable[[C], R], chunks: Sequence[C]) -> dict[Any, int]:
+    """Submit every chunk with the task: a task that lies on the workers would be lost with the last of them."""
+    return {client.submit(task, chunk, pure=False, priority=-k): k for k, chunk in enumerate(chunks)}
+
+
+def _as_arrived(client: Any, futures: dict[Any, int]) -> Iterator[tuple[int, Any]]:
+    from distributed import KilledWorker
+    from distributed import as_completed as arriving
+
+    for future in arriving(list(futures), loop=client.loop):  # type: ignore[no-untyped-call]
+        k = futures.pop(future)
+        try:
+            result = future.result()
+        except KilledWorker:
+            result = WORKERS_DIED
+        except CancelledError:
+            fix = "give the same command again once it runs: what has come back is kept"
+            raise problem("--scheduler", "a scheduler that runs to the end", "a lost connection", fix) from None
+        except UserError:
+            raise
+        except Exception as e:  # such as code that is not installed there
+            fix = "see its log; the scheduler and all workers need the packages that are here"
+            raise problem("a worker", "that it ends its task", f"{type(e).__name__}: {e}", fix) from e
+        del future  # the cluster drops the result
+        yield k, result
 
 
 def _call(task: Callable[[C], R], chunk: C) -> R:

@@ -1,22 +1,26 @@
-"""Run methods on scenes: every method on every scene, a result record for each method.
+"""Run methods on scenes: every method on every scene with every seed, a result record for each method and seed.
 
 OUT/predictions/METHOD/SCENE/   the rendered images; a later run resumes by their content key alone
 OUT/models/METHOD/SCENE.safetensors   the fitted model, for `render` and `view`
 OUT/results/METHOD.json         the result records, scored from those files
 OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
 OUT/work/KEY/                   the checkpoint of an unfinished fit
+OUT/seed-K/                     the same for each further seed K
+
+Cells are fitted here one after another, or by processes or the workers of a cluster in any order. This process writes
+and scores everything.
 """
 
 from __future__ import annotations
 
-import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from uuid import uuid4
 
 from rich.console import Console
 
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.method import Budget, Method
@@ -25,10 +29,11 @@ from spike4dgs.benchmark.reports.console import cell_summary
 from spike4dgs.benchmark.results.record import Cell, Record, build_record, check_method_name, missing_cell, write_record
 from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.results.score import open_for, score_scene
-from spike4dgs.benchmark.runs.cell import Job, is_done, run_job
-from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job
+from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell
+from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
+from spike4dgs.benchmark.runs.remote_cell import SharedFolder, fit_order, make_order, store
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.weights import WeightsError
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,13 @@ class Settings:
     device: str = "cpu"
     budget: Budget = Budget()
     metrics: tuple[str, ...] = (AUTO,)
+    seeds: int = 1  # seed, seed + 1, ...
+    workers: int = 1
+    scheduler: str | None = None
+
+    def folder(self, seed: int) -> Path:
+        """Return the folder that keeps what comes of a seed."""
+        return self.out if seed == self.seed else self.out / f"seed-{seed}"
 
 
 def predictions_folder(out: Path, method: str, scene: str) -> Path:
@@ -47,61 +59,173 @@ def predictions_folder(out: Path, method: str, scene: str) -> Path:
     return out / "predictions" / method / scene
 
 
+@dataclass(frozen=True)
+class Place:
+    """A job, and where a run keeps what comes of it."""
+
+    job: Job
+    out: Path
+
+    @property
+    def title(self) -> str:
+        """The cell as people read it."""
+        return f"{self.job.method.name} on {self.job.scene.id}, seed {self.job.seed}"
+
+    @property
+    def folders(self) -> list[Path]:
+        """The predictions folders of the job's variants."""
+        return [predictions_folder(self.out, variant.name, self.job.scene.id) for variant in self.job.variants]
+
+    @property
+    def model(self) -> Path:
+        """The file of the fitted model."""
+        return self.out / "models" / self.job.method.name / f"{self.job.scene.id}.safetensors"
+
+    @property
+    def work(self) -> Path:
+        """The folder of the checkpoint."""
+        return self.out / "work" / self.job.key[:16]
+
+    @property
+    def log(self) -> Path:
+        """The file for the traceback of a failure."""
+        return self.out / "logs" / f"{self.job.method.name}__{self.job.scene.id}.log"
+
+    def is_done(self) -> bool:
+        """Return whether all predictions are there, whole and undamaged."""
+        return all(is_done(self.job, folder) for folder in self.folders)
+
+
 def run_matrix(
     scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings, console: Console
 ) -> list[Record]:
-    """Run, or resume, every method on every scene, and score everything from the files. Return a record per method.
+    """Run, or resume, every method on every scene with every seed, and score everything from the files.
 
-    A cell that fails does not stop the others: its reason is in the record and its traceback in a log file.
-    Raises UserError for scenes that are damaged or given twice, before any work begins.
+    Return a record per seed and method, in this order. A cell that fails does not stop the others: its reason is in the
+    record and its traceback in a log file. Raises UserError for scenes that are damaged or given twice, before any work
+    begins, and where the cluster cannot go on.
     """
     if len({s.id for s in scenes}) < len(scenes):
         raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    if settings.seeds < 1:
+        raise problem("--seeds", "a number from 1 up", str(settings.seeds), "correct it")
     for method in methods:
         check_method_name(method.name)
     for scene in scenes:
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
-    records = []
+    places = [
+        Place(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed))
+        for seed in range(settings.seed, settings.seed + settings.seeds)
+        for method in methods
+        for scene in scenes
+    ]
+    found: dict[int, list[Cell]] = {}
+    records: dict[int, list[Record]] = {}
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(console, len(scenes) * len(methods)) as display,
+        RunDisplay(console, len(places)) as display,
     ):
-        for method in methods:
-            jobs = [Job(method, scene, settings.seed, settings.device, settings.budget) for scene in scenes]
-            rows = [_run_cell(job, selection, settings.out, display) for job in jobs]
-            for info, cells in zip(jobs[0].variants, zip(*rows, strict=True), strict=True):
-                by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
-                record = build_record(info, scenes, by_scene, settings.device)
-                write_record(settings.out / "results" / f"{info.name}.json", record)
-                records.append(record)
-    return records
+        for k, cells in _run_cells(places, settings, selection, display):
+            found[k] = cells
+            first = k - k % len(scenes)  # of the cells of one record
+            if all(n in found for n in range(first, first + len(scenes))):
+                rows = [found[first + n] for n in range(len(scenes))]
+                records[first] = _write_records(places[first], scenes, rows, settings)
+    return [record for first in sorted(records) for record in records[first]]
 
 
-def _run_cell(job: Job, selection: Selection, out: Path, display: RunDisplay) -> list[Cell]:
-    """Run or resume a job, and return the cells of its variants."""
-    folders = [predictions_folder(out, variant.name, job.scene.id) for variant in job.variants]
-    log = out / "logs" / f"{job.method.name}__{job.scene.id}.log"
-    with display.cell(f"{job.method.name} on {job.scene.id}") as shown:
+def _run_cells(
+    places: Sequence[Place], settings: Settings, selection: Selection, display: RunDisplay
+) -> Iterator[tuple[int, list[Cell]]]:
+    """Run or resume the cells, here or by workers. Yield their positions and the cells of their variants."""
+    if settings.workers == 1 and settings.scheduler is None:
+        for k, place in enumerate(places):
+            with display.cell(place.title) as shown:
+                yield k, _settle(place, _fit_here(place, shown), selection, shown)
+    else:
+        with unordered_executor(settings.workers, settings.scheduler) as run:
+            yield from _spread(places, settings.out, run, selection, display)
+
+
+def _fit_here(place: Place, shown: ShownCell) -> Failure | None:
+    try:
+        if place.is_done():
+            shown.note("predictions are there: scored from the files")
+        else:
+            run_job(place.job, place.folders, place.model, place.work, shown.progress, shown.note)
+    except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
+        return failure_of(e)
+    return None
+
+
+def _spread(
+    places: Sequence[Place], out: Path, run: RunUnordered, selection: Selection, display: RunDisplay
+) -> Iterator[tuple[int, list[Cell]]]:
+    """Fit by workers. While they work, the cells that need none are scored."""
+    folder = SharedFolder(out.absolute(), uuid4().hex)
+    write_text(folder.token_file, folder.token)
+    settled: dict[int, Failure | None] = {}
+    orders = {}
+    for k, place in enumerate(places):
         try:
-            if all(is_done(job, folder) for folder in folders):
+            if place.is_done():
+                settled[k] = None
+            else:
+                orders[k] = make_order(place.job, folder, place.work)
+        except Exception as e:  # a method that cannot travel
+            settled[k] = failure_of(e)
+    arrivals = run(fit_order, list(orders.values()))
+    display.say(f"{len(orders)} cells go to workers and appear as they come back")
+    for k, failure in settled.items():
+        with display.cell(places[k].title) as shown:
+            if failure is None:
                 shown.note("predictions are there: scored from the files")
-            else:
-                model = out / "models" / job.method.name / f"{job.scene.id}.safetensors"
-                run_job(job, folders, model, out / "work" / job.key[:16], shown.progress, shown.note)
-            cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in folders]
+            yield k, _settle(places[k], failure, selection, shown)
+    sent = list(orders)
+    for position, result in arrivals:
+        k = sent[position]
+        with display.cell(places[k].title) as shown:
+            if result == WORKERS_DIED:
+                result = Failure("failed", "its workers died one after another (out of memory?)", WORKERS_DIED)
+            if not isinstance(result, Failure):
+                store(result, places[k].folders, places[k].model)
+                for line in result.notes:
+                    shown.note(line)
+            failure = result if isinstance(result, Failure) else None
+            yield k, _settle(places[k], failure, selection, shown)
+
+
+def _settle(place: Place, failure: Failure | None, selection: Selection, shown: ShownCell) -> list[Cell]:
+    """Score what a cell left, or write why there is nothing. Return the cells of the job's variants."""
+    job, log = place.job, place.log
+    if failure is None:
+        try:
+            cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in place.folders]
             log.unlink(missing_ok=True)
-        except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
-            write_text(log, traceback.format_exc())
-            if isinstance(e, WeightsError):
-                missing = missing_cell("skipped", e.reason)  # records travel: no paths of this machine
-            else:
-                reason = str(e) if isinstance(e, UserError) else f"{type(e).__name__}: {e}"
-                missing = missing_cell("failed", f"{reason} (see logs/{log.name})"[:2000])
-            cells = [missing] * len(folders)
-        for variant, cell in zip(job.variants, cells, strict=True):
-            shown.note(f"{'' if variant == job.info else SUFFIX[1:] + ': '}{cell_summary(cell)}")
+        except Exception as e:  # such as damaged images
+            failure = failure_of(e)
+    if failure is not None:
+        write_text(log, failure.traceback)
+        seen = f" (see logs/{log.name})" if failure.status == "failed" else ""
+        cells = [missing_cell(failure.status, f"{failure.reason}{seen}"[:2000])] * len(job.variants)
+    for variant, cell in zip(job.variants, cells, strict=True):
+        shown.note(f"{'' if variant == job.info else SUFFIX[1:] + ': '}{cell_summary(cell)}")
     return cells
+
+
+def _write_records(
+    place: Place, scenes: Sequence[Scene], rows: Sequence[Sequence[Cell]], settings: Settings
+) -> list[Record]:
+    """Write the records of a method's variants with the seed of `place`; `rows` has their cells of each scene."""
+    records = []
+    device = settings.device if settings.scheduler is None else "cpu"  # of this process, which scored
+    for info, cells in zip(place.job.variants, zip(*rows, strict=True), strict=True):
+        by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
+        record = build_record(info, scenes, by_scene, device)
+        write_record(place.out / "results" / f"{info.name}.json", record)
+        records.append(record)
+    return records
 
 
 def _check_inputs(scene: Scene) -> None:

@@ -1,7 +1,8 @@
 """`run-benchmark`: run methods on scenes, then write the table, the sheets and the leaderboard's entries.
 
 Besides what `run` keeps, OUT has results.csv, sheet_SCENE.png, scatter.png, leaderboard/ and, for a table of the paper,
-table.*. Records that earlier runs left in OUT/results on the same scenes are in all of these.
+table.*. Records that earlier runs left in OUT on the same scenes are in all of these. Images and tables of the paper
+show the first seed; results.csv and the leaderboard have all of them.
 A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 
 Submitting a record and measuring images from spikes are the work of other rooms, which this one does not import: the
@@ -23,14 +24,16 @@ from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Method, find_methods, make_budget
 from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.release.download.download_command import From
+from spike4dgs.benchmark.release.download.track import track_folders
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
-from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, TRACKS, PublishedTable, published, table_scenes
+from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
 from spike4dgs.benchmark.reports.scatter import write_scatter
 from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.results.record import Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
-from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, write_results
+from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results
 from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 
@@ -57,18 +60,24 @@ class RunBenchmark:
 
     submit: Submit
     measure_images: Callable[[Sequence[str]], int]  # the command line of `speed images`, which makes table 6
+    track_scenes: Callable[[str], dict[str, str]]  # the revisions of a track's scenes by their ids
 
     def run_benchmark(
         self,
         scenes: Positional[tuple[Path, ...]] = (),
         *,
         table: int | None = None,
-        track: str = TRACKS[0],
+        poses: str = POSES[0],
+        track: str | None = None,
+        source: From = None,
         data: Path = Path("data"),
         profile: str = "small",
         methods: tuple[str, ...] = (),
         out: Path = Path("runs/benchmark"),
         seed: int = 0,
+        seeds: int = 1,
+        workers: int = 1,
+        scheduler: str | None = None,
         device: str = "auto",
         budget: str = "quick",
         metrics: tuple[str, ...] = (AUTO,),
@@ -85,14 +94,21 @@ class RunBenchmark:
             scenes: Scene folders.
             table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
                 (number of views; plotted in views.png), 6 (images from spikes), 7 (MSDI without SPSS).
-            track: Of table 1 or 2: calibrated (methods are given the rig's poses) or uncalibrated (each estimates its
-                own).
-            data: Folder of the table's scenes.
+            poses: Of table 1 or 2: given (methods get the rig's poses) or estimated (each estimates its own).
+            track: Instead of scenes, a track such as outdoor-small: its scenes in DATA; those that are missing are
+                downloaded.
+            source: Where the release with the track's scenes lies; SPIKE4DGS_RELEASE if left out.
+            data: Folder of the table's or track's scenes.
             profile: Profile of the table's scenes.
             methods: Methods by name; all that are installed, or all rows of the table, if left out.
             out: Folder for predictions, results, images and logs; for another split than the default, OUT/SPLIT is.
             seed: Seed that every fit gets.
-            device: auto, cpu or cuda.
+            seeds: Number of seeds, from that one up. The table shows means over them; what belongs to a further seed K
+                is in OUT/seed-K.
+            workers: Processes that fit, each on its share of this machine's cores.
+            scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers fit. They read the scenes
+                at the same paths.
+            device: auto, cpu or cuda. auto looks at this machine, also for the workers of a scheduler.
             budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
             metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
                 error are always computed.
@@ -101,18 +117,22 @@ class RunBenchmark:
             replace: Replace entries of the same name in that leaderboard.
             allow_gaps: Accept recordings with gaps.
         """
-        if track != TRACKS[0] and table in (None, IMAGE_TABLE):
+        if poses != POSES[0] and table in (None, IMAGE_TABLE):
             fix = "without a table, name the methods, such as tfp+colmap+4dgs"
-            raise problem("--track", "--table 1 or 2 beside it", f"--table {table}" if table else "no table", fix)
+            raise problem("--poses", "--table 1 or 2 beside it", f"--table {table}" if table else "no table", fix)
         if table == IMAGE_TABLE:
             return self._measure_images(scenes, data, profile, out, allow_gaps)
-        paper = None if table is None else published(table, track)
+        paper = None if table is None else published(table, poses)
         if paper and scenes:
             raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
+        if track is not None:
+            scenes = self._track_folders(track, scenes, table, data, source)
         scenes = table_scenes(paper, data, profile) if paper else scenes
         chosen = _choose_methods(methods, paper)
-        device = choose_device(device, rasterizes=any(getattr(m, "rasterizes", True) for m in chosen))
-        console, common = make_console(), (seed, device, make_budget(budget), metrics)
+        if scheduler is None or device == "auto":
+            device = choose_device(device, rasterizes=any(getattr(m, "rasterizes", True) for m in chosen))
+        console = make_console()
+        common = (seed, device, make_budget(budget), metrics, seeds, workers, scheduler)
         splits = paper.splits if paper and paper.splits and split is None else (split,)
         runs, submissions = [], []
         for name in splits:
@@ -120,16 +140,16 @@ class RunBenchmark:
             folder = out / name if name and not all(s.is_default_split for s in opened) else out
             settings = Settings(folder, *common)
             records = run_matrix(opened, chosen, settings, console)
-            earlier, left_out = earlier_records(folder / "results", records)
+            earlier, left_out = earlier_records(folder, records)
             for line in left_out:
                 _say(console, f"not in the table: {line}")
             console.print(results_table([*earlier, *records]))
-            write_images(opened, [*earlier, *records], folder)
+            write_images(opened, of_one_seed([*earlier, *records]), folder)
             write_results(folder / "results.csv", [*earlier, *records])
             _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png; values: {folder}/results.csv")
             submissions.append((records, settings))
             rows = paper.rows if paper else ()
-            runs.append((opened, [*(r for r in earlier if plain_name(r) in rows), *records]))
+            runs.append((opened, of_one_seed([*(r for r in earlier if plain_name(r) in rows), *records])))
         if paper:
             folder = out if len(runs) > 1 else folder
             worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
@@ -143,6 +163,15 @@ class RunBenchmark:
         if failed:
             print(f"failed: {', '.join(failed)}", file=sys.stderr)
         return 1 if failed or any(refused) else 0
+
+    def _track_folders(
+        self, track: str, scenes: tuple[Path, ...], table: int | None, data: Path, source: str | None
+    ) -> tuple[Path, ...]:
+        """Return the scene folders of a track; what is missing is downloaded."""
+        if scenes or table is not None:
+            found = str(scenes[0]) if scenes else f"--table {table}"
+            raise problem("--track", "neither scenes nor a table beside it", found, "use --data for the folder")
+        return track_folders(self.track_scenes(track), data, source)
 
     def _measure_images(self, scenes: tuple[Path, ...], data: Path, profile: str, out: Path, allow_gaps: bool) -> int:
         """Make table 6, which compares images from spikes and fits no method."""
@@ -164,10 +193,10 @@ class RunBenchmark:
         allow_gaps: bool,
     ) -> int:
         """Submit every record. Return how many the leaderboard refused; the run's results remain."""
-        names = [r["method"]["name"] for r in records]
-        folders = {name: settings.out / "predictions" / name for name in names}
+        names = [(settings.folder(r["method"]["seed"]), r["method"]["name"]) for r in records]
+        folders = {out / "results" / f"{name}.json": out / "predictions" / name for out, name in names}
         return self.submit(
-            {settings.out / "results" / f"{n}.json": f if f.is_dir() else None for n, f in folders.items()},
+            {result: folder if folder.is_dir() else None for result, folder in folders.items()},
             scenes=scenes,
             leaderboard=leaderboard or settings.out / "leaderboard",
             replace=replace or leaderboard is None,
@@ -175,9 +204,13 @@ class RunBenchmark:
         )
 
 
-def make_run_benchmark(submit: Submit, measure_images: Callable[[Sequence[str]], int]) -> Callable[..., int]:
+def make_run_benchmark(
+    submit: Submit,
+    measure_images: Callable[[Sequence[str]], int],
+    track_scenes: Callable[[str], dict[str, str]],
+) -> Callable[..., int]:
     """Return the command `run-benchmark`, which calls these functions of other rooms."""
-    return RunBenchmark(submit, measure_images).run_benchmark
+    return RunBenchmark(submit, measure_images, track_scenes).run_benchmark
 
 
 def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
@@ -206,8 +239,8 @@ def plain_name(record: Record) -> str:
 
 
 def _failed_cells(records: Sequence[Record]) -> list[str]:
-    cells = [(f"{r['method']['name']} on {s}", c["status"]) for r in records for s, c in r["scenes"].items()]
-    return [name for name, status in cells if status == "failed"]
+    cells = [(r["method"], scene, c["status"]) for r in records for scene, c in r["scenes"].items()]
+    return [f"{m['name']} on {scene}, seed {m['seed']}" for m, scene, status in cells if status == "failed"]
 
 
 def _say(console: Console, text: str) -> None:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,7 +34,11 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.files import atomic_path, parse_json
+from spike4dgs.benchmark.inputs.names import is_id
+from spike4dgs.benchmark.inputs.numbers import MAX_GAIN, MAX_SIDE, positive, shown, whole
+from spike4dgs.benchmark.inputs.tensor_header import check_header
+from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -41,12 +46,9 @@ Arrays = dict[str, NDArray[Any]]
 
 REACH = 21  # ticks to each side: a window of 41 around the instant, or the same played backwards, lies within
 
-# Variants of each world. 0 is the public benchmark's and 1 to 9 are kept for tests and for other networks' training;
-# of the rest the first three are never trained on and serve for scores.
-HIDDEN_VARIANTS = (10, 11, 12)
-FIRST_TRAINING_VARIANT = 13
-
 _SCHEMA = "spike4dgs-bursts/1"
+_MOST_VALUES = 1 << 27  # radiances of a burst: 512 MB
+_MOST_VIEWS = 10_000  # of a rig, and rigs and instants of a file
 _FIX = "delete it and run `spike4dgs make-msdi-data` again"
 
 
@@ -109,17 +111,36 @@ class BurstFile:
         shape = (f.views, f.height, f.width)
         try:
             with safetensors.safe_open(self.path, framework="np") as file:
-                background, depth, w2c, K = (file.get_slice(n)[rig] for n in ("still", "still_depth", "w2c", "K"))
+                background, depth, w2c, K = (
+                    _part(file, name, rig, (f.rigs, *sides))
+                    for name, sides in (
+                        ("still", shape),
+                        ("still_depth", shape),
+                        ("w2c", (f.views, 4, 4)),
+                        ("K", (f.views, 3, 3)),
+                    )
+                )
                 given, values, there = (file.get_tensor(f"{n}.{rig}.{instant}") for n in ("given", "values", "depth"))
                 gain, dark = file.get_tensor("gain"), file.get_tensor("dark")
-            moving = np.unpackbits(given, count=int(np.prod(shape))).astype(bool).reshape(shape)
+            if gain.shape != shape or dark.shape != shape or len(values) * math.prod(shape) > _MOST_VALUES:
+                raise ValueError(f"maps of shape {gain.shape} and {dark.shape}, radiance at {len(values)} ticks")
+            moving = np.unpackbits(given, count=math.prod(shape)).astype(bool).reshape(shape)
             keys = np.repeat(background.astype(np.float32)[None], len(values), axis=0)
             keys[:, moving] = values
             depth = depth.astype(np.float32)
             depth[moving] = there
         except (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError) as e:
-            raise problem(self.path, "training bursts", f"damaged data ({e})", _FIX) from None
+            raise problem(self.path, "training bursts", f"damaged data ({str(e)[:200]})", _FIX) from None
         return Burst(keys, depth, moving, w2c, K, gain.astype(np.float32), dark.astype(np.float32))
+
+
+def _part(file: Any, name: str, index: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return one entry of a tensor of that shape. Raises ValueError for another shape."""
+    part = file.get_slice(name)
+    if tuple(part.get_shape()) != shape:
+        raise ValueError(f"{name} of shape {part.get_shape()}, and not {shape}")
+    found: NDArray[Any] = part[index]
+    return found
 
 
 def burst_path(folder: Path, world: str, variant: int) -> Path:
@@ -130,15 +151,33 @@ def burst_path(folder: Path, world: str, variant: int) -> Path:
 def open_bursts(path: Path) -> BurstFile:
     """Open a file of bursts. Raises UserError where it is missing, damaged, or something else."""
     try:
+        check_header(path)
         with safetensors.safe_open(path, framework="np") as file:
             meta = file.metadata() or {}
         if _SCHEMA not in meta:
             raise problem(path, f"metadata {_SCHEMA}", ", ".join(meta) or "none", "name a folder of make-msdi-data")
-        fields: dict[str, Any] = json.loads(meta[_SCHEMA])
+        fields: dict[str, Any] = parse_json(meta[_SCHEMA])
         digest = str(fields.pop("sha256"))
-        return BurstFile(path, BurstFacts(**fields), digest)
-    except (safetensors.SafetensorError, OSError, LookupError, TypeError, ValueError) as e:
+        return BurstFile(path, _checked(BurstFacts(**fields)), digest)
+    except (safetensors.SafetensorError, OSError, LookupError, TypeError, ValueError, AttributeError) as e:
         raise problem(path, "training bursts", f"damaged data ({e})", _FIX) from None
+
+
+def _checked(facts: BurstFacts) -> BurstFacts:
+    """Return the facts. Raises ValueError for names that are none and for numbers out of bounds."""
+    if not is_id(facts.world):
+        raise ValueError(f"the world {shown(facts.world)}")
+    for value, most in (
+        *((n, MAX_SIDE) for n in (facts.width, facts.height)),
+        *((n, _MOST_VIEWS) for n in (facts.views, facts.rigs, facts.instants)),
+        (facts.spp, 1 << 20),
+    ):
+        whole(value, 1, most)
+    for value in (facts.variant, facts.seed):
+        whole(value, 0, 2**63)
+    for gain in (facts.radiance_gain, facts.photons_per_spike):
+        positive(gain, MAX_GAIN)
+    return facts
 
 
 def open_folder(folder: Path) -> list[BurstFile]:

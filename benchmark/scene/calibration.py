@@ -6,10 +6,12 @@ first spike and after the last: over T ticks it is wrong by about 1 / T, where a
     gain = (rate under uniform light - dark rate) / its mean,      dark = rate in the dark
 
 The gain map is the n(x, y) of Spike4DGS (eq. 15): a method that wants it takes the estimate, never a simulator's truth.
+A recording is raw (calibration/flat/CAMERA.dat) or counted (.npz), with the same estimates to the last bit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import kernel, rows
-from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.scene.manifest import Manifest
+from spike4dgs.benchmark.spikes.counted import Recording, first_last_total, open_counted
+from spike4dgs.benchmark.spikes.stream import open_stream
 
 Float32 = NDArray[np.float32]
 
@@ -27,9 +30,28 @@ Float32 = NDArray[np.float32]
 class Recordings:
     """Two recordings of one camera: under uniform light of a known radiance, and in the dark."""
 
-    flat: SpikeStream
-    dark: SpikeStream
+    flat: Recording
+    dark: Recording
     flat_radiance: float
+
+
+def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size: tuple[int, int]) -> Recordings | None:
+    """Return a camera's recordings, raw or counted; None where the scene has none. `meta`: scene.json.
+
+    `size` is (width, height). Raises UserError where a file is missing, damaged or not of this camera.
+    """
+    facts: Mapping[str, Any] = meta.get("calibration", {})
+    if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
+        return None
+    order, found = bool(meta["sensor"]["rows_bottom_up"]), list[Recording]()
+    for name in ("flat", "dark"):
+        path, ticks = f"calibration/{name}/{camera}", int(facts[f"{name}_ticks"])
+        if f"{path}.npz" in files.files and f"{path}.dat" not in files.files:
+            found.append(open_counted(files.path(f"{path}.npz"), *size, ticks))
+            continue
+        raw = files.path(f"{path}.dat")
+        found.append(open_stream(raw, *size, float(meta["rate_hz"]), rows_bottom_up=order, n_ticks=ticks))
+    return Recordings(found[0], found[1], float(facts["flat_radiance"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,29 +90,8 @@ def estimate(recordings: Recordings) -> Calibration:
     return Calibration((light / mean).astype(np.float32), dark_rate.astype(np.float32), mean / recordings.flat_radiance)
 
 
-def rates(stream: SpikeStream) -> NDArray[np.float64]:
+def rates(recording: Recording) -> NDArray[np.float64]:
     """Return spikes per tick [H, W] under steady light; a pixel without spikes counts as having half of one."""
-    n = stream.width * stream.height
-    first, last, count = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
-    first_and_last(rows(stream.packed), first, last, count)
+    first, last, total = first_last_total(recording)
     span = np.maximum(last - first, 1)
-    flat = np.where(count > 1, (count - 1) / span, np.maximum(count, 0.5) / stream.n_ticks)
-    image = flat.reshape(stream.height, stream.width)
-    return np.asarray(image[::-1] if stream.rows_bottom_up else image)
-
-
-@kernel
-def first_and_last(packed: Any, first: Any, last: Any, count: Any) -> None:
-    """Fill the ticks of the first and last spike and spike count of every pixel [P], from packed rows [T, bytes]."""
-    for tick in range(len(packed)):
-        for byte in range(packed.shape[1]):
-            bits = packed[tick, byte]
-            if bits == 0:
-                continue
-            for k in range(8):
-                pixel = 8 * byte + k
-                if pixel < len(count) and (bits >> k) & 1:
-                    if count[pixel] == 0:
-                        first[pixel] = tick
-                    last[pixel] = tick
-                    count[pixel] += 1
+    return np.asarray(np.where(total > 1, (total - 1) / span, np.maximum(total, 0.5) / recording.n_ticks))

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.array.lens import NAMES, Distortion, distort, make_distortion, undistort
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.inputs.names import check_ids
+from spike4dgs.benchmark.inputs.numbers import MAX_LENGTH, MAX_SIDE, number, positive, shown, whole
 
 Float64 = NDArray[np.float64]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes
@@ -127,13 +129,19 @@ def to_nerfstudio(camera: Camera) -> dict[str, Any]:
     }
 
 
-def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -> Camera:
-    """Return the camera of per-frame nerfstudio keys. Raises UserError for missing keys and non-rigid poses."""
+def from_nerfstudio(id: str, frame: Mapping[str, Any], where: str = "transforms") -> Camera:
+    """Return the camera of per-frame nerfstudio keys.
+
+    Raises UserError for an id that no file can have, for missing keys, for numbers out of bounds and for non-rigid
+    poses.
+    """
+    check_ids([id], "camera", where)
     try:
-        m = np.array(frame["transform_matrix"], dtype=np.float64) @ _OPENGL
-        fx, fy, cx, cy = (float(frame[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
-        width, height = int(frame["w"]), int(frame["h"])
-        lens = make_distortion([float(frame.get(name, 0.0)) for name in NAMES])
+        m = np.array([_numbers(row, 4) for row in _rows(frame["transform_matrix"], 4)]) @ _OPENGL
+        fx, fy = (positive(frame[k], MAX_LENGTH) for k in ("fl_x", "fl_y"))
+        cx, cy = _numbers([frame[k] for k in ("cx", "cy")], 2)
+        width, height = (whole(frame[k], 1, MAX_SIDE) for k in ("w", "h"))
+        lens = make_distortion(_numbers([frame.get(name, 0.0) for name in NAMES], len(NAMES)))
     except (KeyError, TypeError, ValueError) as e:
         keys = "fl_x, fl_y, cx, cy, w, h and a 4x4 transform_matrix"
         raise problem(where, f"{keys} for camera {id}", repr(e), "write the scene again") from None
@@ -142,6 +150,16 @@ def from_nerfstudio(id: str, frame: dict[str, Any], where: str = "transforms") -
     camera = Camera(id, width, height, fx, fy, cx, cy, R, -R @ m[:3, 3], lens)
     check_lens(camera, where)
     return camera
+
+
+def _rows(values: Any, count: int) -> list[Any]:
+    if not isinstance(values, list) or len(values) != count:
+        raise ValueError(f"{shown(values)} is no list of {count}")
+    return values
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    return [number(value, -MAX_LENGTH, MAX_LENGTH) for value in _rows(values, count)]
 
 
 def border(camera: Camera) -> Float64:
@@ -227,11 +245,30 @@ def read_cameras(root: Path) -> dict[str, Camera]:
     Raises UserError where a file is missing or damaged.
     """
     cameras: dict[str, Camera] = {}
+    for path, frame in _frames(root):
+        camera = from_nerfstudio(str(frame.get("camera")), frame, str(path))
+        cameras.setdefault(camera.id, camera)
+    return cameras
+
+
+def camera_facts(root: Path) -> dict[str, dict[str, Any]]:
+    """Return the numbers that `read_cameras` reads, by camera, as the files have them: without a last bit of rounding.
+
+    The folder is one that `read_cameras` has read.
+    """
+    facts: dict[str, dict[str, Any]] = {}
+    for _, frame in _frames(root):
+        numbers: dict[str, Any] = {name: float(frame[name]) for name in ("fl_x", "fl_y", "cx", "cy")}
+        numbers |= {"w": int(frame["w"]), "h": int(frame["h"])}
+        lens = make_distortion([float(frame.get(name, 0.0)) for name in NAMES])
+        pose = [[float(v) for v in row] for row in frame["transform_matrix"][:3]]
+        facts.setdefault(str(frame.get("camera")), {**numbers, "lens": list(lens), "pose": pose})
+    return facts
+
+
+def _frames(root: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     for name in ("transforms_train.json", "transforms_test.json"):
         frames = read_json(root / name, "camera poses").get("frames")
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise problem(root / name, "a list `frames` of objects", "none", "make or import the scene again")
-        for frame in frames:
-            camera = from_nerfstudio(str(frame.get("camera")), frame, str(root / name))
-            cameras.setdefault(camera.id, camera)
-    return cameras
+        yield from ((root / name, frame) for frame in frames)

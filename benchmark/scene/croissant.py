@@ -40,6 +40,8 @@ _FILE_SETS = {
     "geometry": ("Depth, instance ids and optical flow", "geometry/*/*.exr", _EXR),
     "calibration-flat": ("Spike streams under uniform light", "calibration/flat/*.dat", _BYTES),
     "calibration-dark": ("Spike streams without light", "calibration/dark/*.dat", _BYTES),
+    "calibration-flat-counts": ("Counts of the spikes under uniform light", "calibration/flat/*.npz", _NPZ),
+    "calibration-dark-counts": ("Counts of the spikes without light", "calibration/dark/*.npz", _NPZ),
     "truth": ("True gain and dark maps of the sensors", "truth/*.npz", _NPZ),
     "conventional": ("Frames of a conventional camera, 8-bit sRGB", "conventional/*/*.png", _PNG),
     "events": ("Events: t, x, y, p", "events/*.npz", _NPZ),
@@ -58,23 +60,37 @@ def write_croissant(root: Path, meta: dict[str, Any], description: str) -> None:
     single = {f"{name}.json": _JSON for name in names}
     single |= {stream: _BYTES for stream in meta["streams"].values()}
     found = {name: value for name, value in _FILE_SETS.items() if any(root.glob(value[1]))}
+    files = [
+        file_object(name, (root / name).stat().st_size, kind, sha256_file(root / name)) for name, kind in single.items()
+    ]
+    sets = [_file_set(name, *value) for name, value in found.items()]
     ours = meta["source"]["kind"] != "spikecv"  # of a recording that was imported we do not know whose it is
-    write_json(
-        root / NAME,
-        {
-            "@context": _CONTEXT,
-            "@type": "sc:Dataset",
-            "conformsTo": "http://mlcommons.org/croissant/1.0",
-            "name": meta["id"],
-            "description": description,
-            "license": _licence(meta["licence"]),
-            **({"creator": {"@type": "sc:Organization", "name": "Spike4DGS"}} if ours else {}),
-            "version": "1.0.0",  # of the format; manifest.json's hash is the revision of the data
-            "distribution": [_file_object(root, name, kind) for name, kind in single.items()]
-            + [_file_set(name, *value) for name, value in found.items()],
-            "recordSet": _records(root),
-        },
-    )
+    about = (meta["id"], description, meta["licence"])
+    write_json(root / NAME, dataset(*about, ours=ours, distribution=[*files, *sets], records=_records(root)))
+
+
+def dataset(
+    name: str,
+    description: str,
+    licence: str,
+    *,
+    ours: bool,
+    distribution: list[dict[str, Any]],
+    records: list[dict[str, Any]],
+) -> dict[str, Any]:
+    """Return a dataset of files and record sets; `ours` names us as the creator."""
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": name,
+        "description": description,
+        "license": _licence(licence),
+        **({"creator": {"@type": "sc:Organization", "name": "Spike4DGS"}} if ours else {}),
+        "version": "1.0.0",  # of the format; the contents in manifest.json make the revision of the data
+        "distribution": distribution,
+        "recordSet": records,
+    }
 
 
 def _licence(name: str) -> str:
@@ -83,16 +99,16 @@ def _licence(name: str) -> str:
     return f"https://spdx.org/licenses/{name}.html" if is_spdx else name
 
 
-def _file_object(root: Path, name: str, kind: str) -> dict[str, Any]:
-    path = root / name
+def file_object(name: str, size: int, kind: str, sha256: str) -> dict[str, Any]:
+    """Return a file of a dataset: its path, bytes, type and hash."""
     return {
         "@type": "cr:FileObject",
         "@id": name,
-        "name": path.name,
+        "name": name.rpartition("/")[2],
         "contentUrl": name,
-        "contentSize": f"{path.stat().st_size} B",
+        "contentSize": f"{size} B",
         "encodingFormat": kind,
-        "sha256": sha256_file(path),
+        "sha256": sha256,
     }
 
 
@@ -115,9 +131,7 @@ def _records(root: Path) -> list[dict[str, Any]]:
     found = []
     if read_json(root / "targets.json", "the scored images")["targets"]:
         fields = {"camera": ("Held-out camera", "sc:Text"), "tick": ("Tick of the image", "sc:Integer")}
-        found.append(
-            _record_set("targets", "The scored images of the default split", "targets.json", "targets", fields)
-        )
+        found.append(record_set("targets", "The scored images of the default split", "targets.json", "targets", fields))
     if read_json(root / "transforms_all.json", "all images")["frames"]:
         fields = {
             "camera": ("Camera", "sc:Text"),
@@ -125,11 +139,11 @@ def _records(root: Path) -> list[dict[str, Any]]:
             "t_us": ("The same in microseconds", "sc:Float"),
             "file_path": ("Path in the scene folder", "sc:Text"),
         }
-        found.append(_record_set("images", "The ground-truth images", "transforms_all.json", "frames", fields))
+        found.append(record_set("images", "The ground-truth images", "transforms_all.json", "frames", fields))
     return found
 
 
-def _record_set(
+def record_set(
     name: str, description: str, file: str, items: str, fields: dict[str, tuple[str, str]]
 ) -> dict[str, Any]:
     """Return a record for each object in the list `items` of a JSON file; `fields` has their description and type."""

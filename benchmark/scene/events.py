@@ -7,7 +7,6 @@ the threshold of log radiance at which a pixel fires.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.inputs.npz import Expected, read_npz
 from spike4dgs.benchmark.scene.manifest import Manifest
 
 _AGAIN = "restore it or make the scene again"
@@ -86,6 +86,8 @@ def find_events(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]
     facts: Mapping[str, Any] = meta.get("events", {})
     for camera in cameras if facts else ():
         if (name := f"events/{camera}.npz") in files.files:
+            if "threshold" not in facts:
+                raise problem(files.root / "scene.json", "events/threshold", "no such key", "make the scene again")
             size, clock = (int(meta["width"]), int(meta["height"])), (float(meta["rate_hz"]), int(meta["n_ticks"]))
             found[camera] = EventStream(camera, *size, *clock, float(facts["threshold"]), files.only(name))
     return found
@@ -107,10 +109,5 @@ def write_events(path: Path, found: Events) -> None:
 
 def read_events(path: Path) -> Events:
     """Read events. Raises UserError where the file is missing or damaged."""
-    try:
-        with open(path, "rb") as f, np.load(f) as data:
-            return Events(*(data[name] for name in Events._fields))
-    except FileNotFoundError:
-        raise problem(path, "events", "no such file", _AGAIN) from None
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as e:
-        raise problem(path, "events (t, x, y, p)", f"damaged data ({e})", _AGAIN) from None
+    found = read_npz(path, "events (t, x, y, p)", dict.fromkeys(Events._fields, Expected("iu", (None,))), _AGAIN)
+    return Events(**found)

@@ -15,6 +15,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.images import Float32, UInt8, decode_srgb, read_png
 from spike4dgs.benchmark.scene.manifest import Manifest
 
+_DIGITS = 15  # of a tick
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -40,6 +42,7 @@ class Frames(Sequence[Frame]):
 
     camera: str
     ticks: tuple[int, ...]  # at which the exposures begin
+    shape: tuple[int, int]  # H, W
     rate_hz: float  # ticks per second of the scene's clock
     fps: float
     exposure_us: float
@@ -60,7 +63,7 @@ class Frames(Sequence[Frame]):
         if isinstance(index, slice):
             return [self[i] for i in range(len(self))[index]]
         tick = self.ticks[index]
-        image = read_png(self.files.path(f"conventional/{self.camera}/{tick:06d}.png"))
+        image = read_png(self.files.path(f"conventional/{self.camera}/{tick:06d}.png"), self.shape)
         return Frame(tick, tick * 1e6 / self.rate_hz, self.exposure_us, image)
 
 
@@ -70,11 +73,23 @@ def find_frames(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]
     facts: Mapping[str, Any] = meta.get("conventional", {})
     for camera in cameras if facts else ():
         own = files.only(f"conventional/{camera}/")
-        ticks = tuple(sorted(int(PurePosixPath(name).stem) for name in own.files))
-        if ticks:
-            exposure_us = float(facts["exposure_s"]) * 1e6
-            found[camera] = Frames(camera, ticks, float(meta["rate_hz"]), float(facts["fps"]), exposure_us, own)
+        if ticks := tuple(sorted(_tick(files, name) for name in own.files)):
+            fps, exposure_s = (_fact(files, facts, key) for key in ("fps", "exposure_s"))
+            size = int(meta["height"]), int(meta["width"])
+            found[camera] = Frames(camera, ticks, size, float(meta["rate_hz"]), fps, exposure_s * 1e6, own)
     return found
+
+
+def _tick(files: Manifest, name: str) -> int:
+    if not (stem := PurePosixPath(name).stem).isdecimal() or len(stem) > _DIGITS:
+        raise problem(files.root / name[:200], "a frame named by its tick", "another name", "make the scene again")
+    return int(stem)
+
+
+def _fact(files: Manifest, facts: Mapping[str, Any], key: str) -> float:
+    if key not in facts:
+        raise problem(files.root / "scene.json", f"conventional/{key}", "no such key", "make the scene again")
+    return float(facts[key])
 
 
 def frames_of(found: Mapping[str, Frames], camera: str, where: Path | str) -> Frames:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,15 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.inputs.numbers import MAX_SIDE
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 GRAY = (0.212671, 0.715160, 0.072169)  # luminance of linear R, G, B (CIE XYZ's Y of sRGB primaries, as Mitsuba has it)
+Shape = tuple[int, int]  # H, W
 _AGAIN = "render or restore it"
+_MOST_SAMPLES = 1 << 27  # pixels times channels: 512 MB as floats
+_PNG_ERRORS = (SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error)  # beside OSError
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,21 +54,22 @@ def write_exr(path: Path, image: Float32, t_us: float) -> None:
     _write_channels(path, {name: values.astype(np.float16) for name, values in channels.items()}, t_us)
 
 
-def read_exr(path: Path) -> Float32:
+def read_exr(path: Path, shape: Shape | None = None) -> Float32:
     """Read the gray channel of an EXR [H, W] as float32.
 
-    Raises UserError where the file is missing, damaged or has no channel Y.
+    Raises UserError where the file is missing, damaged, not of that `shape` (if given) or has no channel Y.
     """
-    found = _read_channels(path, ("Y",), "a gray image (channel Y)", "write one gray channel")
+    found = _read_channels(path, ("Y",), "a gray image (channel Y)", "write one gray channel", shape)
     return found["Y"].astype(np.float32)
 
 
-def read_rgb(path: Path) -> Float32:
+def read_rgb(path: Path, shape: Shape | None = None) -> Float32:
     """Read a colour EXR as linear RGB [H, W, 3] float32.
 
-    Raises UserError where the file is missing, damaged or has no channels R, G, B.
+    Raises UserError where the file is missing, damaged, not of that `shape` (if given) or has no channels R, G, B.
     """
-    found = _read_channels(path, tuple("RGB"), "a colour image (channels R, G, B)", "read a gray image's channel Y")
+    fix = "read a gray image's channel Y"
+    found = _read_channels(path, tuple("RGB"), "a colour image (channels R, G, B)", fix, shape)
     return np.stack([found[name].astype(np.float32) for name in "RGB"], axis=-1)
 
 
@@ -82,10 +89,13 @@ def write_geometry(path: Path, depth: Float32, ids: NDArray[np.uint32], flow: Fl
     _write_channels(path, {**channels, "id": ids.astype(np.uint32)}, t_us)
 
 
-def read_geometry(path: Path) -> Geometry:
-    """Read the file that `write_geometry` wrote. Raises UserError where it is missing, damaged or lacks a channel."""
+def read_geometry(path: Path, shape: Shape | None = None) -> Geometry:
+    """Read the file that `write_geometry` wrote.
+
+    Raises UserError where it is missing, damaged, not of that `shape` (if given) or lacks a channel.
+    """
     names = ("Z", "id", "flow.x", "flow.y")
-    found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again")
+    found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again", shape)
     flow = np.stack([found["flow.x"], found["flow.y"]], axis=-1)
     return Geometry(found["Z"].astype(np.float32), found["id"].astype(np.uint32), flow.astype(np.float32))
 
@@ -112,20 +122,63 @@ def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: floa
             ) from e
 
 
-def _read_channels(path: Path, names: tuple[str, ...], what: str, fix: str) -> dict[str, NDArray[Any]]:
-    """Return channels by name [H, W], in the type that the file has."""
+def read_channels(path: Path) -> dict[str, NDArray[Any]]:
+    """Read all channels of an EXR by name, each [H, W] in the type that the file has.
+
+    Raises UserError where the file is missing or damaged.
+    """
+    return _read_channels(path, (), "an EXR image", _AGAIN, None)
+
+
+def _read_channels(
+    path: Path, names: tuple[str, ...], what: str, fix: str, shape: Shape | None
+) -> dict[str, NDArray[Any]]:
+    """Return channels by name [H, W], in the type that the file has; all of them if there are no `names`."""
     import OpenEXR
 
     if not path.is_file():
         raise problem(path, "an EXR image", "no such file", _AGAIN)
     try:
+        with OpenEXR.File(str(path), header_only=True) as f:
+            _check_headers(path, [part.header for part in f.parts], shape)
         with OpenEXR.File(str(path), separate_channels=True) as f:
             channels = f.channels()
             if not set(names) <= set(channels):
-                raise problem(path, what, f"channels {sorted(channels)}", fix)
-            return {name: np.asarray(channels[name].pixels) for name in names}
-    except (RuntimeError, ValueError) as e:  # cut-off files raise either
-        raise problem(path, "an EXR image", f"damaged data ({e})", _AGAIN) from None
+                raise problem(path, what, f"channels {sorted(channels)}"[:200], fix)
+            found = {name: np.asarray(channels[name].pixels) for name in names or channels}
+    except (RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:  # cut-off files raise the first two
+        raise problem(path, "an EXR image", f"damaged data ({str(e)[:200]})", _AGAIN) from None
+    for name, values in found.items():
+        if values.shape != next(iter(found.values())).shape or shape not in (None, values.shape):
+            raise problem(path, what, f"{name} of shape {values.shape}, another than the image's", fix)
+    return found
+
+
+def _check_headers(path: Path, headers: Sequence[Mapping[str, Any]], shape: Shape | None) -> None:
+    """Raise UserError unless the first part has that shape, and none is too large to decode: all of them are."""
+    samples = 0
+    for i, header in enumerate(headers):
+        (x0, y0), (x1, y1) = (map(int, corner) for corner in header["dataWindow"])
+        found = y1 - y0 + 1, x1 - x0 + 1
+        _check_size(path, found, None if i else shape)
+        samples += found[0] * found[1] * len(header["channels"])
+    _check_samples(path, samples)
+
+
+def _check_size(path: Path, found: Shape, shape: Shape | None) -> None:
+    if not all(0 < side <= MAX_SIDE for side in found):
+        raise problem(path, f"an image of at most {MAX_SIDE}x{MAX_SIDE} pixels", _size(found), _AGAIN)
+    if shape is not None and found != shape:
+        raise problem(path, f"an image of {_size(shape)} pixels", _size(found), _AGAIN)
+
+
+def _check_samples(path: Path, samples: int) -> None:
+    if samples > _MOST_SAMPLES:
+        raise problem(path, f"an image of at most {_MOST_SAMPLES} samples in all its channels", str(samples), _AGAIN)
+
+
+def _size(shape: Shape) -> str:
+    return f"{shape[1]}x{shape[0]}"
 
 
 def write_png(path: Path, image: UInt8) -> None:
@@ -136,19 +189,29 @@ def write_png(path: Path, image: UInt8) -> None:
         Image.fromarray(image).save(part)
 
 
-def read_png(path: Path) -> UInt8:
-    """Read an 8-bit PNG, gray [H, W] or RGB [H, W, 3]. Raises UserError where it is missing, damaged or foreign."""
+def read_png(path: Path, shape: Shape | None = None) -> UInt8:
+    """Read an 8-bit PNG, gray [H, W] or RGB [H, W, 3].
+
+    Raises UserError where it is missing, damaged, foreign, or not of that `shape` [H, W] (if given).
+    """
+    return _read_png(path, "an 8-bit gray or RGB PNG image", shape, ("L", "RGB"))
+
+
+def _read_png(path: Path, what: str, shape: Shape | None, modes: tuple[str, ...] = ()) -> UInt8:
+    """Return a PNG of one of `modes`, or without them any as 8-bit gray. Its size is checked before it is decoded."""
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
-            if image.mode not in ("L", "RGB"):
-                raise problem(path, "an 8-bit gray or RGB image", f"mode {image.mode}", _AGAIN)
-            return np.asarray(image)
+        with Image.open(path, formats=("PNG",)) as image:
+            _check_size(path, (image.height, image.width), shape)
+            _check_samples(path, image.height * image.width * len(image.getbands()))
+            if modes and image.mode not in modes:
+                raise problem(path, what, f"mode {image.mode}", _AGAIN)
+            return np.asarray(image if modes else image.convert("L"))
     except FileNotFoundError:
-        raise problem(path, "a PNG image", "no such file", _AGAIN) from None
-    except OSError as e:
-        raise problem(path, "a PNG image", f"damaged data ({e})", _AGAIN) from None
+        raise problem(path, what, "no such file", _AGAIN) from None
+    except (OSError, *_PNG_ERRORS, Image.DecompressionBombError, Image.DecompressionBombWarning) as e:
+        raise problem(path, what, f"damaged data ({str(e)[:200]})", _AGAIN) from None
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
@@ -156,17 +219,9 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     write_png(path, mask.astype(np.uint8) * 255)
 
 
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Read a mask [H, W]. Raises UserError where it is missing or damaged."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("L")) > 127
-    except FileNotFoundError:
-        raise problem(path, "a mask image", "no such file", "restore it or make the scene again") from None
-    except OSError as e:
-        raise problem(path, "a mask image", f"damaged data ({e})", "restore it or make the scene again") from None
+def read_mask(path: Path, shape: Shape | None = None) -> NDArray[np.bool_]:
+    """Read a mask [H, W]. Raises UserError where it is missing, damaged, or not of that `shape` (if given)."""
+    return _read_png(path, "a mask image", shape) > 127
 
 
 def encode_srgb(image: NDArray[np.floating[Any]]) -> UInt8:

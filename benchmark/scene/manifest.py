@@ -1,25 +1,37 @@
-"""manifest.json: the size and SHA-256 of every file of a scene. Its own SHA-256 is the dataset revision."""
+"""manifest.json: the size and SHA-256 of every file of a scene, and the hash of the content of encoded data.
+
+The hashes of contents make the revision without a file being decoded, or even there. A reader of a file checks its
+bytes; `identity.verify` decodes them too and checks what the manifest says of their content.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_file, write_json
+from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
 
 NAME = "manifest.json"
 _SCHEMA = "spike4dgs-manifest/1"
+_DIGEST = re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The recorded files of a scene folder; `files` maps a relative path to (bytes, sha256)."""
+    """The recorded files of a scene folder.
+
+    `files` maps a relative path to (bytes, sha256), `recorded` the path of encoded data to the hash of its content, as
+    far as manifest.json has it.
+    """
 
     root: Path
     files: dict[str, tuple[int, str]]
-    revision: str
+    recorded: dict[str, str] = field(default_factory=dict)
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def path(self, name: str) -> Path:
@@ -36,19 +48,36 @@ class Manifest:
         """Return the manifest of the files alone whose path begins with `prefix`."""
         return replace(self, files={name: facts for name, facts in self.files.items() if name.startswith(prefix)})
 
+    def contents(self, meta: Mapping[str, Any]) -> dict[str, str]:
+        """Return the hash of the content of each file that is fitted or scored, by its key. `meta`: scene.json.
+
+        Files without a recorded hash are decoded. A stream that is not recorded is left out, as a held-out camera's may
+        be. Raises UserError where a file to decode is missing or damaged.
+        """
+        found = {}
+        for key, name in data_files(self.files, meta["streams"]).items():
+            if is_encoded(name):
+                found[key] = self.recorded.get(name) or hash_content(self.path(name), name, meta)
+            elif name in self.files:
+                found[key] = self.files[name][1]
+        return found
+
     def problems(self) -> Iterator[str]:
         """Check every recorded file and yield one line for each that is missing or differs."""
         for name in self.files:
             try:
                 self._check(name)
+                self._checked.add(name)
             except UserError as e:
                 yield str(e)
 
-    def _check(self, name: str) -> None:
-        path = self.root / name
+    def _entry(self, name: str) -> tuple[int, str]:
         if name not in self.files:
-            raise problem(path, f"a file that {NAME} lists", "no entry", "make or import the scene again")
-        size, digest = self.files[name]
+            raise problem(self.root / name, f"a file that {NAME} lists", "no entry", "make or import the scene again")
+        return self.files[name]
+
+    def _check(self, name: str) -> None:
+        path, (size, digest) = self.root / name, self._entry(name)
         if not path.is_file():
             raise problem(path, f"a file of {size} bytes", "no such file", "restore it or make the scene again")
         if (found := path.stat().st_size) != size:
@@ -61,13 +90,32 @@ class Manifest:
 
 def write_manifest(root: Path) -> Manifest:
     """Hash every file below `root` (hidden files and the manifest itself excepted) and write manifest.json."""
-    files = {}
+    meta = _scene_json(root)
+    files: dict[str, dict[str, Any]] = {}
     for path in sorted(p for p in root.rglob("*") if p.is_file()):
         name = path.relative_to(root).as_posix()
         if name != NAME and not any(part.startswith(".") for part in Path(name).parts):
             files[name] = {"bytes": path.stat().st_size, "sha256": sha256_file(path)}
+            if is_encoded(name) and (content := _content(path, name, meta)):
+                files[name]["content"] = content
     write_json(root / NAME, {"schema": _SCHEMA, "files": files})
     return read_manifest(root)
+
+
+def _scene_json(root: Path) -> dict[str, Any]:
+    """Return scene.json, {} where it is missing or damaged: whoever opens the scene says so."""
+    try:
+        return read_json(root / "scene.json", "a scene")
+    except UserError:
+        return {}
+
+
+def _content(path: Path, name: str, meta: Mapping[str, Any]) -> str | None:
+    """Return the hash of a file's content; None where the file or scene.json is damaged, which its reader reports."""
+    try:
+        return hash_content(path, name, meta)
+    except (UserError, KeyError, TypeError, ValueError):
+        return None
 
 
 def read_manifest(root: Path) -> Manifest:
@@ -78,6 +126,20 @@ def read_manifest(root: Path) -> Manifest:
         raise problem(path, f"schema {_SCHEMA}", repr(data.get("schema")), "use a scene made by this version")
     try:
         files = {str(k): (int(v["bytes"]), str(v["sha256"])) for k, v in data["files"].items()}
+        recorded = {str(k): str(v["content"]) for k, v in data["files"].items() if "content" in v}
     except (KeyError, TypeError, ValueError, AttributeError) as e:
         raise problem(path, "path -> {bytes, sha256}", repr(e), "restore it or make the scene again") from None
-    return Manifest(root, files, sha256_file(path))
+    for name in files:
+        if not _is_inside(name):
+            raise problem(path, "paths inside the scene folder", repr(name), "do not use this scene")
+    for name, digest in recorded.items():
+        if not _DIGEST.fullmatch(digest):
+            raise problem(path, f"64 hex digits as the content of {name}", repr(digest), "restore the file")
+    return Manifest(root, files, recorded)
+
+
+def _is_inside(name: str) -> bool:
+    """Return whether a path is plain and relative: no root, no `..`, nothing that another system reads otherwise."""
+    path = PurePosixPath(name)
+    plain = path.as_posix() == name and not set(name) & set("\\\0")
+    return plain and not path.is_absolute() and bool(path.parts) and ".." not in path.parts

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.array.camera_state import PERFECT, CameraState
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
-from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate
-from spike4dgs.benchmark.scene.cameras import Camera, read_cameras
+from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate, find_recordings
+from spike4dgs.benchmark.scene.cameras import Camera, camera_facts, read_cameras
+from spike4dgs.benchmark.scene.content import revision_of
 from spike4dgs.benchmark.scene.events import EventStream, events_of, find_events
 from spike4dgs.benchmark.scene.frames import Frames, find_frames, frames_of
 from spike4dgs.benchmark.scene.images import read_exr, read_mask, read_rgb
@@ -112,10 +113,13 @@ class Scene:
         """Identifier, such as `car-0-small`."""
         return str(self.meta["id"])
 
-    @property
+    @cached_property
     def revision(self) -> str:
-        """SHA-256 of the manifest: it changes whenever any file of the scene changes."""
-        return self.manifest.revision
+        """SHA-256 of what is fitted and scored; see `scene.content`. Texts, versions and encodings do not change it."""
+        every_split = _read_targets(self.manifest.path("targets.json"), self.meta)
+        targets = {name: [[t.camera, t.tick] for t in targets] for name, targets in every_split.items()}
+        gaps = [[g.camera, g.first_tick, g.ticks] for g in self.gaps]
+        return revision_of(self.meta, camera_facts(self.root), targets, gaps, self.manifest.contents(self.meta))
 
     @property
     def n_ticks(self) -> int:
@@ -152,7 +156,12 @@ class Scene:
         return tick * 1e6 / self.rate_hz
 
     def stream(self, camera: str) -> SpikeStream:
-        """Return the packed stream of a camera, checked and memory-mapped."""
+        """Return the packed stream of a camera, checked and memory-mapped.
+
+        Raises UserError for a camera whose stream is kept back, as in the training part of a hidden scene.
+        """
+        if camera not in self.meta["streams"]:
+            raise problem(self.root, f"a stream of {camera}", "none", "use a scene that has it, or another camera")
         path = self.manifest.path(self.meta["streams"][camera])
         c = self.cameras[camera]
         bottom_up, gaps = bool(self.meta["sensor"]["rows_bottom_up"]), tuple(g for g in self.gaps if g.camera == camera)
@@ -161,26 +170,23 @@ class Scene:
 
     def recordings(self, camera: str) -> Recordings | None:
         """Return a camera's recordings under uniform light and in the dark; None where the scene has none."""
-        facts, c = self.meta.get("calibration", {}), self.cameras[camera]
-        if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
-            return None
-        bottom_up, streams = bool(self.meta["sensor"]["rows_bottom_up"]), []
-        for name in ("flat", "dark"):
-            path, ticks = self.manifest.path(f"calibration/{name}/{camera}.dat"), int(facts[f"{name}_ticks"])
-            streams.append(open_stream(path, c.width, c.height, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=ticks))
-        return Recordings(streams[0], streams[1], float(facts["flat_radiance"]))
+        c = self.cameras[camera]
+        return find_recordings(self.meta, self.manifest, camera, (c.width, c.height))
 
     def ground_truth(self, target: Target) -> NDArray[np.float32]:
         """Read the radiance of a target, [H, W] float32."""
-        return read_exr(self.manifest.path(f"images/{target.name}.exr"))
+        return read_exr(self.manifest.path(f"images/{target.name}.exr"), self._shape(target))
 
     def ground_truth_rgb(self, target: Target) -> NDArray[np.float32]:
         """Read it in colour, [H, W, 3]. Raises UserError where the scene has gray images only."""
-        return read_rgb(self.manifest.path(f"images/{target.name}.exr"))
+        return read_rgb(self.manifest.path(f"images/{target.name}.exr"), self._shape(target))
 
     def moving(self, target: Target) -> NDArray[np.bool_]:
         """Read the moving region of a target, [H, W] bool, which the `*_dynamic` metrics use."""
-        return read_mask(self.manifest.path(f"masks/{target.name}.png"))
+        return read_mask(self.manifest.path(f"masks/{target.name}.png"), self._shape(target))
+
+    def _shape(self, target: Target) -> tuple[int, int]:
+        return self.cameras[target.camera].height, self.cameras[target.camera].width
 
     def frames(self, camera: str) -> Frames:
         """Return the frames of the conventional camera at a camera's pose: 60 a second, with motion blur.

@@ -20,6 +20,9 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
+from spike4dgs.benchmark.inputs.names import check_ids, inside
+from spike4dgs.benchmark.inputs.numbers import MAX_GAIN, MAX_HZ, MAX_SIDE, shown
+from spike4dgs.benchmark.inputs.yaml_file import read_yaml
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
@@ -66,9 +69,11 @@ def import_spikecv(
         rows_top_down: The file stores the top row first. The usual order of this camera is bottom row first.
         licence: Licence of the recording.
     """
-    if rate_hz <= 0 or radiance_gain <= 0:
-        raise problem("rate_hz and radiance_gain", "positive numbers", f"{rate_hz:g}, {radiance_gain:g}", "correct it")
+    if not (0 < rate_hz <= MAX_HZ and 0 < radiance_gain <= MAX_GAIN):
+        found = f"{rate_hz:g}, {radiance_gain:g}"
+        raise problem("rate_hz and radiance_gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
     sources = {path.name: _read_config(path) for path in _spikecv_folders(folder)}
+    check_ids(sources, "camera", folder, "rename the camera's folder")
     cameras = None if transforms is None else _read_poses(transforms, sources)
     check_new(out)
     streams = {}
@@ -139,20 +144,17 @@ def _spikecv_folders(folder: Path) -> list[Path]:
 
 def _read_config(folder: Path) -> _Source:
     """Read config.yaml of a SpikeCV folder. Raises UserError where it or the stream is missing or damaged."""
-    import yaml
-
     path = folder / CONFIG
     keys = "filename, spike_w and spike_h"
+    config = read_yaml(path, "a stream's description")
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
         name, width, height = config["filename"], config["spike_w"], config["spike_h"]
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise problem(path, "YAML", f"damaged text ({e})", "restore the file") from None
     except (KeyError, TypeError) as e:
         raise problem(path, keys, f"no {e}", "restore the file") from None
-    if not isinstance(name, str) or type(width) is not int or type(height) is not int or width < 1 or height < 1:
-        raise problem(path, f"{keys} of one stream", f"{name!r}, {width!r}, {height!r}", "correct the file")
-    return _source(folder / name, width, height)
+    if not isinstance(name, str) or any(type(side) is not int or not 0 < side <= MAX_SIDE for side in (width, height)):
+        found = f"{shown(name)}, {shown(width)}, {shown(height)}"
+        raise problem(path, f"{keys} of one stream", found, "correct the file")
+    return _source(inside(folder, name, path), width, height)
 
 
 def _source(path: Path, width: int, height: int) -> _Source:
@@ -183,7 +185,10 @@ def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
     Raises UserError where a stream has no pose, or the streams do not fit the poses or each other.
     """
     data = read_json(path, "camera poses")
-    frames: list[dict[str, Any]] = [{**data, **frame} for frame in data.get("frames", [])]
+    listed = data.get("frames", [])
+    if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
+        raise problem(path, "a list `frames` of objects", "another value", "correct the file")
+    frames: list[dict[str, Any]] = [{**data, **frame} for frame in listed]
     cameras = {str(f.get("camera")): from_nerfstudio(str(f.get("camera")), f, str(path)) for f in frames}
     missing = sorted(set(sources) - set(cameras))
     if missing:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.inputs.names import check_ids
 from spike4dgs.benchmark.scene.cameras import Camera
 
 DEFAULT_SPLIT = "center"
@@ -66,12 +67,18 @@ def spread_order(cameras: Sequence[Camera], held_out: str) -> tuple[str, ...]:
 
 
 def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: Path) -> None:
-    """Raise UserError unless the splits of scene.json name known cameras, and none of them in both parts."""
+    """Raise UserError unless the splits of scene.json name known cameras, and none of them in both parts.
+
+    Held-out cameras may lack a stream: the training part of a hidden scene keeps theirs back. Ids that differ in case
+    alone are refused too.
+    """
+    check_ids(meta["splits"], "split", path)
+    check_ids(meta["streams"], "camera", path)
     if meta["default_split"] not in meta["splits"]:
         raise problem(path, "default_split among the splits", repr(meta["default_split"]), "correct scene.json")
     for split, parts in meta["splits"].items():
         both = set(parts["train"]) & set(parts["test"])
-        unknown = (set(parts["train"]) | set(parts["test"])) - (set(cameras) & set(meta["streams"]))
+        unknown = set(parts["test"]) - set(cameras) | set(parts["train"]) - (set(cameras) & set(meta["streams"]))
         if both or unknown:
             found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
             raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")

@@ -50,6 +50,7 @@ class SceneDescription:
     gaps: tuple[dict[str, Any], ...] = ()
     splits: Mapping[str, Split] = field(default_factory=dict)  # `standard_splits`, or none but the default
     extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    kept_back: tuple[str, ...] = ()  # held-out cameras without a stream
 
     @property
     def all_splits(self) -> dict[str, Split]:
@@ -93,7 +94,7 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
         "pose_convention": _POSES,
         "sensor": scene.sensor,
         "radiance_gain": scene.radiance_gain,
-        "streams": {c.id: stream_name(c.id) for c in scene.cameras},
+        "streams": {c.id: stream_name(c.id) for c in scene.cameras if c.id not in scene.kept_back},
         "splits": {name: {"train": list(s.train), "test": list(s.test)} for name, s in splits.items()},
         "default_split": DEFAULT_SPLIT,
         "gaps": list(scene.gaps),
@@ -226,8 +227,10 @@ _CONTENTS = {
     "masks": "`masks/CAMERA/TICK.png`: the moving region of the same image (white).",
     "geometry": "`geometry/CAMERA/TICK.exr`: Z, depth along the optical axis in metres (inf: nothing); id, the moving\n"
     "  thing (0: none; names in scene.json); flow.x, flow.y, how far its point moves in pixels in the next 20 ticks.",
-    "calibration/flat": "`calibration/flat/CAMERA.dat`: a recording of uniform light, packed like `spikes/`.",
-    "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`.",
+    "calibration/flat": "`calibration/flat/CAMERA.dat`: a recording of uniform light, packed like `spikes/`; or its\n"
+    "  counts, `.npz`.",
+    "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`; or its\n"
+    "  counts, `.npz`.",
     "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
     "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
     "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
@@ -256,7 +259,8 @@ Licence: {scene.licence}.
 - `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
   tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.
 {contents}
-- `scene.json`: everything else about the scene. `manifest.json`: size and SHA-256 of every file.
+- `scene.json`: everything else about the scene. `manifest.json`: size and SHA-256 of every file, and of the
+  content of data that is fitted or scored. The revision of the scene is made of these contents.
 - `transforms_train.json`, `transforms_test.json`: poses and intrinsics; `sparse/0`: the same for COLMAP.
   `transforms_all.json`: the same for every image, those at training cameras too, which are not for training.
 - `targets.json`: what is scored. Splits, the first is the default:

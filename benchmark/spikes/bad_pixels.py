@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes.counted import WINDOW_TICKS, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -23,7 +24,6 @@ Float64 = NDArray[np.float64]
 FEWEST_SPIKES = 10  # fewer say nothing of a rate
 HOT_SIGMA = 6.0  # robust standard deviations of its surroundings that a hot pixel is above its brightest neighbour,
 HOT_SHARE = 0.5  # and share of that neighbour's rate: texture of one pixel seldom has more
-WINDOW_TICKS = 50  # of a flickering pixel's counts: a state that holds for a few milliseconds shows
 FLICKER_FACTOR = 4.0  # times the usual deviation of counts that a flickering pixel has,
 FLICKER_LEAST = 1.0  # and at least so many spikes: steady light's counts differ by one, which deviates by a half
 _LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
@@ -50,7 +50,7 @@ class BadPixels:
         return self.dead | self.hot | self.flickering
 
 
-def total_counts(stream: SpikeStream) -> NDArray[np.int64]:
+def total_counts(stream: Recording) -> NDArray[np.int64]:
     """Return the spikes per pixel of a whole stream [H, W]."""
     counts = np.zeros((stream.height, stream.width), np.int64)
     for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
@@ -58,7 +58,7 @@ def total_counts(stream: SpikeStream) -> NDArray[np.int64]:
     return counts
 
 
-def find_bad(stream: SpikeStream, flat: SpikeStream | None = None, dark: SpikeStream | None = None) -> BadPixels:
+def find_bad(stream: SpikeStream, flat: Recording | None = None, dark: Recording | None = None) -> BadPixels:
     """Return the bad pixels of a camera: from its recordings, or without them by isolation in `stream`."""
     if flat and dark:
         return from_recordings(flat, dark)
@@ -66,7 +66,7 @@ def find_bad(stream: SpikeStream, flat: SpikeStream | None = None, dark: SpikeSt
     return isolated(total_counts(stream) / seen, seen, deviation(stream))
 
 
-def deviation(stream: SpikeStream) -> Float64:
+def deviation(stream: Recording) -> Float64:
     """Return the standard deviation of each pixel's counts in windows of WINDOW_TICKS [H, W].
 
     What the whole chip does, as under a lamp that flickers, does not count. Zero for fewer than two windows.
@@ -84,13 +84,13 @@ def deviation(stream: SpikeStream) -> Float64:
     return np.asarray(np.sqrt(np.maximum(square / n - (total / n) ** 2, 0)))
 
 
-def flickering(stream: SpikeStream) -> Mask:
+def flickering(stream: Recording) -> Mask:
     """Return the pixels [H, W] whose rate is not steady in a recording of steady light or of darkness."""
     found = deviation(stream)
     return found > max(FLICKER_FACTOR * float(np.median(found)), FLICKER_LEAST)
 
 
-def from_recordings(flat: SpikeStream, dark: SpikeStream) -> BadPixels:
+def from_recordings(flat: Recording, dark: Recording) -> BadPixels:
     """Return the pixels that never fire under uniform light, fire too often in the dark, or flicker in either.
 
     A hot pixel's dark rate is at least `SENSOR.hot_factor` times the chip's median, in at least FEWEST_SPIKES spikes.

@@ -11,6 +11,8 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
+from spike4dgs.benchmark.inputs.names import check_ids, inside
+from spike4dgs.benchmark.inputs.numbers import MAX_HZ, MAX_SIDE, MAX_TICKS, positive, whole
 from spike4dgs.benchmark.spikes.gaps import read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
@@ -50,14 +52,16 @@ def open_stream_folder(root: Path, allow_gaps: bool = False) -> dict[str, SpikeS
         raise problem(path, f"schema '{_SCHEMA}'", f"{data.get('schema')!r}", "import the recording again")
     streams = {}
     try:
-        ticks = {str(camera): int(s["n_ticks"]) for camera, s in data["streams"].items()}
+        described = {str(camera): dict(s) for camera, s in data["streams"].items()}
+        check_ids(described, "camera", path)
+        ticks = {camera: whole(s["n_ticks"], 1, MAX_TICKS) for camera, s in described.items()}
         gaps = read_gaps(data.get("gaps", []), ticks, path)
-        for camera, s in data["streams"].items():
-            order, n_ticks = bool(s["rows_bottom_up"]), int(s["n_ticks"])
-            size = (int(s["width"]), int(s["height"]))
-            own = tuple(gap for gap in gaps if gap.camera == camera)
-            streams[str(camera)] = open_stream(
-                root / str(s["file"]), *size, float(s["rate_hz"]), rows_bottom_up=order, n_ticks=n_ticks, gaps=own
+        for camera, s in described.items():
+            width, height = (whole(s[key], 1, MAX_SIDE) for key in ("width", "height"))
+            own, order = tuple(gap for gap in gaps if gap.camera == camera), bool(s["rows_bottom_up"])
+            file, rate_hz = inside(root, str(s["file"]), path), positive(s["rate_hz"], MAX_HZ)
+            streams[camera] = open_stream(
+                file, width, height, rate_hz, rows_bottom_up=order, n_ticks=ticks[camera], gaps=own
             )
     except (KeyError, TypeError, ValueError, AttributeError) as e:
         raise problem(path, "file, width, height, rate_hz, ... of streams", repr(e), "import it again") from None

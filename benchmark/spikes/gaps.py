@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.inputs.numbers import MAX_TICKS, whole
 
 
 @dataclass(frozen=True, order=True)
@@ -43,7 +44,7 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
     Raises UserError where a record is none, names no camera of the recording, leaves its clip or overlaps another.
     """
     try:
-        gaps = sorted(Gap(str(r["camera"]), int(r["first_tick"]), int(r["ticks"]), str(r["reason"])) for r in records)
+        gaps = sorted(_gap(record) for record in records)
     except (KeyError, TypeError, ValueError) as e:
         raise problem(path, "gaps {camera, first_tick, ticks, reason}", repr(e), "restore the file") from None
     for i, gap in enumerate(gaps):
@@ -53,6 +54,11 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
             expected = f"gaps of its cameras that {'do not overlap' if inside else 'lie within the clip'}"
             raise problem(path, expected, str(gap.record), "restore the file")
     return tuple(gaps)
+
+
+def _gap(record: Mapping[str, Any]) -> Gap:
+    first, ticks = (whole(record[key], 0, MAX_TICKS) for key in ("first_tick", "ticks"))
+    return Gap(str(record["camera"]), first, ticks, str(record["reason"]))
 
 
 def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:

@@ -12,11 +12,13 @@ spike's place.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.spikes.bits import UInt8, find_spike, in_threads, kernel
+from spike4dgs.benchmark.spikes.counted import CountedRecording, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -26,6 +28,7 @@ INTERVALS = 2  # that count in any case, if there are so many
 _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more than it saves
 
 Int64 = NDArray[np.int64]
+AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 
 def fill_gaps(stream: SpikeStream, longest: int = LONGEST_TICKS) -> SpikeStream:
@@ -105,13 +108,18 @@ def _shift(total: int, n: int, length: float) -> float:
     return min(max((even - total) / (n + 1), -1.0), 1.0)
 
 
-def fill_pixels(stream: SpikeStream, bad: NDArray[np.bool_] | None) -> SpikeStream:
-    """Return the stream, in memory, whose pixels of a mask [H, W] fire as their nearest pixel outside of it does."""
+def fill_pixels(stream: AnyRecording, bad: NDArray[np.bool_] | None) -> AnyRecording:
+    """Return the stream, in memory, whose pixels of a mask [H, W] fire as their nearest pixel outside of it does.
+
+    Of a counted recording the counts are those of that pixel.
+    """
     if bad is None or not bad.any() or bad.all():
         return stream
     from scipy.ndimage import distance_transform_edt  # where it is used: scenes open without it
 
     rows, columns = distance_transform_edt(bad, return_distances=False, return_indices=True)
+    if isinstance(stream, CountedRecording):
+        return stream.taken(rows, columns)
     packed = np.array(stream.packed)
     for y, x in np.argwhere(bad):
         target, source = _stored(stream, y, x), _stored(stream, rows[y, x], columns[y, x])

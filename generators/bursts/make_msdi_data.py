@@ -16,8 +16,6 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.bursts import (
-    FIRST_TRAINING_VARIANT,
-    HIDDEN_VARIANTS,
     REACH,
     Arrays,
     BurstFacts,
@@ -27,6 +25,7 @@ from spike4dgs.benchmark.scene.bursts import (
     write_bursts,
 )
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
 from spike4dgs.generators.profiles import RATE_HZ
 
 if TYPE_CHECKING:
@@ -140,6 +139,10 @@ def make_msdi_data(
     if min(rigs, instants) < 1 or variants < 0 or min(width, height) < 16:
         found = f"{variants} variants, {rigs} rigs, {instants} instants, {width}x{height}"
         raise problem("make-msdi-data", "counts from 1 up and at least 16x16 pixels", found, "correct them")
+    if FIRST_TRAINING_VARIANT + variants > FIRST_SEASON_VARIANT:
+        most = FIRST_SEASON_VARIANT - FIRST_TRAINING_VARIANT
+        fix = f"variants from {FIRST_SEASON_VARIANT} on are kept for hidden seasons"
+        raise problem("--variants", f"at most {most}", str(variants), fix)
     if spp < 1 or spp & (spp - 1):
         raise problem("--spp", "a power of two", str(spp), "give 16, 32, 64, ...")
     choose_device(device)

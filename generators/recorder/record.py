@@ -17,6 +17,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.inputs.numbers import MAX_TICKS
 from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.generators.recorder.capture import capture
@@ -93,9 +94,10 @@ def record(
     profile = source.profile if mode == CLIP else _without_poses(source.profile)
     light = _light(profile, flat, dark, flat_radiance)
     length = source.seconds if seconds is None else seconds
+    if not 0.5 < length * profile.fps <= MAX_TICKS:
+        expected = f"from {1 / profile.fps:g}, one tick, to {MAX_TICKS / profile.fps:g}"
+        raise problem("--seconds", expected, f"{length:g}", "record for longer, or shorter")
     n_ticks = round(length * profile.fps)
-    if n_ticks < 1:
-        raise problem("--seconds", f"at least {1 / profile.fps:g}, one tick", f"{length:g}", "record for longer")
     profile = _with_buffer(profile, continuous, buffer_s, length)
     if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulate is not None):
         raise UserError("; ".join(map(str, problems)))

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.inputs.numbers import MAX_GAIN
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.spikes.counted import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
@@ -19,7 +21,7 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
     draw,
     dropped_ticks,
     truth_record,
-    with_wrong_poses,
+    with_wrong_calibrations,
 )
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
@@ -101,7 +103,7 @@ def _worse_source(
         ppm={name: camera.clock.drift_ppm for name, camera in cameras.items()},
     )
     done = truth_record(worse, seed, cameras, profile.width)
-    return Source(with_wrong_poses(profile, cameras), EmulatedBackend(array), ticks / profile.fps, None, done)
+    return Source(with_wrong_calibrations(profile, cameras), EmulatedBackend(array), ticks / profile.fps, None, done)
 
 
 def _scene_profile(scene: Scene, layout: str) -> RigProfile:
@@ -141,7 +143,7 @@ def _calibration_streams(scene: Scene, mode: str) -> dict[str, UInt8]:
         if (recordings := scene.recordings(camera)) is None:
             fix = "emulate a scene that has calibration/"
             raise problem(scene.root, f"a {mode} recording of each camera", f"none of {camera}", fix)
-        s = recordings.flat if mode == FLAT else recordings.dark
+        s = raw(recordings.flat if mode == FLAT else recordings.dark)
         streams[camera] = orient(s.packed, s.width, s.height, not s.rows_bottom_up, False)
     return streams
 
@@ -155,8 +157,10 @@ def calibration_truth(flat: Path, dark: Path, flat_radiance: float, profile: Rig
     if not profile.calibrated:
         fix = "run `spike4dgs calibrate-rig` first, or leave out --flat and --dark"
         raise problem(f"rig {profile.name}", "a calibration, for a scene with --flat and --dark", "none", fix)
-    if not flat_radiance > 0:
-        raise problem("--flat-radiance", "a positive radiance", f"{flat_radiance:g}", "correct it")
+    if not 0 < flat_radiance <= MAX_GAIN:
+        raise problem(
+            "--flat-radiance", f"a positive radiance, {MAX_GAIN:g} at most", f"{flat_radiance:g}", "correct it"
+        )
     names = {c.id for c in profile.cameras}
     facts: dict[str, Any] = {"flat_radiance": flat_radiance}
     files: dict[str, Path] = {}

@@ -60,7 +60,7 @@ def _geometry(scene: Scene, target: Target) -> list[tuple[str, Any]]:
     low, high = np.percentile(depth[np.isfinite(depth)], [1, 99])
     return [
         ("inverse depth", np.clip((depth - low) / max(high - low, 1e-9), 0, 1)),
-        ("moving things", _colours(geometry.ids)),  # the title stays: the sheet is part of the scene's revision
+        ("moving things", _colours(geometry.ids)),
         ("moving region", scene.moving(target)),
         (f"flow, up to {np.linalg.norm(geometry.flow, axis=-1).max():.1f} px/ms", _wheel(geometry.flow)),
         ("truth, gray", encode_srgb(scene.ground_truth(target))),

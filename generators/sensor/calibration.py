@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.inputs.npz import Expected, read_npz
 from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
@@ -75,8 +76,9 @@ def truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[floa
     path = f"truth/{camera.id}.npz"
     if path not in scene.manifest.files:
         return None, None
-    with np.load(scene.manifest.path(path)) as truth:
-        pairs = [(getattr(found, name), truth[name] if name in truth else None) for name in ("gain", "dark")]
+    shapes = dict.fromkeys(("gain", "dark"), Expected("fiu", (camera.height, camera.width)))
+    truth = read_npz(scene.manifest.path(path), "the true maps", shapes, "make the scene again", optional=True)
+    pairs = [(getattr(found, name), truth.get(name)) for name in shapes]
     errors = [None if t is None else 100 * float(np.sqrt(np.mean((a / t - 1) ** 2))) for a, t in pairs]
     return errors[0], errors[1]
 

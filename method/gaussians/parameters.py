@@ -21,7 +21,8 @@ from spike4dgs.method.splat.reference import rotation_matrices
 
 SPLIT_SHRINK = 1.6  # a split Gaussian's two halves are this much smaller (3DGS)
 MAX_COPIES = 51  # the relocation formula's alternating sum is evaluated up to this many copies (MCMC)
-_COMMON = ("means", "log_scales", "quats", "logits", "colors")
+_SIDES: dict[str, tuple[int, ...]] = {"means": (3,), "log_scales": (3,), "quats": (4,), "logits": ()}  # after the first
+_COMMON = (*_SIDES, "colors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,16 @@ class Gaussians:
         """Return the Gaussians whose `tensors` these are."""
         extra = {k: v for k, v in tensors.items() if k not in _COMMON}
         return cls(**{k: tensors[k] for k in _COMMON}, extra=extra)
+
+    @classmethod
+    def from_file(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """Return the Gaussians of a file's `tensors`. Raises KeyError or ValueError where they are none."""
+        n = len(tensors["means"])
+        for name, tensor in tensors.items():
+            sides = _SIDES.get(name, tuple(tensor.shape[1:]))
+            if tuple(tensor.shape) != (n, *sides) or tensor.dtype != torch.float32:
+                raise ValueError(f"{name} of {n} Gaussians is {tensor.dtype} {tuple(tensor.shape)}")
+        return cls.from_tensors(tensors)
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -15,6 +15,7 @@ from typing import Any
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import parse_json
 from spike4dgs.benchmark.results.provenance import Provenance, read_provenance
 from spike4dgs.method.model_files.tensor_file import part, read_tensors, write_tensors
 
@@ -59,8 +60,8 @@ def read_model(path: Path) -> ModelFile:
         )
     tensors, meta = read_tensors(path, SCHEMA, "about", "a fitted model", FIX)
     try:
-        about = json.loads(meta.get("about", ""))
+        about = parse_json(meta.get("about", ""))
         kind, config, origin = about["kind"], dict(about["config"]), dict(about["provenance"])
     except (ValueError, KeyError, TypeError) as e:
-        raise problem(path, "kind, config and provenance of a model", repr(e), FIX) from None
+        raise problem(path, "kind, config and provenance of a model", repr(e)[:200], FIX) from None
     return ModelFile(str(kind), config, tensors, read_provenance(origin, str(path), FIX))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, sha256_file
+from spike4dgs.benchmark.files import atomic_path, parse_json, sha256_file
 from spike4dgs.benchmark.weights import FoundWeights, NamedWeights, find_weights, load_into, read_header, read_tensors
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def read_weights_card(kind: WeightKind[CardT], path: Path) -> CardT:
     """Return the file's card. Raises UserError for a damaged or foreign file. torch is not imported."""
     text = read_header(path, kind.schema, kind.description, kind.fix)
     try:
-        fields: dict[str, Any] = json.loads(text)
+        fields: dict[str, Any] = parse_json(text)
         return kind.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
     except (LookupError, TypeError, ValueError) as e:
         raise problem(path, kind.description, f"damaged data in its card ({e})", kind.fix) from None

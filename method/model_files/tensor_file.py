@@ -12,8 +12,10 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.inputs.tensor_header import check_header
 
 Tensors = dict[str, Tensor]
+_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)  # a foreign header, among others
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], schema: str, entries: Mapping[str, str], key: str) -> None:
@@ -31,11 +33,12 @@ def read_tensors(path: Path, schema: str, key: str, what: str, fix: str) -> tupl
     the message, `fix` the remedy.
     """
     try:
+        check_header(path)
         with safetensors.safe_open(path, framework="pt") as f:
             meta = f.metadata() or {}
             # Copies: a view into the file may be unaligned, and then sums are taken in another order.
             tensors = {name: f.get_tensor(name).clone() for name in f.keys()}
-    except (safetensors.SafetensorError, OSError, UnicodeError) as e:
+    except (safetensors.SafetensorError, *_DAMAGED) as e:
         raise problem(path, what, f"damaged data ({e})", fix) from None
     if meta.get("schema") != schema:
         raise problem(path, f"schema {schema}", repr(meta.get("schema")), fix)

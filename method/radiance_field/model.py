@@ -12,11 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from spike4dgs.benchmark.inputs.numbers import MAX_LENGTH, positive, whole
 from spike4dgs.benchmark.results.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.method.fitted_model import count_bytes
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
+from spike4dgs.method.model_files.modules import make_filled
 from spike4dgs.method.motion.hexplane import HexPlaneShape
 from spike4dgs.method.radiance_field.blocks import in_blocks
 from spike4dgs.method.radiance_field.field import Deformation, Field, encode_position
@@ -24,6 +26,7 @@ from spike4dgs.method.radiance_field.march import Rays, camera_rays, resample, s
 from spike4dgs.method.radiance_field.occupancy import Occupancy
 from spike4dgs.method.torch_state import one_torch_thread
 
+_MOST_LAYERS, _MOST_SAMPLES = 64, 4096  # that a file may state; published are 8 layers and 192 samples
 RAYS_AT_ONCE = 2048  # in a render: bounds memory at about 100 MB
 
 
@@ -209,11 +212,23 @@ class RadianceModel:
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> RadianceModel:
-        """Return the model that `save` wrote. Raises KeyError, TypeError or RuntimeError for another version's."""
+        """Return the model that `save` wrote.
+
+        Raises KeyError, TypeError, ValueError or RuntimeError for another version's.
+        """
         config: dict[str, Any] = dict(file.config)
+        for key in ("depth", "coarse_depth", "position_frequencies", "direction_frequencies"):
+            whole(config["shape"][key], 0, _MOST_LAYERS)
+        for key in ("coarse_samples", "fine_samples"):
+            whole(config["shape"][key], 1, _MOST_SAMPLES)
         planes = {**config["shape"]["deformation"], "spatial": tuple(config["shape"]["deformation"]["spatial"])}
         shape = FieldShape(**{**config["shape"], "deformation": HexPlaneShape(**planes)})
         values: dict[str, Any] = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in config["bounds"].items()}
-        field = DynamicField(shape, Bounds(**values), config["brightest"], torch.Generator())
-        field.load_state_dict(file.part("field"))
+        numbers = (*(values[key] for key in ("near", "far", "scale")), config["brightest"])
+        near, far, _, brightest = (positive(value, MAX_LENGTH) for value in numbers)
+        if near >= far:
+            raise ValueError(f"samples from {near:g} to {far:g} m")
+        field = make_filled(
+            lambda: DynamicField(shape, Bounds(**values), brightest, torch.Generator()), file.part("field")
+        )
         return cls(field.to(device), file.provenance.duration_us, device)

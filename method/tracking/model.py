@@ -39,6 +39,22 @@ class Tracks:
         values = (gaussians.means[free], quats, gaussians.colors[rows])
         return cls(times, free, rows, *(v.repeat(len(ticks), 1, 1) for v in values))
 
+    def check(self, gaussians: Gaussians) -> None:
+        """Raise ValueError unless these are tracks of those Gaussians."""
+        t, m, r = len(self.times_us), len(self.free), len(self.rows)
+        shapes = {"means": (t, m, 3), "quats": (t, m, 4), "colors": (t, r, gaussians.colors.shape[1])}
+        for name, value in self.tensors().items():
+            if tuple(value.shape) != shapes[name] or value.dtype != torch.float32:
+                raise ValueError(f"{name} of {t} times is {value.dtype} {tuple(value.shape)}, and not {shapes[name]}")
+        for index in (self.free, self.rows):
+            inside = (
+                index.ndim == 1 and index.dtype == torch.int64 and bool(((index >= 0) & (index < len(gaussians))).all())
+            )
+            if not inside:
+                raise ValueError(f"tracks of others than the {len(gaussians)} Gaussians")
+        if self.times_us.ndim != 1 or t == 0 or not bool((self.times_us.diff() > 0).all()):
+            raise ValueError("times that do not ascend")
+
     def tensors(self) -> dict[str, Tensor]:
         """Return the tracked values, by name."""
         return {"means": self.means, "quats": self.quats, "colors": self.colors}
@@ -131,7 +147,8 @@ class TrackedModel:
 
     @classmethod
     def from_file(cls, file: ModelFile, device: str) -> TrackedModel:
-        """Return the model that `save` wrote. Raises KeyError or TypeError for another version's."""
-        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in file.part("gaussians").items()})
-        tracks = {k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()}
-        return cls(gaussians, Tracks(**tracks), file.provenance.duration_us)
+        """Return the model that `save` wrote. Raises KeyError, TypeError or ValueError for another version's."""
+        gaussians = Gaussians.from_file({k: v.to(device) for k, v in file.part("gaussians").items()})
+        tracks = Tracks(**{k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()})
+        tracks.check(gaussians)
+        return cls(gaussians, tracks, file.provenance.duration_us)

@@ -11,11 +11,14 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.inputs.numbers import MAX_SIDE
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb, write_png
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing import camera_paths
 from spike4dgs.method.viewing.camera_paths import PathName, make_path, resized
 from spike4dgs.method.viewing.video import Write, check_video, video_writer
+
+_MOST_FRAMES = 1_000_000
 
 
 def render(
@@ -54,8 +57,16 @@ def render(
         check_video(out)
     if frames is not None:
         check_new(frames)
+    if not saved.provenance.duration_us * 1e-6 * fps * slow_motion <= _MOST_FRAMES:
+        found = f"{saved.provenance.duration_us * 1e-6:g} s at {fps:g} frames/s, {slow_motion:g} times slower"
+        raise problem(
+            "--slow-motion and --fps", f"a video of at most {_MOST_FRAMES} frames", found, "lower one of them"
+        )
     times = frame_times(saved.provenance.duration_us, slow_motion, fps)
     views = make_path(path, saved.provenance.cameras, camera)
+    size = scale * max(views(0.0).width, views(0.0).height)
+    if not 1 <= size <= MAX_SIDE:
+        raise problem("--scale", f"an image of 1 to {MAX_SIDE} pixels each way", f"{size:g}", "correct it")
     first = resized(views(0.0), scale)
     with ExitStack() as stack:
         writers: list[Write] = []

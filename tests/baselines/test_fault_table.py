@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from spike4dgs.baselines import fault_table
 from spike4dgs.baselines.fault_table import CASES, Case, Outcome
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.results.predictions import open_predictions
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 
 
@@ -45,6 +48,31 @@ def test_a_table_of_two_captures(tiny_data: Path, tmp_path: Path, monkeypatch: p
     before = model.stat().st_mtime_ns
     assert main(command) == 0
     assert model.stat().st_mtime_ns == before, "finished fits are kept"
+
+
+def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fault_table, "CASES", CASES[:1])
+    monkeypatch.setattr(fault_table, "LENS_CASES", (fault_table.LENS_CASES[-1],))
+    curved = tmp_path / "curved"
+    shutil.copytree(tiny_data / "car-0-tiny", curved)
+    lens = {"k1": -0.2}
+    for name in ("train", "test", "all"):
+        file = curved / f"transforms_{name}.json"
+        transforms = json.loads(file.read_text())
+        file.write_text(json.dumps({**transforms, "frames": [f | lens for f in transforms["frames"]]}))
+    write_manifest(curved)
+    out = tmp_path / "faults"
+    options = ["--methods", "tfp+static", "--budget", "0.01", "--out", str(out)]
+    assert main(["fault-table", str(tiny_data / "car-0-tiny"), "--lens-scene", str(curved), *options]) == 0
+    clips = [open_scene(out / "captures" / name / "clip") for name in ("none", "lens-ignored")]
+    assert all(not c.distortion for clip in clips for c in clip.cameras.values()), "the capture says pinhole"
+    with (out / "table.csv").open() as file:
+        exact, ignored = csv.DictReader(file)
+    # The streams are those of the same pinholes: a fit that is told of no lens has the same score.
+    assert (ignored["fault"], ignored["size"]) == ("lens", "ignored")
+    assert float(ignored["psnr"]) == pytest.approx(float(exact["psnr"]), abs=1e-3)
 
 
 def test_a_fit_that_fails_has_a_dash_and_its_reason(tmp_path: Path) -> None:

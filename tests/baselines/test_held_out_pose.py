@@ -119,14 +119,14 @@ def test_a_clip_of_targets_alone_is_refused() -> None:
 class SeenFrom(CountModel):
     """Renders the camera's position as a gray value; refinement moves it, and keeps its arguments."""
 
-    def __init__(self, given: list[Any]) -> None:
-        self.given = given
+    def __init__(self, seen: list[Any]) -> None:
+        self.seen = seen
 
     def render(self, camera: Camera, t_us: float) -> np.ndarray:
         return np.full((camera.height, camera.width), camera.t[0], np.float32)
 
     def refine(self, camera: Camera, image: np.ndarray, background: np.ndarray, t_us: float) -> Camera:
-        self.given.append((camera, image, background, t_us))
+        self.seen.append((camera, image, background, t_us))
         return replace(camera, t=camera.t + [0.5, 0, 0])
 
 
@@ -135,11 +135,11 @@ class Posed(CountMethod):
 
     def __init__(self) -> None:
         super().__init__("posed")
-        self.given: list[Any] = []
+        self.seen: list[Any] = []
 
     def fit(self, *args: Any, **kwargs: Any) -> SeenFrom:
         super().fit(*args, **kwargs)
-        return SeenFrom(self.given)
+        return SeenFrom(self.seen)
 
 
 def test_a_run_publishes_unrefined_and_refined_scores(small_scene: Path, tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_a_run_publishes_unrefined_and_refined_scores(small_scene: Path, tmp_pat
         assert np.allclose(image, value, atol=1e-3)
     assert plain["mean"]["psnr"] != refined["mean"]["psnr"]
     assert read_record(tmp_path / "results/posed.refined.json") == refined
-    assert method.fits == 1 and len(method.given) == 1
+    assert method.fits == 1 and len(method.seen) == 1
     again = Posed()
     assert run(tmp_path, [small_scene], again)[1]["scenes"] == refined["scenes"] and again.fits == 0
 
@@ -160,7 +160,7 @@ def test_a_run_publishes_unrefined_and_refined_scores(small_scene: Path, tmp_pat
 def test_the_image_for_refinement_is_unscored_and_of_the_background(small_scene: Path, tmp_path: Path) -> None:
     method, scene = Posed(), open_scene(small_scene)
     run(tmp_path, [small_scene], method)
-    camera, image, background, t_us = method.given[0]
+    camera, image, background, t_us = method.seen[0]
     assert camera.id == "cam_03" and TICKS == 80  # targets at 20, 40 and 60
     counts = scene.stream("cam_03").counts(0, 20) / (20 * GAIN)  # the longest time between them, by one tick
     assert np.allclose(image, counts, atol=1e-6) and image.dtype == np.float32

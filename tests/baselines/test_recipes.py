@@ -42,7 +42,7 @@ def test_every_row_of_the_papers_tables_is_a_method() -> None:
     main = {recipe.name for recipe in RECIPES} - {"tfp+static"} | {"spike4dgs", "spike4dgs-x"}
     for number in (1, 2):
         assert set(published(number).rows) == main
-        assert set(published(number, "uncalibrated").rows) <= {recipe.name for recipe in POSED}
+        assert set(published(number, "estimated").rows) <= {recipe.name for recipe in POSED}
     for number in (3, 4, 5, 7):
         assert set(published(number).rows) <= set(METHODS)
 
@@ -228,9 +228,27 @@ def test_recipes_that_are_compared_differ_in_one_part() -> None:
     for start in ("colmap", "dust3r"):
         assert differ(f"tfi+{start}+4dgs", f"tfi+{start}+4dgs+spss") == {"supervision"}
         assert differ("tfi+4dgs", f"tfi+{start}+4dgs") == {"initialization"}
-    for name in published(1, "uncalibrated").rows:
+    for name in published(1, "estimated").rows:
         assert differ(name.replace("+colmap", "").replace("-uncalibrated", ""), name) == {"initialization"}
     assert differ("tfp+4dgs", "tfp+dust3r+4dgs") == {"initialization"}
     assert differ("tfp+4dgs", "tfp+static") == {"motion", "settings"}
     static, moving = (METHODS[name].settings["trainer"] for name in ("tfp+static", "tfp+4dgs"))
     assert static.coarse_steps == moving.coarse_steps + moving.fine_steps, "the floor has as many steps"
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("nearest-view", ("poses",)),
+        ("tfp+4dgs", ("poses",)),
+        ("dy-spikenerf", ("poses",)),
+        ("tfp+4dgs+spss", ("poses", "flat-field")),  # its loss has the cameras' response
+        ("spike4dgs", ("poses", "flat-field")),
+        ("spike4dgs-x", ("poses", "flat-field")),
+        ("tfp+colmap+4dgs", ()),
+        ("spike4dgs-x+colmap", ("flat-field",)),
+        ("spike4dgs-uncalibrated", ("flat-field",)),
+    ],
+)
+def test_methods_say_what_they_are_given(name: str, given: tuple[str, ...]) -> None:
+    assert METHODS[name].given == given  # type: ignore[attr-defined]

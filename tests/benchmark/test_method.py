@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from dummy_methods import CountMethod
+from dummy_methods import CountMethod, run
 
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.results.predictions import read_info
+from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.scene.scene import open_scene
 
 
 def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,3 +35,26 @@ def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(plugins, "entry_points", lambda group: entries)
     with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
         recipes.find_methods()
+
+
+class Unflat(CountMethod):
+    given = ("poses",)
+
+
+def test_calibration_recordings_are_handed_to_those_who_say_that_they_are_given_them(small_scene: Path) -> None:
+    training = open_scene(small_scene).training
+    recordings = tuple(object() for _ in training.cameras)
+    scene = replace(training, recordings=recordings)  # type: ignore[arg-type]
+    assert recipes.training_for(CountMethod(), scene).recordings is recordings
+    assert recipes.training_for(Unflat(), scene).recordings == (None,) * len(training.cameras)
+    assert recipes.training_for(Unflat(), scene).cameras == training.cameras
+
+
+def test_what_a_method_is_given_is_recorded_and_no_part_of_the_key(small_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(small_scene)
+    plain, unflat = (Job(m, scene, 0, "cpu", recipes.Budget()) for m in (CountMethod(), Unflat()))
+    assert "given" not in plain.info.as_dict() and unflat.info.as_dict()["given"] == ["poses"]
+    assert plain.key == unflat.key, "finished predictions stay valid"
+    (record,) = run(tmp_path, [small_scene], Unflat())
+    assert record["method"]["given"] == ["poses"]
+    assert read_info(tmp_path / "predictions/counts/pattern-0").method.given == ("poses",)

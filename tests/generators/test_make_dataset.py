@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import json
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_renderer import FakeRenderer, files
+from fake_renderer import FakeRenderer, files, render_fakes
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.generators import make_dataset as command
-from spike4dgs.generators import scene_maker, tasks
+from spike4dgs.generators import scene_maker
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.scene_maker import Maker
-from spike4dgs.generators.worlds import WORLDS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
-PLAN = KeyPlan(80, 20_000, 0.5, (20, 10))
-
-
-@cache
-def car():
-    return WORLDS["car"].build(0, 0, PROFILES["tiny"].seconds)
 
 
 @pytest.fixture
 def fake(monkeypatch):
-    monkeypatch.setattr(tasks, "world_of", lambda job: car())
-    monkeypatch.setattr(tasks, "plan_of", lambda job: PLAN)
-    monkeypatch.setattr(tasks, "MultiViewRenderer", FakeRenderer)
-    monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
+    render_fakes(monkeypatch)
 
 
 def plain(stage, steps, total):
@@ -185,6 +173,8 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
         (("car",), {"lens": (float("nan"),)}, "--lens"),
         (("car",), {"lens": (-0.1,), "audit": True}, "--audit: expected pinhole cameras"),
         (("car",), {"lens": (-9.0,)}, "whose model holds up to the image's corners"),
+        (("car",), {"lens": (-0.1,), "lens_spread": 1.0}, "--lens-spread: expected a share from 0 to below 1"),
+        (("car",), {"lens_spread": 0.2}, "--lens-spread: expected the mean lens"),
     ],
 )
 def test_bad_arguments_are_one_line(worlds, options, words, tmp_path):
@@ -206,6 +196,12 @@ def test_folders_that_cannot_be_written_are_one_error(worlds, fake, tmp_path):
     with pytest.raises(UserError, match="file"):
         command.make_dataset(worlds, all=not worlds, profile="tiny", out=tmp_path / "file" / "data")
     assert (tmp_path / "file").read_text() == "no folder"
+
+
+def test_a_variant_of_seasons_is_named_as_such(fake, tmp_path, capsys):
+    for variant, kept in ((8999, False), (9000, True)):
+        assert command.make_dataset(("car",), profile="tiny", variant=variant, out=tmp_path) == 0
+        assert (f"variant {variant} is kept for hidden seasons" in capsys.readouterr().out) is kept
 
 
 def test_worlds_are_named_or_all(tmp_path):

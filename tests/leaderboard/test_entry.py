@@ -1,31 +1,146 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from submissions import edit, enter
+from submissions import board, edit, edit_with_ledger, enter, entry_of, everything, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.rank import write_leaderboard
+from spike4dgs.leaderboard.entry import check_numbers, entry_path, read_entries, write_entry
+from spike4dgs.leaderboard.rank import write_boards
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda e: e.update(label="certified"), "at label"),
+        (lambda e: e["verification"].update(label="certified"), "at verification/label"),
+        (lambda e: e["verification"].update(label="claimed"), "at verification"),
+        (lambda e: e["verification"].update(label="re-fitted"), "at verification"),
         (lambda e: e.update(note="x"), "'note' was unexpected"),
         (lambda e: e["record"].update(note="x"), "at record"),
-        (
-            lambda e: e["record"]["method"].update(name="other"),
-            "/tfp+4dgs, found pattern-0+pattern-1/other",
-        ),
+        (lambda e: e["record"]["method"].update(name="other"), "found that of local/pattern-0+1@"),
+        (lambda e: e["record"]["dataset"]["scenes"].update({"pattern-0": "0" * 64}), "found that of local/"),
         (lambda e: e["record"]["mean"].update(psnr=50.0), "expected psnr ="),
     ],
 )
-def test_damaged_entries_are_refused_by_name(done: Path, change: Any, message: str) -> None:
+def test_damaged_entries_are_refused_by_name_and_block_nobody(done: Path, change: Any, message: str) -> None:
     path = enter(done)
-    edit(path, change)
+    edit_with_ledger(path, change)
+    enter(done, "rough")
+    (only,) = board(done)["boards"]
+    assert [r["method"] for r in only["rows"]] == ["rough"]
+    (refused,) = board(done)["refused"]
+    assert refused["entry"].endswith("tfp+4dgs.json") and message in refused["reason"]
+
+
+def test_a_label_that_was_edited_by_hand_is_noticed(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = enter(done, verified=False)
+    verified = read(enter(done, "rough"))["verification"]
+    edit(path, lambda e: e.update(verification={**verified, "truth": {}}))
+    enter(done, "bad", verified=False)
+    assert "tfp+4dgs.json: expected an entry as LEDGER lists it" in capsys.readouterr().err
+    assert [r["method"] for r in board(done)["boards"][0]["rows"]] == ["rough", "bad"]
+    with pytest.raises(UserError, match="LEDGER"):
+        enter(done)
+    assert read(enter(done, replace=True))["verification"]["label"] == "re-scored"
+
+
+def test_a_damaged_ledger_is_an_error_with_its_line(done: Path) -> None:
+    enter(done)
+    ledger = done / "board/LEDGER"
+    ledger.write_text(ledger.read_text() + "not a line\n")
+    with pytest.raises(UserError, match=r"LEDGER: expected lines of a sha256.* found line 2: 'not a line'"):
+        enter(done, "rough")
+
+
+def test_half_written_files_of_killed_processes_block_nobody(done: Path) -> None:
+    path = enter(done)
+    for part in (path.with_name(".rough.part.json"), path.with_name(".tfp+4dgs.77.part.json")):
+        part.write_text('{"half":')
+    (done / "board/.leaderboard.9.part.json").write_text("{")
+    enter(done, "rough")
+    assert len(board(done)["boards"][0]["rows"]) == 2 and not board(done)["refused"]
+    assert not [name for name in everything(done / "board") if ".part" in name]
+
+
+@pytest.mark.parametrize("name", ["../../evil", "a/b", "..", ".hidden", "", "a\n", "CON", "aux.v2", "name.", "x" * 101])
+def test_names_that_are_no_file_names_everywhere_are_refused(done: Path, name: str) -> None:
+    edit(done / "out/results/tfp+4dgs.json", lambda r: r["method"].update(name=name))
     with pytest.raises(UserError) as e:
-        write_leaderboard(done / "board")
-    assert "tfp+4dgs.json" in str(e.value) and message in str(e.value)
+        enter(done, verified=False)
+    assert "\n" not in str(e.value) and not (done / "board").exists()
+
+
+@pytest.mark.parametrize("name", ["../../../out", "/tmp/out", "a/b", "..", "other"])
+def test_the_datasets_name_leads_nowhere(done: Path, name: str) -> None:
+    before = everything(done)
+    edit(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"].update(name=name))
+    with pytest.raises(UserError, match=r"expected the name pattern-0\+pattern-1|at dataset/name"):
+        enter(done, verified=False)
+    assert everything(done).keys() == before.keys()
+
+
+def test_names_that_differ_by_case_alone_are_refused(done: Path) -> None:
+    enter(done, "rough", verified=False)
+    result = done / "out/results/Rough.json"
+    result.write_text((done / "out/results/rough.json").read_text().replace('"rough"', '"Rough"'))
+    with pytest.raises(UserError, match=r"Rough\.json: expected a name that differs by more than case"):
+        submit(result, leaderboard=done / "board")
+
+
+def test_a_seed_of_its_own_is_an_entry_of_its_own(done: Path) -> None:
+    record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
+    assert entry_path(record).endswith("/tfp+4dgs.json")
+    record["method"]["seed"] = 7
+    assert entry_path(record).endswith("/tfp+4dgs@seed-7.json")
+    for seed in (-1, 10**30):
+        record["method"]["seed"] = seed
+        with pytest.raises(UserError, match="expected a seed"):
+            entry_path(record)
+
+
+@pytest.mark.parametrize("value", [1e308, -1e16, 10**400, float("nan"), float("inf"), 1.0000001e15])
+def test_numbers_out_of_bounds_are_refused(value: float) -> None:
+    with pytest.raises(UserError, match=r"expected numbers within \+-1e\+15"):
+        check_numbers({"a": [1, {"b": value}]}, Path("x"))
+    check_numbers({"a": [1e15, -3, None, True, "1e400"]}, Path("x"))
+
+
+def test_a_huge_fit_time_blocks_nobody(done: Path) -> None:
+    """Neither as a record nor, with a ledger line, as an entry."""
+    path = enter(done, "rough", verified=False)
+    text = path.read_text()
+    for value in (10**400, "1e400", 1e308, "NaN"):
+        record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
+        record["scenes"]["pattern-0"]["fit_seconds"] = "HUGE"
+        (done / "huge.json").write_text(json.dumps(record).replace('"HUGE"', str(value)))
+        with pytest.raises(UserError) as e:
+            submit(done / "huge.json", leaderboard=done / "board")
+        assert "\n" not in str(e.value)
+        entry = json.loads(text)
+        entry["record"]["scenes"]["pattern-0"]["fit_seconds"] = "HUGE"
+        path.write_text(json.dumps(entry).replace('"HUGE"', str(value)))
+        enter(done, verified=False)
+        assert [item["entry"].rpartition("/")[2] for item in board(done)["refused"]] == ["rough.json"]
+
+
+def test_a_key_twice_is_refused(done: Path) -> None:
+    result = done / "out/results/tfp+4dgs.json"
+    result.write_text(result.read_text().replace('"schema"', '"command": "x", "schema"', 1))
+    with pytest.raises(UserError, match="twice"):
+        enter(done, verified=False)
+
+
+def test_a_ledger_line_without_its_entry_is_what_a_kill_leaves(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    release_of(done, monkeypatch)
+    path = enter(done)
+    before = path.read_bytes()
+    path.unlink()
+    entries, refused = read_entries(done / "board", "entries", "local")
+    assert not entries and not refused
+    entry = json.loads(before)
+    write_entry(done / "board", entry["record"], entry["verification"], replace=False)
+    write_boards(done / "board")
+    assert read(entry_of(done, "tfp+4dgs"))["record"] == entry["record"]

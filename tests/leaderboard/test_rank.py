@@ -6,14 +6,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pytest
 from dummy_methods import CountMethod, run
-from submissions import Record, board, enter
+from submissions import Record, board, edit, enter, read, release_of, submit
 
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.entry import read_entry
-from spike4dgs.leaderboard.rank import rank_entries, write_leaderboard
-from spike4dgs.leaderboard.submit_command import submit
+from spike4dgs.leaderboard.rank import rank_entries, write_boards
 
 
 def test_rows_are_ranked_and_failures_come_last(done: Path) -> None:
@@ -25,33 +24,74 @@ def test_rows_are_ranked_and_failures_come_last(done: Path) -> None:
     assert [(r["method"], r["rank"]) for r in rows] == [("tfp+4dgs", 1), ("rough", 2), ("bad", None)]
     assert rows[0]["mean"][PRIMARY] > rows[1]["mean"][PRIMARY]
     assert rows[2]["status"] == {"pattern-0": "failed", "pattern-1": "failed"}
-    assert rows[2]["mean"][PRIMARY] is None and rows[2]["fit_seconds"] is None
+    assert rows[2]["mean"][PRIMARY] is None and rows[2]["costs"]["fit_seconds"]["claimed"] is None
     assert [m["id"] for m in board(done)["metrics"]] == list(METRICS)
     check_schema(board(done), load_schema("spike4dgs.leaderboard", "leaderboard.schema.json"), "board", "")
 
 
-def entry_of(record: Record, name: str, psnr: float | None, submitted: str) -> Record:
+def test_claimed_rows_have_no_rank_and_come_after_the_others(done: Path) -> None:
+    enter(done, verified=False)
+    enter(done, "rough")
+    rows = board(done)["boards"][0]["rows"]
+    assert rows[0]["mean"][PRIMARY] < rows[1]["mean"][PRIMARY]
+    assert [(r["method"], r["rank"], r["label"]) for r in rows] == [
+        ("rough", 1, "re-scored"),
+        ("tfp+4dgs", None, "claimed"),
+    ]
+
+
+def test_costs_are_claimed_and_trained_on_is_shown(done: Path) -> None:
+    class Learned(CountMethod):
+        trained_on = ("other-1-small",)
+
+    run(done / "out", [done / "s0", done / "s1"], Learned("learned"))
+    record = read(enter(done, "learned"))["record"]
+    (row,) = board(done)["boards"][0]["rows"]
+    seconds = sum(cell["fit_seconds"] for cell in record["scenes"].values())
+    assert row["costs"]["fit_seconds"] == {"claimed": pytest.approx(seconds), "re-fitted": None}
+    assert row["trained_on"] == ["other-1-small"] and row["rank"] == 1
+    assert row["given"] == ["poses", "flat-field"] and len(row["code"]["claimed"]) == len(row["code"]["verifier"]) == 1
+
+
+def entry_with(record: Record, name: str, psnr: float | None, submitted: str, seed: int = 0, **changes: Any) -> Record:
     record = copy.deepcopy(record)
-    record["method"]["name"] = name
+    record["method"].update(name=name, seed=seed, **changes)
     record["mean"][PRIMARY] = psnr
-    checked = {"label": "verified", "unverified": []}
-    return {"schema": "spike4dgs-entry/1", **checked, "submitted": submitted, "record": record}
+    by = {"when": submitted, "harness": record["harness"], "environment": record["environment"]}
+    verification = {"label": "re-scored", "unverified": [], "by": by, "truth": {}, "refit": None}
+    return {"schema": "spike4dgs-entry/2", "submitted": submitted, "verification": verification, "record": record}
+
+
+def ranks(entries: list[Record]) -> list[tuple[str, int | None, list[int], float | None]]:
+    rows = rank_entries({f"entries/a@0/{i}.json": entry for i, entry in enumerate(entries)})
+    return [(r["method"], r["rank"], r["seeds"], r["mean"][PRIMARY]) for r in rows]
 
 
 def test_of_equal_values_the_earlier_submission_is_first(finished: Path) -> None:
     record = json.loads((finished / "out/results/rough.json").read_text())
-    rows = rank_entries(
-        [
-            entry_of(record, "later", 20.0, "2026-01-02T00:00:00Z"),
-            entry_of(record, "none", None, "2026-01-01T00:00:00Z"),
-            entry_of(record, "best", 21.0, "2026-01-03T00:00:00Z"),
-            entry_of(record, "earlier", 20.0, "2026-01-01T00:00:00Z"),
-        ]
-    )
-    assert [(r["method"], r["rank"]) for r in rows] == [("best", 1), ("earlier", 2), ("later", 3), ("none", None)]
+    entries = [
+        entry_with(record, "later", 20.0, "2026-01-02T00:00:00Z"),
+        entry_with(record, "none", None, "2026-01-01T00:00:00Z"),
+        entry_with(record, "best", 21.0, "2026-01-03T00:00:00Z"),
+        entry_with(record, "earlier", 20.0, "2026-01-01T00:00:00Z"),
+    ]
+    assert [r[:2] for r in ranks(entries)] == [("best", 1), ("earlier", 2), ("later", 3), ("none", None)]
 
 
-def test_a_method_with_one_failed_scene_is_not_ranked(done: Path) -> None:
+def test_a_row_is_the_mean_over_the_seeds_of_one_configuration(finished: Path) -> None:
+    record = json.loads((finished / "out/results/rough.json").read_text())
+    entries = [entry_with(record, "a", 20.0 + seed, "2026-01-02T00:00:00Z", seed) for seed in range(3)]
+    other = entry_with(record, "a", 50.0, "2026-01-02T00:00:00Z", 3, params={"steps": 9})
+    claimed = entry_with(record, "a", 90.0, "2026-01-02T00:00:00Z", 4)
+    claimed["verification"] = {"label": "claimed", "unverified": [], "by": None, "truth": {}, "refit": None}
+    assert ranks([*entries, other, claimed]) == [
+        ("a", 1, [3], 50.0),
+        ("a", 2, [0, 1, 2], 21.0),
+        ("a", None, [4], 90.0),
+    ]
+
+
+def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     class Half(CountMethod):
         def fit(self, scene: Any, *args: Any, **kwargs: Any) -> Any:
             if scene.id == "pattern-1":
@@ -59,10 +99,11 @@ def test_a_method_with_one_failed_scene_is_not_ranked(done: Path) -> None:
             return super().fit(scene, *args, **kwargs)
 
     run(done / "out", [done / "s0", done / "s1"], Half("half"))
-    entry = read_entry(enter(done, "half"))
-    assert entry["label"] == "verified", "what was scored was verified"
+    entry = read(enter(done, "half"))
+    assert entry["verification"]["label"] == "re-scored", "what was scored was verified"
     (row,) = board(done)["boards"][0]["rows"]
     assert row["rank"] is None and row["status"] == {"pattern-0": "ok", "pattern-1": "failed"}
+    assert "not ranked (pattern-1 failed)" in capsys.readouterr().out
 
 
 def test_only_records_of_one_dataset_compare(done: Path) -> None:
@@ -73,17 +114,69 @@ def test_only_records_of_one_dataset_compare(done: Path) -> None:
     assert sorted(names) == [("pattern-0+pattern-1", ["tfp+4dgs"]), ("pattern-1", ["other"])]
 
 
-def test_the_leaderboard_is_made_from_the_entries_alone(done: Path) -> None:
+def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Unposed(CountMethod):
+        given = ("flat-field",)
+
+    release_of(done, monkeypatch)
+    run(done / "out", [done / "s0", done / "s1"], Unposed("unposed"))
+    enter(done)
+    enter(done, "unposed")
+    boards = {b["track"]: [(r["method"], r["rank"]) for r in b["rows"]] for b in board(done, "leaderboard")["boards"]}
+    assert {track: {m for m, _ in rows} for track, rows in boards.items()} == {
+        "patterns": {"tfp+4dgs", "unposed"},
+        "unposed": {"unposed"},
+    }
+    assert boards["unposed"] == [("unposed", 1)] and not (done / "board/local.json").exists()
+    out = capsys.readouterr().out
+    revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
+    assert f"on patterns (release 1, revision {revision})" in out
+    assert f"rank 1 of 1 on unposed (release 1, revision {revision})" in out
+
+
+def test_the_boards_are_made_from_the_entries_alone(done: Path) -> None:
     enter(done)
     enter(done, "rough")
-    before = (done / "board/leaderboard.json").read_bytes()
-    (done / "board/leaderboard.json").unlink()
-    write_leaderboard(done / "board")
-    assert (done / "board/leaderboard.json").read_bytes() == before
+    before = (done / "board/local.json").read_bytes()
+    (done / "board/local.json").unlink()
+    write_boards(done / "board")
+    assert (done / "board/local.json").read_bytes() == before
+    shutil.rmtree(done / "board/local")
+    write_boards(done / "board")
+    assert not (done / "board/local.json").exists()
 
 
-def test_the_committed_leaderboard_follows_from_the_committed_entries(tmp_path: Path) -> None:
+def test_the_archive_is_kept_and_has_no_ranks(done: Path) -> None:
+    path = enter(done)
+    archive = done / "board/archive" / path.parent.name
+    archive.parent.mkdir()
+    path.parent.rename(archive)
+    name = f"archive/{path.parent.name}/{path.name}"
+    (done / "board/LEDGER").write_text((done / "board/LEDGER").read_text().replace("local/", "archive/"))
+    write_boards(done / "board")
+    (only,) = board(done, "archive")["boards"]
+    assert only["why"].startswith("before release 1") and not (done / "board/local.json").exists()
+    assert [(r["rank"], r["entries"]) for r in only["rows"]] == [(None, [name])]
+
+
+def test_the_committed_boards_follow_from_the_committed_entries(tmp_path: Path) -> None:
     committed = Path(__file__).resolve().parents[2] / "leaderboard"
-    shutil.copytree(committed / "entries", tmp_path / "entries")
-    write_leaderboard(tmp_path)
-    assert (tmp_path / "leaderboard.json").read_bytes() == (committed / "leaderboard.json").read_bytes()
+    for name in ("entries", "archive"):
+        if (committed / name).is_dir():
+            shutil.copytree(committed / name, tmp_path / name)
+    shutil.copy(committed / "LEDGER", tmp_path)
+    boards = write_boards(tmp_path)
+    assert boards["entries"]["boards"] and not any(b["refused"] for b in boards.values())
+    for name in ("leaderboard.json", "archive.json"):
+        assert (tmp_path / name).is_file() == (committed / name).is_file()
+        assert not (tmp_path / name).is_file() or (tmp_path / name).read_bytes() == (committed / name).read_bytes()
+
+
+def test_editing_a_board_does_not_last(done: Path) -> None:
+    enter(done)
+    before = (done / "board/local.json").read_bytes()
+    edit(done / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
+    enter(done)
+    assert (done / "board/local.json").read_bytes() == before

@@ -7,18 +7,43 @@ from typing import Any
 
 import pytest
 from dummy_methods import CountMethod, run
-from submissions import edit, enter, everything
+from submissions import board, edit, enter, everything, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.entry import read_entry
-from spike4dgs.leaderboard.submit_command import submit
+from spike4dgs.leaderboard.submit_command import submit_all
 
 
-def test_with_files_an_entry_is_verified(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    entry = read_entry(enter(done))
-    assert entry["label"] == "verified"
+def test_with_files_an_entry_is_re_scored(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    release_of(done, monkeypatch)
+    path = enter(done)
+    entry = read(path)
+    assert entry["verification"]["label"] == "re-scored"
     assert entry["record"] == json.loads((done / "out/results/tfp+4dgs.json").read_text())
-    assert capsys.readouterr().out == "tfp+4dgs: verified, rank 1 of 1 on pattern-0+pattern-1\n"
+    assert entry["verification"]["by"].keys() == {"when", "harness", "environment"}
+    revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
+    assert path.parent == done / f"board/entries/1-patterns@{revision}"
+    line = f"tfp+4dgs: re-scored, rank 1 of 1 on patterns (release 1, revision {revision})\n"
+    assert capsys.readouterr().out == line
+
+
+def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    release_of(done, monkeypatch)
+    enter(done)
+    public = everything(done / "board/entries")
+    release_of(done, monkeypatch, pattern_0="cd" * 32)
+    edit(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"]["scenes"].update({"pattern-0": "ab" * 32}))
+    capsys.readouterr()
+    assert submit(done / "out/results/tfp+4dgs.json", leaderboard=done / "board", replace=True) == 0
+    out = capsys.readouterr().out
+    assert f"pattern-0: revision {'ab' * 6} here, {'cd' * 6} in release 1" in out
+    assert f"local board, in {done}/board/local.json, not on a track: local/pattern-0+1@" in out
+    assert everything(done / "board/entries") == public, "the track's entry is as it was"
+    (only,) = board(done)["boards"]
+    assert only["track"] is None and only["why"].startswith("pattern-0: revision abab")
 
 
 @pytest.mark.parametrize(
@@ -30,14 +55,14 @@ def test_with_files_an_entry_is_verified(done: Path, capsys: pytest.CaptureFixtu
         (("predictions", "one"), "no --scenes for pattern-1"),
     ],
 )
-def test_without_files_an_entry_is_self_reported(
+def test_without_files_an_entry_is_claimed(
     done: Path, given: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options: dict[str, Any] = {"predictions": done / "out/predictions/tfp+4dgs"} if "predictions" in given else {}
     options |= {"scenes": (done / "s0", done / "s1")} if "scenes" in given else {}
     options |= {"scenes": (done / "s0",)} if "one" in given else {}
-    assert read_entry(enter(done, verified=False, **options))["label"] == "self-reported"
-    assert f"self-reported ({reason}), rank 1" in capsys.readouterr().out
+    assert read(enter(done, verified=False, **options))["verification"]["label"] == "claimed"
+    assert f"claimed ({reason}), not ranked (nothing was computed again) on the local" in capsys.readouterr().out
 
 
 def test_submitting_twice_changes_nothing(done: Path) -> None:
@@ -57,10 +82,10 @@ def test_scoring_again_is_the_same_record(done: Path) -> None:
     assert everything(done / "board") == before
 
 
-def test_a_self_reported_entry_can_be_verified_later(done: Path) -> None:
-    submitted = read_entry(enter(done, verified=False))["submitted"]
-    entry = read_entry(enter(done))
-    assert (entry["label"], entry["submitted"]) == ("verified", submitted)
+def test_a_claimed_entry_can_be_verified_later(done: Path) -> None:
+    submitted = read(enter(done, verified=False))["submitted"]
+    entry = read(enter(done))
+    assert (entry["verification"]["label"], entry["submitted"]) == ("re-scored", submitted)
 
 
 def test_another_record_needs_replace(done: Path) -> None:
@@ -71,7 +96,49 @@ def test_another_record_needs_replace(done: Path) -> None:
         enter(done)
     assert path.read_bytes() == before
     enter(done, replace=True)
-    assert read_entry(path)["record"]["method"]["params"] == {"steps": 2}
+    assert read(path)["record"]["method"]["params"] == {"steps": 2}
+
+
+def test_seeds_are_entries_of_one_row(done: Path) -> None:
+    enter(done)
+    run(done / "other", [done / "s0", done / "s1"], CountMethod("tfp+4dgs"), seed=5)
+    seeded = done / "other/results/tfp+4dgs.json"
+    submit_all(
+        {seeded: done / "other/predictions/tfp+4dgs"},
+        scenes=(done / "s0", done / "s1"),
+        leaderboard=done / "board",
+    )
+    (row,) = board(done)["boards"][0]["rows"]
+    assert row["seeds"] == [0, 5] and [p.rpartition("/")[2] for p in row["entries"]] == [
+        "tfp+4dgs.json",
+        "tfp+4dgs@seed-5.json",
+    ]
+    each = [json.loads(p.read_text())["mean"]["psnr"] for p in (seeded, done / "out/results/tfp+4dgs.json")]
+    assert row["mean"]["psnr"] == pytest.approx(sum(each) / 2)
+
+
+def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(done / "out/results/rough.json", lambda r: r["mean"].update(psnr=99.0))
+    results = {done / f"out/results/{n}.json": done / "out/predictions" / n for n in ("rough", "tfp+4dgs")}
+    assert submit_all(results, scenes=(done / "s0", done / "s1"), leaderboard=done / "board") == 1
+    captured = capsys.readouterr()
+    assert "expected psnr" in captured.err and "tfp+4dgs: re-scored, rank 1 of 1" in captured.out
+    assert captured.out.count("local board, in") == 1
+
+
+def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = everything(done)
+    monkeypatch.chdir(done)
+    for name in ("", ".", "out", "s0/scene.json"):
+        with pytest.raises(UserError, match="--leaderboard: expected a leaderboard or a new folder"):
+            submit(done / "out/results/rough.json", leaderboard=Path(name))
+        with pytest.raises(UserError, match="--leaderboard"):
+            submit_all({}, scenes=(), leaderboard=Path(name))
+    (done / "empty").mkdir()
+    monkeypatch.chdir(done / "empty")
+    with pytest.raises(UserError, match="the working folder"):
+        submit(done / "out/results/rough.json", leaderboard=Path(""))
+    assert everything(done) == before
 
 
 def test_the_default_folder_is_the_repositorys() -> None:

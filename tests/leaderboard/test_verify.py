@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from dummy_methods import CountMethod, run
-from submissions import Record, board, edit, enter
+from submissions import Record, board, edit, enter, entry_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
@@ -16,8 +16,6 @@ from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.predictions import INFO, SUMS
 from spike4dgs.benchmark.runs.score_command import score
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE
-from spike4dgs.leaderboard.entry import read_entry
-from spike4dgs.leaderboard.submit_command import submit
 
 
 def better_psnr(record: Record) -> None:
@@ -37,7 +35,7 @@ def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
     ):
         enter(done)
     assert not (done / "board").exists()
-    assert read_entry(enter(done, verified=False))["label"] == "self-reported"
+    assert read(enter(done, verified=False))["verification"]["label"] == "claimed"
 
 
 def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
@@ -48,7 +46,7 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
         record["mean"]["psnr"] += 1e-7 / 6
 
     edit(done / "out/results/tfp+4dgs.json", nudge)
-    assert read_entry(enter(done))["label"] == "verified"
+    assert read(enter(done))["verification"]["label"] == "re-scored"
 
 
 @pytest.mark.parametrize(
@@ -118,15 +116,15 @@ def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
 ) -> None:
     run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
     monkeypatch.delenv(VARIABLE)
-    entry = read_entry(enter(done, "with", verified=False))
-    assert set(entry["unverified"]) == {*METRICS} - {"lpips_alex", "lpips_vgg", "lpips_squeeze"}
-    entry = read_entry(enter(done, "with"))
-    assert (entry["label"], entry["unverified"]) == ("verified", ["metaiqa"])
+    entry = read(enter(done, "with", verified=False))
+    assert set(entry["verification"]["unverified"]) == {*METRICS} - {"lpips_alex", "lpips_vgg", "lpips_squeeze"}
+    entry = read(enter(done, "with"))
+    assert (entry["verification"]["label"], entry["verification"]["unverified"]) == ("re-scored", ["metaiqa"])
     assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
-    assert "with: verified (as claimed, for lack of weights: metaiqa), rank 1" in capsys.readouterr().out
+    assert "with: re-scored (as claimed, for lack of weights: metaiqa), rank 1" in capsys.readouterr().out
     monkeypatch.setenv(VARIABLE, str(weights))
     path = enter(done, "with")
-    assert read_entry(path)["unverified"] == []
+    assert read(path)["verification"]["unverified"] == []
     before = path.read_bytes()
     monkeypatch.delenv(VARIABLE)
     assert enter(done, "with").read_bytes() == before, "what was verified stays so"
@@ -147,11 +145,11 @@ def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done:
         enter(done, "with")
     torch.manual_seed(1)
     torch.save(metaiqa_network().state_dict(), weights / METAIQA.name)
-    assert read_entry(enter(done, "with"))["unverified"] == ["metaiqa"]
+    assert read(enter(done, "with"))["verification"]["unverified"] == ["metaiqa"]
 
 
 def test_more_weights_than_the_claimants_do_no_harm(done: Path, weights: Path) -> None:
-    assert read_entry(enter(done))["unverified"] == []
+    assert read(enter(done))["verification"]["unverified"] == []
 
 
 def test_predictions_of_another_program_are_scored_and_verified(done: Path) -> None:
@@ -167,7 +165,7 @@ def test_predictions_of_another_program_are_scored_and_verified(done: Path) -> N
     scenes = (done / "s0", done / "s1")
     assert score(theirs, scenes, out=done / "theirs.json") == 0
     assert submit(done / "theirs.json", predictions=theirs, scenes=scenes, leaderboard=done / "board") == 0
-    assert read_entry(done / "board/entries/pattern-0+pattern-1/theirs.json")["label"] == "verified"
+    assert read(entry_of(done, "theirs"))["verification"]["label"] == "re-scored"
     (row,) = board(done)["boards"][0]["rows"]
     ours = json.loads((done / "out/results/rough.json").read_text())
-    assert row["rank"] == 1 and row["fit_seconds"] is None and row["mean"] == ours["mean"]
+    assert row["rank"] == 1 and row["costs"]["fit_seconds"]["claimed"] is None and row["mean"] == ours["mean"]

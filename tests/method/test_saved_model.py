@@ -130,14 +130,17 @@ def without(key: str) -> Any:
         (lambda f: {"config": {}}, "cannot read .KeyError"),
         (lambda f: {"config": {"motion": {**f.config["motion"], "name": "warp"}}}, "cannot read .KeyError: 'warp'"),
         (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"x": 1}}}}, "found 'x'; correct the name"),
-        (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}}, "cannot read .Runtime"),
+        (
+            lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}},
+            "cannot read .ValueError: .* in place of",
+        ),
         (
             lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
             "cannot read .KeyError",
         ),
-        (lambda f: {"provenance": provenance(cameras=())}, "expected method, scene, cameras and clock of a fit"),
-        (lambda f: {"provenance": provenance(rate_hz=0.0)}, "bad .'rate_hz'."),
-        (lambda f: {"provenance": provenance(method={})}, "KeyError.'name'."),
+        (lambda f: {"provenance": provenance(cameras=())}, "at cameras"),
+        (lambda f: {"provenance": provenance(rate_hz=0.0)}, "at rate_hz"),
+        (lambda f: {"provenance": provenance(method={})}, "at method: 'name' is a required property"),
     ],
 )
 def test_a_model_of_another_version_is_one_clear_error(saved: Path, change: Any, message: str) -> None:

@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +59,46 @@ class CountMethod:
         return CountModel(weights, rates)
 
 
+class WorkerKiller(CountMethod):
+    """Kills its process after two steps, once for each file in a folder. Notes the step at which each fit begins."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        super().__init__(name)
+        self._folder = folder
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> CountModel:
+        with open(self._folder / "begins.txt", "a") as f:
+            saved = request.checkpoint and request.checkpoint.exists() and json.loads(request.checkpoint.read_text())
+            f.write(f"{saved['step'] if saved else 0}\n")
+        bullets = sorted(self._folder.glob("bullet*"))
+        self._die_at = 2 if bullets else None
+        for bullet in bullets[:1]:
+            bullet.unlink()
+        return super().fit(scene, request)
+
+
+class WaitingMethod(CountMethod):
+    """Begins to fit, says so by a file, and goes on once another file is there."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        super().__init__(name)
+        self._folder = folder
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> CountModel:
+        (self._folder / "begun").touch()
+        wait_for(lambda: (self._folder / "go").exists())
+        return super().fit(scene, request)
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 120) -> None:
+    """Return when a condition holds; an error after `seconds`."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            raise TimeoutError(f"nothing after {seconds} s")
+        time.sleep(0.05)
+
+
 class FailingMethod(CountMethod):
     """Fails in a way of its choice."""
 
@@ -71,6 +113,22 @@ class FailingMethod(CountMethod):
 
     def render(self, camera: Camera, t_us: float) -> Any:
         return self._result
+
+
+# Also the state of the checkout, which somebody may change while the tests run.
+TIMINGS = ("fit_seconds", "render_fps", "peak_memory_mb", "fitted_with")
+
+
+def without_timings(record: dict[str, Any]) -> dict[str, Any]:
+    """Return what two runs of the same cells share."""
+    cells = {s: {k: v for k, v in c.items() if k not in TIMINGS} for s, c in record["scenes"].items()}
+    return {**record, "scenes": cells, "created": None, "command": None, "harness": None}
+
+
+def prediction_bytes(out: Path) -> dict[str, bytes]:
+    """Return the predictions of a run, of all its seeds, without what tells of times."""
+    paths = sorted(p for p in out.rglob("*") if "predictions" in p.relative_to(out).parts)
+    return {p.relative_to(out).as_posix(): p.read_bytes() for p in paths if p.is_file() and p.suffix != ".json"}
 
 
 def run(out: Path, scenes: list[Path], *methods: Any, **settings: Any) -> list[dict[str, Any]]:

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+from functools import cache
+from types import SimpleNamespace
+
 import numpy as np
 
 from spike4dgs.benchmark.scene.images import gray
+from spike4dgs.generators import scene_maker, tasks
+from spike4dgs.generators.profiles import PROFILES
+from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.render import StaticViews
+from spike4dgs.generators.worlds import WORLDS
+
+PLAN = KeyPlan(80, 20_000, 0.5, (20, 10))
+
+
+@cache
+def car():
+    return WORLDS["car"].build(0, 0, PROFILES["tiny"].seconds)
+
+
+def render_fakes(monkeypatch):
+    """Let `make-dataset` render scenes of the profile tiny with the FakeRenderer; the rest of it is real."""
+    monkeypatch.setattr(tasks, "world_of", lambda job: car())
+    monkeypatch.setattr(tasks, "plan_of", lambda job: PLAN)
+    monkeypatch.setattr(tasks, "MultiViewRenderer", FakeRenderer)
+    monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
 
 
 class FakeRenderer:

@@ -1,15 +1,25 @@
-"""Help for tests of the leaderboard: submit a finished run's records, read and change the files."""
+"""Help for tests of the leaderboard: submit a finished run's records, change the files, make releases."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.files import write_json
-from spike4dgs.leaderboard.submit_command import submit
+import pytest
+
+from spike4dgs.benchmark.files import sha256_json, write_json
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard import tracks
+from spike4dgs.leaderboard.entry import read_entry
+from spike4dgs.leaderboard.ledger import add_line, read_ledger
+from spike4dgs.leaderboard.submit_command import make_submit
+from spike4dgs.leaderboard.truth_check import no_renderings
 
 Record = dict[str, Any]
+submit = make_submit(no_renderings)
 
 
 def enter(done: Path, name: str = "tfp+4dgs", verified: bool = True, **options: Any) -> Path:
@@ -21,7 +31,18 @@ def enter(done: Path, name: str = "tfp+4dgs", verified: bool = True, **options: 
             **options,
         }
     assert submit(done / f"out/results/{name}.json", leaderboard=done / "board", **options) == 0
-    return next((done / "board/entries").glob(f"*/{name}.json"))
+    return entry_of(done, name)
+
+
+def entry_of(done: Path, name: str) -> Path:
+    (path,) = (p for folder in ("entries", "local") for p in (done / "board" / folder).glob(f"*/{name}.json"))
+    return path
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read an entry as the leaderboard does."""
+    board = path.parents[2]
+    return read_entry(board, path.relative_to(board).as_posix(), read_ledger(board))
 
 
 def edit(path: Path, change: Any) -> None:
@@ -30,9 +51,40 @@ def edit(path: Path, change: Any) -> None:
     write_json(path, data)
 
 
+def edit_with_ledger(path: Path, change: Any) -> None:
+    """Change an entry as somebody who also knows the ledger would."""
+    edit(path, change)
+    board = path.parents[2]
+    add_line(board, sha256_json(json.loads(path.read_text())), path.relative_to(board).as_posix())
+
+
 def everything(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def board(done: Path) -> dict[str, Any]:
-    return json.loads((done / "board/leaderboard.json").read_text())
+def board(done: Path, name: str = "local") -> dict[str, Any]:
+    return json.loads((done / f"board/{name}.json").read_text())
+
+
+def write_release(folder: Path, all_tracks: Mapping[str, Any], ceilings: Mapping[str, float] | None = None) -> Path:
+    data = {"schema": "spike4dgs-release/1", "release": "1", "tracks": dict(all_tracks), "ceilings_db": ceilings or {}}
+    write_json(folder / "1.json", data)
+    digest = hashlib.sha256((folder / "1.json").read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text(f"{digest}  1.json\n")
+    return folder
+
+
+def track(scenes: Mapping[str, str | None], withheld: tuple[str, ...] = (), split: str = "center") -> dict[str, Any]:
+    status = "announced" if None in scenes.values() else "open"
+    return {"title": "A track", "status": status, "split": split, "withheld": [*withheld], "scenes": dict(scenes)}
+
+
+def release_of(
+    done: Path, monkeypatch: pytest.MonkeyPatch, ceilings: Mapping[str, float] | None = None, **revisions: str
+) -> None:
+    """Ship a release whose tracks `patterns` and `unposed` have the run's two scenes."""
+    scenes = {s.id: s.revision for s in (open_scene(done / "s0"), open_scene(done / "s1"))}
+    scenes |= {name.replace("_", "-"): revision for name, revision in revisions.items()}
+    all_tracks = {"patterns": track(scenes), "unposed": track(scenes, ("poses",))}
+    monkeypatch.setattr(tracks, "FOLDER", write_release(done / "releases", all_tracks, ceilings))
+    tracks.read_release.cache_clear()

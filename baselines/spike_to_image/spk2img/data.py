@@ -1,7 +1,7 @@
 """Training data of Spk2ImgNet: spikes and the ground truth of ordinary scene folders.
 
 Every image of a scene counts, those of the held-out camera (every 20 ticks) and the sparse ones of the others. The
-public benchmark, variant 0 of every world, is refused: no training may see a scored scene.
+public benchmark, variant 0 of every world, and hidden seasons are refused: no training may see a scored scene.
 
 Augmentation is exact: the eight symmetries of the square, and time reversal. An integrator's spikes played backwards
 are those of an integrator that saw the light backwards; the image of the start of tick t is then that of the end of
@@ -21,9 +21,9 @@ from spike4dgs.baselines.spike_to_image.windows import HALF_WINDOW, WINDOW, wind
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.variants import PUBLIC_VARIANT, is_reserved
 
 Float32 = NDArray[np.float32]
-PUBLIC_VARIANT = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,16 @@ class Batch:
 def open_for_training(folder: Path, allow_gaps: bool = False) -> Scene:
     """Open a scene folder.
 
-    Raises UserError for one of the public benchmark, and for a recording with gaps unless `allow_gaps`.
+    Raises UserError for one of the public benchmark or of a hidden season, and for a recording with gaps unless
+    `allow_gaps`.
     """
     scene = open_scene(folder, allow_gaps)
-    if scene.meta.get("source", {}).get("variant") == PUBLIC_VARIANT:
-        fix = "make one with `spike4dgs make-dataset WORLD --variant 1`"
+    variant = scene.meta.get("source", {}).get("variant")
+    fix = "make one with `spike4dgs make-dataset WORLD --variant 1`"
+    if variant == PUBLIC_VARIANT:
         raise problem(folder, "a training variant (1 or higher)", "the public benchmark's variant 0", fix)
+    if is_reserved(variant):
+        raise problem(folder, "a training variant", f"variant {variant}, which is kept for hidden seasons", fix)
     return scene
 
 

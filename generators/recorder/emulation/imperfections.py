@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.array.camera_state import Clock
+from spike4dgs.benchmark.array.lens import make_distortion
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera, Float64
 from spike4dgs.generators.recorder.emulation.camera import LOST, Fault
@@ -34,6 +35,7 @@ class Imperfections:
         bad_pixels: Bad pixels of each camera: a third each is dead, hot and flickering.
         gain: Largest difference of a camera's gain from the array's; 0.02 is 2 percent.
         pose_deg: Rotation between a camera's written and true pose.
+        lens: Share of its lens distortion that a camera's written calibration lacks; 1 writes a pinhole.
     """
 
     offset_ticks: float = 0.0
@@ -42,10 +44,19 @@ class Imperfections:
     bad_pixels: int = 0
     gain: float = 0.0
     pose_deg: float = 0.0
+    lens: float = 0.0
 
 
 PERFECT = Imperfections()
-_BELOW = {"offset_ticks": 1e4, "drift_ppm": 1e4, "dropped": 0.5, "bad_pixels": 1e6, "gain": 0.5, "pose_deg": 90.0}
+_MOST = {
+    "offset_ticks": 1e4,
+    "drift_ppm": 1e4,
+    "dropped": 0.5,
+    "bad_pixels": 1e6,
+    "gain": 0.5,
+    "pose_deg": 90.0,
+    "lens": 1.0,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +79,16 @@ class WorseCamera:
     bad: BadPixels
     turn: Float64  # [3, 3], from the true to the written camera axes
     dropped: tuple[int, ...]  # ticks
+    known_lens: float = 1.0  # share of the lens distortion that the written calibration has
 
 
 def check(worse: Imperfections) -> None:
     """Raise UserError for a size that no array has."""
-    for name, most in _BELOW.items():
+    for name, most in _MOST.items():
         value = getattr(worse, name)
-        if not 0 <= value < most:
+        if not 0 <= value <= most:
             option = f"--worse.{name.replace('_', '-')}"
-            raise problem(option, f"a number from 0 to below {most:g}", f"{value:g}", "correct it")
+            raise problem(option, f"a number from 0 to {most:g}", f"{value:g}", "correct it")
 
 
 def draw(worse: Imperfections, profile: RigProfile, n_ticks: int, seed: int) -> dict[str, WorseCamera]:
@@ -105,6 +117,7 @@ def _draw(worse: Imperfections, rig: RigProfile, camera: str, exact: bool, n_tic
         bad=_bad_pixels(worse.bad_pixels, rig.width * rig.height, random(seed, camera, "bad pixels")),
         turn=_turn(worse.pose_deg, random(seed, camera, "pose")),
         dropped=tuple(np.nonzero(lost)[0].tolist()),
+        known_lens=1 - worse.lens,
     )
 
 
@@ -130,17 +143,18 @@ def dropped_ticks(cameras: Mapping[str, WorseCamera], profile: RigProfile) -> li
     return [Fault(name, LOST, tick, lost=size) for name, camera in cameras.items() for tick in camera.dropped]
 
 
-def with_wrong_poses(profile: RigProfile, cameras: Mapping[str, WorseCamera]) -> RigProfile:
-    """Return the profile with each calibration turned about the camera's centre."""
+def with_wrong_calibrations(profile: RigProfile, cameras: Mapping[str, WorseCamera]) -> RigProfile:
+    """Return the profile with each calibration turned about the camera's centre, and without a share of its lens."""
 
-    def turned(camera: Camera, turn: Float64) -> Camera:
-        R = turn @ camera.R
-        return replace(camera, R=R, t=-R @ camera.center)
+    def wrong(camera: Camera, to: WorseCamera) -> Camera:
+        R = to.turn @ camera.R
+        lens = make_distortion([k * to.known_lens for k in camera.distortion])
+        return replace(camera, R=R, t=-R @ camera.center, distortion=lens)
 
     return replace(
         profile,
         cameras=tuple(
-            replace(c, calibration=c.calibration and turned(c.calibration, cameras[c.id].turn)) for c in profile.cameras
+            replace(c, calibration=c.calibration and wrong(c.calibration, cameras[c.id])) for c in profile.cameras
         ),
     )
 

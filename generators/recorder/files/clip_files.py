@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +16,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import check_new, writing
+from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.scene.writer import stream_name
 from spike4dgs.generators.recorder.files.clip_record import ClipRecord, gaps_of, write_description
 from spike4dgs.generators.recorder.files.disk import Buffers, DiskFile
@@ -41,17 +43,29 @@ class StreamFiles:
     """
 
     def __init__(self, out: Path, profile: RigProfile, n_ticks: int) -> None:
-        """Make the folder and reserve its disk space. Raises UserError where `out` is not new or the disk is full."""
-        _check_folder(out, profile)
+        """Make the folder and reserve its disk space.
+
+        Raises UserError where `out` is not new, where another process records into it, and where the disk is full.
+        """
         self._out, self._profile, self._n_ticks = out, profile, n_ticks
-        self._layout = make_layout(profile.layout, profile.width, profile.height)
-        self._unpacked = np.empty((_FRAMES, self._layout.payload_bytes), np.uint8)
         self._files: dict[str, DiskFile] = {}
         self._lost: tuple[Gap, ...] | None = None  # known after `flush`
-        size = n_ticks * self._layout.payload_bytes
-        self.buffers = Buffers(len(profile.cameras), size)
+        self._lock = ExitStack()
+        with ExitStack() as lock:
+            file = out.resolve().parent / f".{out.resolve().name}.lock"
+            lock.enter_context(locked(file, out, "a folder that no other recording uses", temporary=True))
+            _check_folder(out, profile)
+            self._reserve()
+            self._lock = lock.pop_all()
+
+    def _reserve(self) -> None:
+        """Make the files of the streams, and the memory between them and the cameras."""
+        self._layout = make_layout(self._profile.layout, self._profile.width, self._profile.height)
+        self._unpacked = np.empty((_FRAMES, self._layout.payload_bytes), np.uint8)
+        size = self._n_ticks * self._layout.payload_bytes
+        self.buffers = Buffers(len(self._profile.cameras), size)
         try:
-            for camera in profile.cameras:
+            for camera in self._profile.cameras:
                 with writing(self._path(camera)):
                     self._part(camera).parent.mkdir(parents=True, exist_ok=True)
                     self._files[camera.id] = DiskFile(self._part(camera), size, self.buffers)
@@ -159,7 +173,7 @@ class StreamFiles:
         return path.with_name(f".{path.name}.part")
 
     def _remove(self) -> None:
-        """Remove unfinished files, and the folders that are then empty."""
+        """Remove unfinished files, and the folders that are then empty. Release the lock."""
         for camera in self._profile.cameras:
             if camera.id in self._files:
                 self._files.pop(camera.id).close()
@@ -167,6 +181,7 @@ class StreamFiles:
         for folder in (self._out / "spikes", self._out):
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
+        self._lock.close()
 
 
 def write_clip(out: Path, profile: RigProfile, streams: Mapping[str, UInt8], record: ClipRecord) -> Path:

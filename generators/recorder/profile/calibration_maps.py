@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.inputs.npz import Expected, read_npz
 
 Float32 = NDArray[np.float32]
 
@@ -21,15 +20,9 @@ def read_maps(path: Path, width: int, height: int) -> dict[str, Float32]:
     """
     what = f"an .npz of the maps gain and dark, {width}x{height} pixels each"
     fix = "make it with `spike4dgs calibrate`"
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            maps = {name: np.asarray(data[name], np.float32) for name in ("gain", "dark")}
-    except FileNotFoundError:
-        raise problem(path, what, "no such file", fix) from None
-    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, TypeError, AttributeError, OSError, EOFError) as e:
-        raise problem(path, what, f"damaged data ({e})", fix) from None
+    shapes = dict.fromkeys(("gain", "dark"), Expected("fiu", (height, width)))
+    maps = {name: values.astype(np.float32) for name, values in read_npz(path, what, shapes, fix).items()}
     for name, values in maps.items():
-        if values.shape != (height, width) or not np.isfinite(values).all():
-            found = f"{name} of shape {values.shape}" if values.shape != (height, width) else f"{name} not finite"
-            raise problem(path, what, found, fix)
+        if not np.isfinite(values).all():
+            raise problem(path, what, f"{name} not finite", fix)
     return maps

@@ -15,6 +15,7 @@ import numpy as np
 
 from spike4dgs.benchmark.array.lens import NAMES, make_distortion
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.inputs.numbers import MAX_SIDE, shown
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.profile.calibration_maps import read_maps
@@ -27,7 +28,6 @@ from spike4dgs.generators.recorder.profile.toml_table import (
     matching,
     number,
     read_toml,
-    shown,
     tuple_of,
     whole,
 )
@@ -109,7 +109,7 @@ def load_profile(path: Path) -> RigProfile:
     """
     top = read_toml(path, "a rig profile")
     top.take("schema", choice(SCHEMA))
-    width, height = (top.take(name, whole(1, 65535)) for name in ("width", "height"))
+    width, height = (top.take(name, whole(1, MAX_SIDE)) for name in ("width", "height"))
     cameras = _read_cameras(top, width, height)
     transfer = top.table("transfer") or Table(path, "transfer", {})
     profile = RigProfile(

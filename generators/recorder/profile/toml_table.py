@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_text
+from spike4dgs.benchmark.inputs.numbers import shown
 
 T = TypeVar("T")
 D = TypeVar("D")
-_SHOWN = 60  # characters of a wrong value
+_MOST_BYTES = 1 << 18  # a profile of nine cameras has 5 kB
 
 
 @dataclass(frozen=True)
@@ -84,22 +86,11 @@ class Table:
 def read_toml(path: Path, what: str) -> Table:
     """Read a TOML file. `what` names the kind of file for the error: missing, unreadable, or no TOML."""
     try:
-        return Table(path, "", tomllib.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise problem(path, what, "no such file", "check the path") from None
-    except OSError as e:
-        raise problem(path, what, (e.strerror or "an unreadable file").lower(), "check the path") from None
-    except (ValueError, RecursionError) as e:  # bad syntax, bad UTF-8, absurd depth
-        raise problem(path, f"{what} (TOML)", f"damaged text ({e})", "correct the file") from None
-
-
-def shown(value: object) -> str:
-    """Return a value in the form of an error message, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # a number with more digits than Python prints
-        text = "a number of thousands of digits"
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+        return Table(path, "", tomllib.loads(read_text(path, what, _MOST_BYTES)))
+    except RecursionError:
+        raise problem(path, f"{what} (TOML)", "values nested too deep", "correct the file") from None
+    except ValueError as e:  # bad syntax, bad UTF-8
+        raise problem(path, f"{what} (TOML)", f"damaged text ({str(e)[:200]})", "correct the file") from None
 
 
 def whole(low: int, high: int) -> Kind[int]:

@@ -18,6 +18,7 @@ from spike4dgs.benchmark.errors import problem
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+_MOST = 1000  # corners each way, and metres of a square
 _FEWEST = 3  # corners in a row that the detector needs
 _SMALL = 640  # px; a smaller image is enlarged by two for the detector
 
@@ -36,9 +37,13 @@ class Board:
 
     def __post_init__(self) -> None:
         size = f"{self.columns} x {self.rows} inner corners of {self.square_m:g} m"
-        if min(self.columns, self.rows) < _FEWEST or not self.square_m > 0:
+        if (
+            min(self.columns, self.rows) < _FEWEST
+            or max(self.columns, self.rows) > _MOST
+            or not 0 < self.square_m <= _MOST
+        ):
             raise problem(
-                "chessboard", f"at least {_FEWEST} x {_FEWEST} inner corners and a size", size, "correct them"
+                "chessboard", f"{_FEWEST} to {_MOST} inner corners each way and a size in metres", size, "correct them"
             )
         if (self.columns + self.rows) % 2 == 0:
             fix = "take a board that half a turn changes, such as 8 x 5"

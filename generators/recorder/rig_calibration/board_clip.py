@@ -18,6 +18,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.inputs.numbers import MAX_SIDE
 from spike4dgs.benchmark.metrics.pose_error import Sim3
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes, look_at
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -32,6 +33,7 @@ from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 RATE_HZ = 20000
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
+_MOST_SECONDS = 3600
 _POSES = 500  # samples of the motion from which its speed is computed
 DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of view is the horizontal one
 _PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
@@ -271,9 +273,13 @@ def board_clip(
         seed: Seed of the array's mounting errors and of the sensors.
         like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
     """
+    if not 0.5 < seconds * RATE_HZ <= _MOST_SECONDS * RATE_HZ:
+        expected = f"from {1 / RATE_HZ:g}, one tick, to {_MOST_SECONDS}"
+        raise problem("--seconds", expected, f"{seconds:g}", "ask for another length")
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        found = f"{width}, {height}"
+        raise problem("--width and --height", f"whole numbers from 1 to {MAX_SIDE}", found, "correct them")
     n_ticks = round(seconds * RATE_HZ)
-    if n_ticks < 1:
-        raise problem("--seconds", f"at least {1 / RATE_HZ:g}, one tick", f"{seconds:g}", "ask for a longer clip")
     cameras, distance_m = array(width, height, seed), DISTANCE_M
     if like is not None:
         cameras, distance_m = in_front(tuple(open_scene(like).cameras.values()))

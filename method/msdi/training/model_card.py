@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from spike4dgs.benchmark.environment import harness
-from spike4dgs.benchmark.scene.bursts import HIDDEN_VARIANTS
+from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.training.settings import TrainingSettings
 from spike4dgs.method.msdi.weights import VARIABLE, Card

@@ -23,7 +23,8 @@ from torch import Tensor
 from spike4dgs.benchmark.environment import choose_device, device_type
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
-from spike4dgs.benchmark.scene.bursts import FIRST_TRAINING_VARIANT, BurstFile, open_folder
+from spike4dgs.benchmark.scene.bursts import BurstFile, open_folder
+from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
@@ -164,8 +165,9 @@ def train_msdi(
         raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
     files = open_folder(data)
     learned, hidden = ([f for f in files if f.facts.hidden is h] for h in (False, True))
-    if wrong := [f.facts.id for f in learned if f.facts.variant < FIRST_TRAINING_VARIANT]:
-        expected = f"hidden variants and those from {FIRST_TRAINING_VARIANT} up"
+    allowed = range(FIRST_TRAINING_VARIANT, FIRST_SEASON_VARIANT)
+    if wrong := [f.facts.id for f in learned if f.facts.variant not in allowed]:
+        expected = f"hidden variants and those from {allowed.start} to {allowed[-1]}"
         raise problem(data, expected, ", ".join(wrong), "remove them: they are kept for tests")
     if not learned:
         raise problem(data, "shards to train on", "hidden variants only", "make more with `spike4dgs make-msdi-data`")

@@ -86,14 +86,15 @@ def test_examples_are_all_images_of_a_scene(small_scene: Path) -> None:
         assert example.stream.packed.tobytes() == scene.stream("cam_03").packed.tobytes()
 
 
-def test_the_public_benchmark_is_refused(small_scene: Path) -> None:
+def test_the_public_benchmark_and_seasons_are_refused(small_scene: Path) -> None:
     meta = json.loads((small_scene / "scene.json").read_text())
-    for variant, refused in ((0, True), (1, False)):
+    public, season = r" \(1 or higher\), found the public", ", found variant 9000, which is kept for hidden seasons"
+    for variant, refused in ((0, public), (1, ""), (8999, ""), (9000, season)):
         meta["source"]["variant"] = variant
         (small_scene / "scene.json").write_text(json.dumps(meta))
         write_manifest(small_scene)
         if refused:
-            with pytest.raises(UserError, match=r"expected a training variant \(1 or higher\), found the public"):
+            with pytest.raises(UserError, match=f"expected a training variant{refused}"):
                 open_for_training(small_scene)
         else:
             assert open_for_training(small_scene).id == "pattern-0"

@@ -14,9 +14,11 @@ from dummy_methods import CountMethod, run
 
 from spike4dgs.benchmark.cli import COMMANDS, SPEED, Command, main
 from spike4dgs.benchmark.cli import dispatch as cli
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.results.record import read_record
 from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.runs.score_command import score
+from spike4dgs.benchmark.scene.scene import open_scene
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
@@ -56,6 +58,18 @@ def test_the_overview_of_speed_lists_its_measurements(capsys: pytest.CaptureFixt
     assert done.returncode == 0 and done.stdout == text
 
 
+def test_a_command_of_two_words_is_found_by_both(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["release"]) == main(["release", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "usage: spike4dgs release COMMAND" in text and "  pack " in text and "  check " in text
+    assert main(["release", "chekc"]) == 2
+    assert "did you mean `spike4dgs release check`?" in capsys.readouterr().err
+    assert main(["release", "check", str(tmp_path)]) == 2
+    assert "release.json: expected the description of a release" in capsys.readouterr().err
+    assert main(["download", "weights", "nothing"]) == 2
+    assert "weights: expected names among lpips" in capsys.readouterr().err
+
+
 def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
     from importlib.metadata import version
 
@@ -72,11 +86,11 @@ def test_every_command_exists(command: Command) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([name, "--help"]) == 0
+    assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"usage: spike4dgs {name}" in text
-    assert f"Example:\n  spike4dgs {COMMANDS[name].example.split()[0]}" in text.replace("│", "")
-    assert COMMANDS[name].example.split()[0] == name
+    assert f"Example:\n  spike4dgs {name}" in text.replace("│", "")
+    assert f"{COMMANDS[name].example} ".startswith(f"{name} ")
 
 
 @pytest.mark.parametrize("name", ["run-benchmark", "make-dataset"])
@@ -173,6 +187,7 @@ def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
     command = RunBenchmark(
         submit=lambda results, **options: submitted.extend(results) or 0,
         measure_images=lambda arguments: measured.append(arguments) or 0,
+        track_scenes={"moon": {small_scene.name: open_scene(small_scene).revision}}.__getitem__,
     )
     monkeypatch.setattr("spike4dgs.benchmark.runs.run_command.find_methods", lambda: {"counts": CountMethod()})
     out = tmp_path / "out"
@@ -180,6 +195,10 @@ def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
     assert submitted == [out / "results/counts.json"] and not measured
     assert command.run_benchmark((small_scene,), table=6, out=out) == 0
     assert measured == [[str(small_scene), "--out", str(out)]] and len(submitted) == 1
+    assert command.run_benchmark(track="moon", data=small_scene.parent, out=out, device="cpu", metrics=("psnr",)) == 0
+    assert len(submitted) == 2, "the scenes of the track are those in the folder"
+    with pytest.raises(UserError, match="--track: expected neither scenes nor a table beside it, found --table 1"):
+        command.run_benchmark(track="moon", table=1)
 
 
 def test_speed_passes_the_rest_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:

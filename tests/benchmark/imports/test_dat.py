@@ -243,7 +243,10 @@ def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
         (["--cameras", "large.yaml"], "large.yaml: expected 40x24 pixels for cam_00, as the streams have, found 8x8"),
         (["--cameras", "part.yaml"], "expected camera_model, intrinsics, distortion_model, distortion_coeffs"),
         (["--cameras", "cut"], "cut: expected a whole COLMAP model, found a damaged one"),
-        (["--cameras", "greedy"], "points3D.bin: expected 18446744073709551615 points, found a shorter file"),
+        (
+            ["--cameras", "greedy"],
+            "greedy: expected a whole COLMAP model, found a damaged one (images.bin ends",
+        ),
         (["--cameras", "others"], "others: expected a camera for each stream, found none for cam_00 (it has a, b, c)"),
     ],
 )
@@ -265,7 +268,7 @@ def test_bad_input_is_one_line(
     Path("part.yaml").write_text("cam_00: {camera_model: pinhole}\n")
     cut = write_colmap(Path("cut")) / "cameras.bin"
     cut.write_bytes(cut.read_bytes()[:20])
-    (write_colmap(Path("greedy")) / "points3D.bin").write_bytes(b"\xff" * 200)
+    (write_colmap(Path("greedy")) / "images.bin").write_bytes(b"\xff" * 200)
     write_colmap(Path("others"), names=["a.png", "b.png", "c.png"])
     given = {"--width": "40", "--height": "24", "--rate-hz": "20000", "--out": "out"} | {change[0]: change[1]}
     assert main(["import-dat", "in", *(text for item in given.items() for text in item)]) == 2
@@ -290,3 +293,51 @@ def test_the_real_recording_comes_in_unchanged(tmp_path: Path) -> None:
     assert (tmp_path / "out" / path.name).read_bytes() == path.read_bytes()
     (stream,) = open_stream_folder(tmp_path / "out").values()
     assert stream.counts(0, 200).mean() / 200 == pytest.approx(0.366, abs=5e-4)
+
+
+def test_a_models_points_rigs_and_frames_are_not_read(tmp_path: Path) -> None:
+    """A count of 2^64 frames would keep pycolmap busy for years."""
+    write_streams(tmp_path / "in", ["cam_00", "cam_02"])
+    model = write_colmap(tmp_path / "binary")
+    for name in ("points3D.bin", "rigs.bin", "frames.bin"):
+        (model / name).write_bytes(b"\xff" * 200)
+    import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / "out")
+    for name, camera in open_scene(tmp_path / "out").cameras.items():
+        expected = next(c for c in CAMERAS if c.id == name)
+        np.testing.assert_allclose(camera.w2c, expected.w2c, atol=1e-12)
+        np.testing.assert_allclose(camera.K, expected.K, atol=1e-12)
+
+
+def test_images_with_points_are_read_without_them(tmp_path: Path) -> None:
+    write_streams(tmp_path / "in", ["cam_00"])
+    for kind in ("binary", "text"):
+        model = pycolmap.Reconstruction(write_colmap(tmp_path / f"bare-{kind}"))
+        for image in model.images.values():
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([3.0 + i, 5.0])) for i in range(7)])
+        folder = tmp_path / kind
+        folder.mkdir()
+        model.write_text(str(folder)) if kind == "text" else model.write_binary(str(folder))
+        import_dat(tmp_path / "in", **SIZE, cameras=folder, out=tmp_path / f"{kind}-out")
+        found = open_scene(tmp_path / f"{kind}-out").cameras["cam_00"]
+        np.testing.assert_allclose(found.w2c, CAMERAS[0].w2c, atol=1e-9)
+
+
+@pytest.mark.parametrize("facts", ["rows: 3, dt: d", "rows: 3, cols: 900000000, dt: d", "rows: 3, cols: 3, dt: 3d"])
+def test_matrices_that_contradict_themselves(tmp_path: Path, facts: str) -> None:
+    """OpenCV's own parser writes beyond its memory for some of them."""
+    one = "[ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]"
+    text = f"%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix {{ {facts}, data: {one} }}\nR: {one}\nT: [ 0., 0., 0. ]\n"
+    (tmp_path / "left.yml").write_text(text)
+    write_streams(tmp_path / "in", ["left"])
+    with pytest.raises(UserError, match="expected a matrix camera_matrix of left"):
+        import_dat(tmp_path / "in", **SIZE, cameras=tmp_path / "left.yml", out=tmp_path / "out")
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_an_images_name_that_is_no_text(tmp_path: Path, kind: str) -> None:
+    model = write_colmap(tmp_path / kind)
+    path = next(model.glob("images.*"))
+    path.write_bytes(path.read_bytes().replace(b"cam_01.png", b"cam_\x9e1.png"))
+    write_streams(tmp_path / "in", ["cam_00"])
+    with pytest.raises(UserError, match="found a damaged one .*can't decode byte 0x9e"):
+        import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / "out")

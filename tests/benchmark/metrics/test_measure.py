@@ -197,7 +197,9 @@ def test_metrics_of_a_command_line_are_in_its_record(scene: Scene, tmp_path: Pat
     cell = read_record(tmp_path / "r.json")["scenes"][scene.id]
     assert "flip" in cell["computed"] and "brisque" not in cell["computed"]
     assert cell["notes"]["brisque"] == "not computed: not asked for"
-    with pytest.raises(UserError, match=r"alexnet-owt-7be5be79\.pth: expected .* found no such file; get it from"):
+    with pytest.raises(
+        UserError, match=r"alexnet-owt-7be5be79\.pth: expected .* found no such file; run `spike4dgs download weights"
+    ):
         score(root, (scene.root,), metrics=("auto", "lpips_alex"))
 
 

@@ -18,7 +18,9 @@ from spike4dgs.benchmark.runs import run_command
 from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
-COMMAND = RunBenchmark(submit=lambda results, **options: 0, measure_images=lambda arguments: 0)
+COMMAND = RunBenchmark(
+    submit=lambda results, **options: 0, measure_images=lambda arguments: 0, track_scenes=lambda name: {}
+)
 VIEWS = tuple(f"views-{n}" for n in range(3, 9))
 
 
@@ -55,14 +57,18 @@ def test_rows_without_msdi_are_methods_and_rows_of_ours_have_no_published_values
 
 @pytest.mark.parametrize("number", [None, 6, 4])
 def test_a_track_belongs_to_tables_1_and_2(number: int | None, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="--track: expected (--table 1 or 2 beside it|calibrated for table 4)"):
-        COMMAND.run_benchmark(table=number, track="uncalibrated", out=tmp_path / "out")
+    with pytest.raises(UserError, match="--poses: expected (--table 1 or 2 beside it|given for table 4)"):
+        COMMAND.run_benchmark(table=number, poses="estimated", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def seen_as(scene: Scene, split: str) -> Scene:
     """The scene, with its split views-3 under another name."""
-    return replace(scene, meta=scene.meta | {"splits": {split: scene.meta["splits"]["views-3"]}}, split=split)
+    return replace(
+        scene,
+        meta=scene.meta | {"splits": scene.meta["splits"] | {split: scene.meta["splits"]["views-3"]}},
+        split=split,
+    )
 
 
 def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(

@@ -52,7 +52,7 @@ def test_published_numbers_are_the_papers() -> None:
 
 def test_the_track_without_given_poses_has_a_row_for_every_row() -> None:
     for number in (1, 2):
-        given, own = published(number), published(number, "uncalibrated")
+        given, own = published(number), published(number, "estimated")
         assert (own.worlds, own.metrics) == (given.worlds, given.metrics)
         partners = {name.replace("+colmap", "").replace("-uncalibrated", "") for name in own.rows}
         assert partners == set(given.rows) and not set(own.rows) & set(given.rows)
@@ -63,9 +63,9 @@ def test_the_track_without_given_poses_has_a_row_for_every_row() -> None:
 
 def test_tables_that_mix_poses_have_one_track() -> None:
     for number in (3, 4, 5, 7):
-        with pytest.raises(UserError, match=f"--track: expected calibrated for table {number}, found uncalibrated"):
-            published(number, "uncalibrated")
-    with pytest.raises(UserError, match="--track: expected one of calibrated, uncalibrated, found 'own'"):
+        with pytest.raises(UserError, match=f"--poses: expected given for table {number}, found estimated"):
+            published(number, "estimated")
+    with pytest.raises(UserError, match="--poses: expected one of given, estimated, found 'own'"):
         published(1, "own")
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs import executors
-from spike4dgs.benchmark.runs.executors import chunked, executor
+from spike4dgs.benchmark.runs.executors import chunked, executor, unordered_executor
 
 
 class Square:
@@ -54,6 +54,32 @@ def test_results_come_in_order(workers):
 def test_a_worker_that_dies_is_one_error():
     with executor(2) as run, pytest.raises(UserError, match="a worker process.*run the same command again"):
         list(run(die, [[1], [2], [3]]))
+
+
+def first_ends_last(chunk):
+    """Touch a file; the first chunk waits for those of the others."""
+    folder, k = chunk
+    (folder / str(k)).touch()
+    while k == 0 and len(list(folder.iterdir())) < 3:
+        time.sleep(0.05)
+    return sorted(os.sched_getaffinity(0))
+
+
+def test_unordered_results_come_as_they_end_with_their_positions(tmp_path):
+    with unordered_executor(2, None) as run:
+        found = list(run(first_ends_last, [(tmp_path, k) for k in range(3)]))
+    assert found[0][0] != 0 and sorted(k for k, _ in found) == [0, 1, 2]
+    mine = sorted(os.sched_getaffinity(0))
+    shares = {tuple(cores) for _, cores in found}
+    assert all(set(share) <= set(mine) for share in shares)
+    if len(mine) > 1:
+        assert sum(map(len, shares)) <= len(mine), "workers share no core"
+
+
+def test_an_unordered_worker_that_dies_is_one_error():
+    with pytest.raises(UserError, match="a worker process.*run the same command again"):
+        with unordered_executor(2, None) as run:
+            list(run(die, [[1], [2], [3]]))
 
 
 def test_errors_of_tasks_come_through():

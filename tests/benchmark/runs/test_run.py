@@ -12,7 +12,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from dummy_methods import CountMethod, FailingMethod, run
+from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
 
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark.errors import UserError
@@ -21,19 +21,6 @@ from spike4dgs.benchmark.runs.cell import FitClock
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import WeightsError
-
-# Also the state of the checkout, which somebody may change while the tests run.
-TIMINGS = ("fit_seconds", "render_fps", "peak_memory_mb", "fitted_with")
-
-
-def without_timings(record: dict[str, Any]) -> dict[str, Any]:
-    cells = {s: {k: v for k, v in c.items() if k not in TIMINGS} for s, c in record["scenes"].items()}
-    return {**record, "scenes": cells, "created": None, "command": None, "harness": None}
-
-
-def prediction_bytes(out: Path) -> dict[str, bytes]:
-    paths = sorted((out / "predictions").rglob("*"))
-    return {p.relative_to(out).as_posix(): p.read_bytes() for p in paths if p.is_file() and p.suffix != ".json"}
 
 
 def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_path: Path) -> None:
@@ -93,7 +80,8 @@ def test_another_revision_of_the_scene_is_another_key(tmp_path: Path) -> None:
 
     scene = write_small_scene(tmp_path / "scene")
     run(tmp_path / "out", [scene], CountMethod())
-    (scene / "README.md").write_text("changed")
+    stream = np.fromfile(scene / "spikes/cam_00.dat", np.uint8)
+    (stream ^ 1).tofile(scene / "spikes/cam_00.dat")
     write_manifest(scene)
     again = CountMethod()
     run(tmp_path / "out", [scene], again)

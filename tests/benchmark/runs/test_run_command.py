@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
@@ -19,7 +20,6 @@ from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.cli import load
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.entry import read_entry
 
 run_benchmark = load("run-benchmark")
 
@@ -41,13 +41,13 @@ def test_run_benchmark_leaves_results_images_and_entries(
     code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5")
     assert code == 0
     text = capsys.readouterr().out
-    assert "quick+counts" in text and "Results" in text and "verified, rank 1 of" in text
+    assert "quick+counts" in text and "Results" in text and "re-scored, rank 1 of" in text
     for name in ("sheet_pattern-0.png", "scatter.png"):
         with Image.open(out / name) as image:
             assert min(image.size) > 300
-    assert read_entry(out / "leaderboard/entries/pattern-0/quick+counts.json")["label"] == "verified"
-    rows = json.loads((out / "leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
-    assert [r["rank"] for r in rows] == [1, 2]
+    rows = json.loads((out / "leaderboard/local.json").read_text())["boards"][0]["rows"]
+    assert [(r["rank"], r["label"]) for r in rows] == [(1, "re-scored"), (2, "re-scored")]
+    assert text.count("local board, in") == 1, "one line says that no track has this scene"
     record = json.loads((out / "results/counts.json").read_text())
     assert record["scenes"]["pattern-0"]["budget"] == 0.5
 
@@ -59,9 +59,9 @@ def test_ranks_are_printed_once_and_are_the_final_ones(
     names = ("counts", "quick+counts", "bad")
     assert run_benchmark((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
     text = capsys.readouterr().out
-    shown = dict(re.findall(r"^(\S+): .*, (rank \d of 3|not ranked) on pattern-0$", text, re.MULTILINE))
-    rows = json.loads((tmp_path / "out/leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
-    assert shown == {r["method"]: f"rank {r['rank']} of 3" if r["rank"] else "not ranked" for r in rows}
+    shown = dict(re.findall(r"^(\S+): .*, (rank \d of 2|not ranked) .*on the local board", text, re.MULTILINE))
+    rows = json.loads((tmp_path / "out/leaderboard/local.json").read_text())["boards"][0]["rows"]
+    assert shown == {r["method"]: f"rank {r['rank']} of 2" if r["rank"] else "not ranked" for r in rows}
     assert text.index("results.csv") < text.index("rank ") and text.count("rank ") == 2
 
 
@@ -98,6 +98,27 @@ def test_a_run_with_another_method_adds_to_what_is_there(
         assert cell["metrics"]["niqe"] is None and row["niqe"] == ""
     text = go("counts", seed=1)
     assert [(r["method"], r["seed"]) for r in rows()] == [("quick+counts", "0"), ("counts", "1")], "replaced, not twice"
+
+
+@pytest.mark.usefixtures("installed")
+def test_several_seeds_have_folders_of_their_own_and_one_row_of_the_table(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for methods in (("counts",), ("quick+counts",)):
+        options: dict[str, Any] = {"seed": 2, "seeds": 3, "device": "cpu", "metrics": ("psnr",)}
+        assert run_benchmark((small_scene,), methods=methods, out=out, **options) == 0
+    table = capsys.readouterr().out.rpartition("Results")[2].partition("images:")[0]
+    rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+    assert [(r["method"], r["seed"]) for r in rows] == [(m, k) for m in ("counts", "quick+counts") for k in "234"]
+    for method in ("counts", "quick+counts"):
+        folders = (out, out / "seed-3", out / "seed-4")
+        records = [json.loads((f / f"results/{method}.json").read_text()) for f in folders]
+        assert [r["method"]["seed"] for r in records] == [2, 3, 4]
+        values = [r["mean"]["psnr"] for r in records]
+        assert values == [float(r["psnr"]) for r in rows if r["method"] == method]
+        assert re.search(rf" {re.escape(method)} +{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} ", table)
+    assert not (out / "seed-2").exists()
 
 
 @pytest.mark.usefixtures("installed")
@@ -140,7 +161,7 @@ def test_run_benchmark_exits_1_where_a_cell_failed(
     shown = capsys.readouterr()
     assert "failed: bad on pattern-0" in shown.err
     assert "bad (failed)" in shown.out
-    rows = json.loads((out / "leaderboard/leaderboard.json").read_text())["boards"][0]["rows"]
+    rows = json.loads((out / "leaderboard/local.json").read_text())["boards"][0]["rows"]
     assert [(r["method"], r["rank"]) for r in rows] == [("quick+counts", 1), ("bad", None)]
 
 
@@ -148,22 +169,25 @@ def test_run_benchmark_exits_1_where_a_cell_failed(
 def test_another_record_in_a_shared_leaderboard_needs_replace(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def go(seed: int, replace: bool = False) -> int:
+    def go(seed: int, budget: str = "quick", replace: bool = False) -> int:
         return run_benchmark(
             (small_scene,),
             methods=("quick+counts",),
             out=tmp_path / "out",
             seed=seed,
             device="cpu",
+            budget=budget,
             leaderboard=tmp_path / "board",
             replace=replace,
         )
 
     assert go(0) == 0 and go(0) == 0
-    assert go(1) == 1
+    assert go(1) == 0, "another seed has an entry of its own"
+    assert go(1, "0.5") == 1
     assert "pass --replace" in capsys.readouterr().err
-    assert go(1, replace=True) == 0
-    assert read_entry(tmp_path / "board/entries/pattern-0/quick+counts.json")["record"]["method"]["seed"] == 1
+    assert go(1, "0.5", replace=True) == 0
+    (path,) = (tmp_path / "board/local").glob("pattern-0@*/quick+counts@seed-1.json")
+    assert json.loads(path.read_text())["record"]["scenes"]["pattern-0"]["budget"] == 0.5
 
 
 @pytest.mark.usefixtures("installed")
@@ -171,9 +195,9 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
     ("arguments", "message"),
     [
         ({"methods": ("nonsense",)}, "--methods: expected names among bad, counts, quick+counts, found nonsense"),
-        ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, found '0'"),
-        ({"budget": "nan"}, "or a positive number, found 'nan'"),
-        ({"budget": "fast"}, "or a positive number, found 'fast'"),
+        ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, 1e+06 at most, found '0'"),
+        ({"budget": "nan"}, "or a positive number, 1e+06 at most, found 'nan'"),
+        ({"budget": "fast"}, "or a positive number, 1e+06 at most, found 'fast'"),
         ({"device": "tpu"}, "--device: expected auto, cpu or cuda, found 'tpu'"),
         ({"device": "cuda:99"}, "--device: expected a CUDA device of this machine, found 'cuda:99'"),
         ({"scenes": ()}, "scenes: expected at least one scene folder"),

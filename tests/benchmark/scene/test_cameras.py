@@ -180,7 +180,7 @@ GOOD: dict[str, Any] = {
         ({"transform_matrix": np.eye(3).tolist()}, "4x4 transform_matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "expected a rotation matrix"),
         ({"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}, "determinant -1"),
-        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "expected a rotation matrix"),
+        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "nan is no number"),
     ],
 )
 def test_poses_that_are_none_are_refused(change: dict[str, Any], message: str) -> None:

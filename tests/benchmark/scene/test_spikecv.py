@@ -110,7 +110,7 @@ def test_a_scene_of_any_size_goes_out_and_comes_back(
     ("config", "message"),
     [
         (None, "expected a folder with config.yaml"),
-        ("a: [", "config.yaml: expected YAML, found damaged text"),
+        ("a: [", "config.yaml: expected a stream's description .YAML., found damaged text"),
         ("just text", "config.yaml: expected filename, spike_w and spike_h"),
         ("{filename: a.dat, spike_w: 11}", "config.yaml: expected filename, spike_w and spike_h, found no 'spike_h'"),
         ("{filename: [a.dat, b.dat], spike_w: 11, spike_h: 5}", "config.yaml: expected .* of one stream"),
@@ -148,7 +148,7 @@ def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
 
 def test_other_refusals(tmp_path: Path, small_scene: Path) -> None:
     folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
-    with pytest.raises(UserError, match="expected positive numbers, found 0, 1"):
+    with pytest.raises(UserError, match="expected positive numbers, at most 1e.09, found 0, 1"):
         import_spikecv(folder, tmp_path / "out", rate_hz=0)
     for command in (lambda: import_spikecv(folder, folder, rate_hz=1.0), lambda: export_spikecv(small_scene, folder)):
         with pytest.raises(UserError, match="expected a new or empty folder"):

@@ -25,8 +25,7 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription
-from spike4dgs.leaderboard.entry import read_entry
-from spike4dgs.leaderboard.submit_command import submit
+from spike4dgs.leaderboard.submit_command import submit_all
 
 
 def at(*positions: tuple[float, float]) -> tuple[Camera, ...]:
@@ -247,19 +246,14 @@ def test_splits_never_mix_in_a_leaderboard(scene: Path, tmp_path: Path, capsys: 
         predictions = tmp_path / split / "predictions/counts"
         result = tmp_path / split / "results/counts.json"
         for _ in range(2):  # the second time changes nothing
-            assert submit(result, predictions=predictions, scenes=(scene,), leaderboard=tmp_path / "board") == 0
-    text = capsys.readouterr().out
-    assert "counts: verified, rank 1 of 1 on pattern-0\n" in text
-    assert "counts: verified, rank 1 of 1 on pattern-0, split corner\n" in text
-    names = sorted(p.name for p in (tmp_path / "board/entries/pattern-0").iterdir())
-    assert names == ["counts.json", "counts@corner.json"]
-    board = json.loads((tmp_path / "board/leaderboard.json").read_text())["boards"]
-    rows = {b["dataset"]["split"]: [row["entry"] for row in b["rows"]] for b in board}
-    assert rows == {"center": ["entries/pattern-0/counts.json"], "corner": ["entries/pattern-0/counts@corner.json"]}
-    entries = tmp_path / "board/entries/pattern-0"
-    (entries / "counts@corner.json").rename(entries / "counts@views-3.json")
-    with pytest.raises(UserError, match="entry of pattern-0/counts@views-3, found pattern-0/counts@corner"):
-        read_entry(entries / "counts@views-3.json")
+            assert not submit_all({result: predictions}, scenes=(scene,), leaderboard=tmp_path / "board")
+            assert "counts: re-scored, rank 1 of 1 on the local board pattern-0 (revision " in capsys.readouterr().out
+    boards = json.loads((tmp_path / "board/local.json").read_text())["boards"]
+    assert sorted(b["dataset"]["split"] for b in boards) == ["center", "corner"]
+    assert len({b["revision"] for b in boards}) == 2
+    for b in boards:
+        (row,) = b["rows"]
+        assert row["entries"] == [f"local/pattern-0@{b['revision'][:12]}/counts.json"]
 
 
 def test_run_benchmark_keeps_the_splits_apart(

@@ -9,14 +9,13 @@ import pytest
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.bursts import (
-    FIRST_TRAINING_VARIANT,
-    HIDDEN_VARIANTS,
     Burst,
     burst_path,
     open_folder,
     write_bursts,
 )
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
 from spike4dgs.generators.bursts import make_msdi_data as msdi_data
 from spike4dgs.generators.bursts.make_msdi_data import MakeBursts, make_msdi_data
 from spike4dgs.generators.bursts.rig_jitter import jittered_cameras
@@ -111,6 +110,7 @@ def test_no_variant_that_is_kept_for_tests_is_ever_made() -> None:
     [
         ({"worlds": ("cart",)}, "expected some of jaywalk, .* found cart"),
         ({"rigs": 0}, "expected counts from 1 up"),
+        ({"variants": 8988}, "--variants: expected at most 8987, found 8988; variants from 9000 on are kept"),
         ({"spp": 12}, "--spp: expected a power of two, found 12"),
     ],
 )

@@ -149,7 +149,7 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut("rig/1", "rig/2"), "schema", "expected one of spike4dgs-rig/1, found 'spike4dgs-rig/2'"),
         (cut('name = "pair"'), "name", "found no such key; add it"),
         (cut('"pair"', '"a pair"'), "name", "expected a name of letters, digits"),
-        (cut("width = 40", "width = 40.0"), "width", "expected a whole number from 1 to 65535, found 40.0"),
+        (cut("width = 40", "width = 40.0"), "width", "expected a whole number from 1 to 16384, found 40.0"),
         (cut("width = 40", "width = true"), "width", "found True"),
         (cut("plain", "striped"), "layout", "expected one of plain, tagged-rows, line-tagged, found 'striped'"),
         (
@@ -216,7 +216,7 @@ def test_files_that_are_no_profiles(tmp_path: Path) -> None:
             load_profile(tmp_path / "rig.toml")
     with pytest.raises(UserError, match="expected a rig profile, found no such file"):
         load_profile(tmp_path / "none.toml")
-    with pytest.raises(UserError, match="found is a directory"):
+    with pytest.raises(UserError, match="found a folder"):
         load_profile(tmp_path)
 
 

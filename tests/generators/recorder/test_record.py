@@ -202,7 +202,7 @@ def test_wrong_arguments_give_a_fix(scene, small_scene, tmp_path, capsys):
     for arguments, message in (
         ((), "--emulate SCENE"),
         ((tmp_path / "none.toml",), "none.toml"),
-        (("--emulate", scene, "--seconds", "0.00001"), "at least 5e-05, one tick"),
+        (("--emulate", scene, "--seconds", "0.00001"), "from 5e-05, one tick"),
         (("--emulate", scene, "--flat", tmp_path), "no --dark, --flat-radiance"),
         (("--emulate", small_scene, "--mode", "flat"), "none of cam_0"),
         (("--emulate", scene, "--out", scene), "a new or empty folder"),

@@ -14,7 +14,7 @@ from torch import Tensor
 from spike4dgs.baselines.initialization.dust3r_network import Dust3r, Dust3rShape
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
-from spike4dgs.benchmark.scene.bursts import FIRST_TRAINING_VARIANT
+from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
 from spike4dgs.method.msdi.checkpoints import load_pretrained, source_of, transfer

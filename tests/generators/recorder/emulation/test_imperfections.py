@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.generators.recorder.emulation.array import scene_profile
-from spike4dgs.generators.recorder.emulation.imperfections import Imperfections, draw
+from spike4dgs.generators.recorder.emulation.imperfections import Imperfections, draw, with_wrong_calibrations
 from spike4dgs.generators.sensor import calibration
 from spike4dgs.generators.sensor.model import Sensor
 
@@ -109,11 +110,23 @@ def test_light_and_darkness_show_the_same_pixels_and_gains(scene, tmp_path):
     np.testing.assert_array_equal(clip.recordings("cam_01").flat.packed, flat["cam_01"].packed)
 
 
+def test_a_share_of_the_lens_is_missing_from_the_calibration_alone(scene):
+    profile = scene_profile(open_scene(scene), layout="tagged-rows")
+    lens = (-0.2, 0.04, 0.001, 0.0, 0.0)
+    cameras = tuple(replace(c, calibration=replace(c.calibration, distortion=lens)) for c in profile.cameras)
+    curved = replace(profile, cameras=cameras)
+    for share, left in ((0.0, lens), (0.25, (-0.15, 0.03, 0.00075, 0.0, 0.0)), (1.0, ())):
+        worse = with_wrong_calibrations(curved, draw(Imperfections(lens=share), curved, 100, 0))
+        for before, after in zip(curved.cameras, worse.cameras, strict=True):
+            assert after.calibration.distortion == pytest.approx(left)
+            np.testing.assert_array_equal(after.calibration.R, before.calibration.R)
+
+
 def test_options_that_do_not_fit_are_refused(scene, tmp_path, capsys):
     out = ("--out", tmp_path / "x")
     for arguments, message in (
         (("rig.toml", "--worse.gain", 0.1), "--emulate SCENE: no real array is made worse"),
-        (("--emulate", scene, "--worse.gain", 0.7), "--worse.gain: expected a number from 0 to below 0.5"),
+        (("--emulate", scene, "--worse.gain", 0.7), "--worse.gain: expected a number from 0 to 0.5"),
         (("--emulate", scene, "--worse-truth", tmp_path / "t.json"), "imperfections"),
         (("--emulate", scene, "--worse.gain", 0.1, "--worse-truth", tmp_path / "x" / "t.json"), "a file outside"),
         (("--emulate", scene, "--worse.bad-pixels", 5000), "at most 960"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,79 @@ def spikes(seed: int, ticks: int = TICKS) -> np.ndarray:
 
 def streams(profile: RigProfile) -> dict[str, np.ndarray]:
     return {c.id: pack(spikes(i)) for i, c in enumerate(profile.cameras)}
+
+
+RECORDER = """
+import sys
+from pathlib import Path
+import numpy as np
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators.recorder.files.clip_files import StreamFiles
+from spike4dgs.generators.recorder.files.clip_record import ClipRecord
+from spike4dgs.generators.recorder.profile.profile import load_profile
+
+out, rig, value = Path(sys.argv[1]), load_profile(Path(sys.argv[2])), int(sys.argv[3])
+print("ready", flush=True)
+sys.stdin.readline()
+try:
+    with StreamFiles(out, rig, 2000) as files:
+        for camera in rig.cameras:
+            files.append(camera.id, 0, np.full((2000, rig.width * rig.height // 8), value, np.uint8))
+        files.finish(ClipRecord(2000, (), {"method": "none"}))
+    print("done")
+except UserError as e:
+    print(e)
+"""
+RIG = """
+schema = "spike4dgs-rig/1"
+name = "pair"
+width = 40
+height = 24
+layout = "plain"
+[defaults]
+vendor_id = 1
+product_id = 1
+endpoint_in = 0x82
+[[camera]]
+id = "left"
+serial = "A1"
+role = "primary"
+[[camera]]
+id = "right"
+serial = "A2"
+"""
+
+
+def test_of_recorders_that_start_into_one_folder_together_one_records(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(RIG)
+    out, pipe = tmp_path / "clip", subprocess.PIPE
+    commands = [[sys.executable, "-c", RECORDER, str(out), str(tmp_path / "rig.toml"), str(v)] for v in (1, 2, 3)]
+    started = [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for command in commands]
+    for process in started:
+        assert process.stdout and process.stdout.readline() == "ready\n"
+    for process in started:
+        assert process.stdin
+        process.stdin.write("\n")
+        process.stdin.flush()
+    said = [process.communicate(timeout=120)[0] for process in started]
+    assert said.count("done\n") == 1, said
+    for text in said:
+        assert text.count("\n") == 1 and (text == "done\n" or "no other recording uses" in text or "a new or" in text)
+    found = {int(v) for stream in open_stream_folder(out).values() for v in np.unique(stream.packed)}
+    assert found == {said.index("done\n") + 1}, "no clip of two recorders"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["clip", "rig.toml"], "no lock stays behind"
+
+
+def test_a_folder_is_locked_from_the_start_to_the_end_of_a_recording(tmp_path: Path) -> None:
+    out = tmp_path / "clip"
+    with StreamFiles(out, rig(), TICKS):
+        with pytest.raises(UserError, match="expected a folder that no other recording uses, found a run in progress"):
+            StreamFiles(out, rig(), TICKS)
+    assert not out.exists()
+    write_clip(out, rig(), streams(rig()), ClipRecord(TICKS, (), SYNC))
+    with pytest.raises(UserError, match="a new or empty folder"):
+        StreamFiles(out, rig(), TICKS)
+    assert open_scene(out).n_ticks == TICKS and [p.name for p in tmp_path.iterdir()] == ["clip"]
 
 
 GAPS = (Gap("cam_00", 4, 3, "overflow"), Gap("cam_00", 28, 2, "unplugged"), Gap("cam_02", 0, 1, "stall"))

@@ -95,7 +95,7 @@ def test_a_board_clip_is_a_scene_and_overwrites_no_other(tmp_path, capsys):
     assert (scene.n_ticks, len(scene.cameras), scene.meta["source"]["square_m"]) == (40, 9, 0.04)
     assert main(arguments) == 2
     assert main([*arguments[:2], str(tmp_path / "c"), "--seconds", "0.00001"]) == 2
-    assert "at least 5e-05, one tick" in capsys.readouterr().err
+    assert "from 5e-05, one tick" in capsys.readouterr().err
 
 
 def test_any_array_films_the_board(small_scene, tmp_path):

@@ -1,0 +1,1 @@
+"""Download from releases: scenes, parts of them, windows of time, and weight files."""

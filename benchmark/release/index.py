@@ -1,0 +1,208 @@
+"""The index of a release: release.json, and beside each shard the list of its members.
+
+    release.json                        scenes: revision, size, clock, samples; shards: bytes, SHA-256, that of the list
+    shards/000/spike4dgs-1-00000.tar    members, uncompressed
+    shards/000/spike4dgs-1-00000.json   the list: member, scene, path, camera, part, offset, bytes, SHA-256 of it and of
+                                        its blocks
+
+The SHA-256 of release.json pins all of it. A client reads release.json and the lists of those shards alone that hold
+what it wants, so a release of many terabytes costs its clients no more than they take.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import parse_json
+from spike4dgs.benchmark.release.layout import part_of
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+
+NAME = "release.json"
+SCHEMA, SHARD_SCHEMA = "spike4dgs-packed-release/1", "spike4dgs-shard/1"
+BLOCK = 1 << 20  # bytes that have a hash of their own: the smallest piece of a file that can be checked
+_FIX = "fetch the release again, or pack it again"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A file of a scene in a shard. `blocks` has the SHA-256 of each BLOCK bytes of it; the last may be shorter."""
+
+    name: str
+    scene: str
+    path: str  # in the scene folder
+    camera: str | None
+    offset: int  # of its first byte in the shard
+    bytes: int
+    sha256: str
+    blocks: tuple[str, ...]
+
+
+def index_of(shard: str) -> str:
+    """Return the path of the list of a shard's members, in the release."""
+    return shard.removesuffix(".tar") + ".json"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A tar of a release: its path in the release, and its list of members as a file."""
+
+    file: str
+    bytes: int
+    sha256: str
+    index_bytes: int
+    index_sha256: str
+
+    @property
+    def index(self) -> str:
+        """The path of its list of members in the release."""
+        return index_of(self.file)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One camera of a scene, or with camera None the scene's own files: its shard, and bytes by part."""
+
+    camera: str | None
+    shard: int
+    sizes: dict[str, int]
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """A scene of a release. The fields after `licence` are those of scene.json."""
+
+    id: str
+    revision: str
+    samples: tuple[Sample, ...]
+    title: str
+    licence: str
+    rate_hz: float
+    n_ticks: int
+    width: int
+    height: int
+    rows_bottom_up: bool
+    streams: dict[str, str]  # camera -> path
+    gaps: tuple[dict[str, Any], ...]
+
+    @property
+    def bytes(self) -> int:
+        """The size of all its files."""
+        return sum(sum(sample.sizes.values()) for sample in self.samples)
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Bytes by part."""
+        sizes: dict[str, int] = {}
+        for sample in self.samples:
+            for part, size in sample.sizes.items():
+                sizes[part] = sizes.get(part, 0) + size
+        return sizes
+
+
+@dataclass(frozen=True)
+class Release:
+    """What release.json says. `sha256` is that of the file itself."""
+
+    name: str
+    scenes: dict[str, SceneEntry]
+    shards: tuple[Shard, ...]
+    sha256: str
+
+
+def release_json(name: str, scenes: list[SceneEntry], shards: list[Shard]) -> dict[str, Any]:
+    """Return the content of release.json."""
+    return {
+        "schema": SCHEMA,
+        "name": name,
+        "block_bytes": BLOCK,
+        "scenes": [_scene_json(scene) for scene in scenes],
+        "shards": [
+            {
+                "file": s.file,
+                "bytes": s.bytes,
+                "sha256": s.sha256,
+                "index_bytes": s.index_bytes,
+                "index_sha256": s.index_sha256,
+            }
+            for s in shards
+        ],
+    }
+
+
+def _scene_json(scene: SceneEntry) -> dict[str, Any]:
+    facts = {name: value for name, value in vars(scene).items() if name != "samples"}
+    facts["gaps"] = list(scene.gaps)
+    samples = [{"camera": s.camera, "shard": s.shard, "sizes": s.sizes} for s in scene.samples]
+    return {**facts, "bytes": scene.bytes, "samples": samples}
+
+
+def parse_release(text: bytes, sha256: str, where: str) -> Release:
+    """Return the release that a release.json describes. Raises UserError where it is damaged or foreign."""
+    data = _parse(text, where, SCHEMA, "release.schema.json")
+    scenes = {s["id"]: _scene(s) for s in data["scenes"]}
+    shards = tuple(Shard(**s) for s in data["shards"])
+    used = {sample.shard for scene in scenes.values() for sample in scene.samples}
+    if len(scenes) != len(data["scenes"]) or not used <= set(range(len(shards))):
+        raise problem(where, "distinct scenes in the shards that it lists", "others", _FIX)
+    return Release(data["name"], scenes, shards, sha256)
+
+
+def _scene(data: dict[str, Any]) -> SceneEntry:
+    samples = tuple(Sample(s["camera"], s["shard"], s["sizes"]) for s in data["samples"])
+    return SceneEntry(
+        **{k: v for k, v in data.items() if k not in ("samples", "bytes", "gaps")},
+        samples=samples,
+        gaps=tuple(data["gaps"]),
+    )
+
+
+def shard_json(file: str, size: int, sha256: str, members: list[Member]) -> dict[str, Any]:
+    """Return the content of the list of a shard's members."""
+    return {
+        "schema": SHARD_SCHEMA,
+        "shard": file,
+        "bytes": size,
+        "sha256": sha256,
+        "files": [{**vars(m), "blocks": list(m.blocks), "part": part_of(m.path)} for m in members],
+    }
+
+
+def parse_shard(text: bytes, shard: Shard, where: str) -> tuple[Member, ...]:
+    """Return the members of a shard. Raises UserError where the list is damaged, or none of this shard."""
+    data = _parse(text, where, SHARD_SCHEMA, "shard.schema.json")
+    fields = ("name", "scene", "path", "camera", "offset", "bytes", "sha256")
+    members = tuple(Member(**{k: f[k] for k in fields}, blocks=tuple(f["blocks"])) for f in data["files"])
+    for m in members:
+        if m.offset + m.bytes > shard.bytes or len(m.blocks) != max(-(-m.bytes // BLOCK), 1):
+            raise problem(where, f"files inside {shard.bytes} bytes, with a hash a block", m.name, _FIX)
+    if len({(m.scene, m.path) for m in members}) < len(members):
+        raise problem(where, "distinct files", "one twice", _FIX)
+    if (data["shard"], data["bytes"], data["sha256"]) != (shard.file, shard.bytes, shard.sha256):
+        raise problem(where, f"the members of {shard.file}", "those of another file", _FIX)
+    return members
+
+
+def _parse(text: bytes, where: str, schema: str, file: str) -> dict[str, Any]:
+    try:
+        data = parse_json(text.decode())
+    except ValueError as e:
+        raise problem(where, f"a {schema} (JSON)", f"damaged text ({e})", _FIX) from None
+    found = data.get("schema") if isinstance(data, dict) else type(data).__name__
+    if found != schema:
+        raise problem(where, f"schema {schema}", repr(found), "name the folder of a release of this version")
+    check_schema(data, load_schema("spike4dgs.benchmark.release", file), where, _FIX)
+    checked: dict[str, Any] = data
+    return checked
+
+
+def read_release(root: Path) -> Release:
+    """Read release.json of a folder. Raises UserError where it is missing or damaged."""
+    path = root / NAME
+    if not path.is_file():
+        raise problem(path, "the description of a release", "no such file", "name a folder of `spike4dgs release pack`")
+    text = path.read_bytes()
+    return parse_release(text, hashlib.sha256(text).hexdigest(), str(path))

@@ -1,0 +1,1 @@
+"""Make releases: shards, their index, the card; and check them before they are uploaded."""

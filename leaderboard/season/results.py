@@ -1,0 +1,120 @@
+"""The results of a season: one file for each submission, and the table that is made from them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.results.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.leaderboard.season.season_file import Season, season_folder
+
+SCHEMA = "spike4dgs-season-result/1"
+TABLE = "table.md"
+PREDICTIONS, METHOD = "predictions", "method"  # the ways to submit
+_SHOWN = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "temporal_error")
+
+
+@dataclass(frozen=True)
+class Result:
+    """The record of a submission, and the way in which it was submitted."""
+
+    submitted_as: str  # PREDICTIONS or METHOD
+    record: Record
+
+    @property
+    def name(self) -> str:
+        """The method's name."""
+        return str(self.record["method"]["name"])
+
+    @property
+    def predictions_sha256(self) -> dict[str, str | None]:
+        """The SHA-256 of each scene's SHA256SUMS."""
+        return {scene: cell["predictions_sha256"] for scene, cell in self.record["scenes"].items()}
+
+
+def result_path(seasons: Path, number: int, method: str) -> Path:
+    """Return the file of a method's result."""
+    return season_folder(seasons, number) / "results" / f"{method}.json"
+
+
+def write_result(seasons: Path, number: int, result: Result) -> None:
+    """Write a result, or keep the one of the same predictions.
+
+    Raises UserError where the method has other predictions there: a name is scored once, so that nobody can tune
+    against hidden scenes.
+    """
+    path = result_path(seasons, number, result.name)
+    if path.exists():
+        if read_result(path).predictions_sha256 != result.predictions_sha256:
+            fix = "a name is scored once in a season: submit under another one"
+            raise problem(path, "no result of this name, or the same predictions", "other predictions", fix)
+        return
+    write_json(path, {"schema": SCHEMA, "submitted_as": result.submitted_as, "record": result.record})
+
+
+def read_result(path: Path) -> Result:
+    """Read a result. Raises UserError where it is damaged or inconsistent, or where its file has another name."""
+    data = read_json(path, "a season's result")
+    schema = load_schema("spike4dgs.leaderboard.season", "season_result.schema.json")
+    check_schema(data, schema, path, "score the submission again")
+    result = Result(data["submitted_as"], with_later_metrics(data["record"]))
+    check_record(result.record, path)
+    if result.name != path.stem:
+        raise problem(path, f"the result of {path.stem}", result.name, "rename the file")
+    return result
+
+
+def read_results(seasons: Path, season: Season) -> list[Result]:
+    """Return the results of a season, best first; incomplete ones follow.
+
+    Raises UserError where one is damaged, or is of other scenes than the season's.
+    """
+    found = []
+    expected = {scene.id: scene.revision for scene in season.scenes}
+    for path in sorted((season_folder(seasons, season.season) / "results").glob("*.json")):
+        result = read_result(path)
+        if (scenes := result.record["dataset"]["scenes"]) != expected:
+            raise problem(path, f"scores of the committed {json.dumps(expected)}", json.dumps(scenes), "score it again")
+        found.append(result)
+    return sorted(found, key=_order)
+
+
+def _order(result: Result) -> tuple[bool, float, str]:
+    """Return the key by which results are ranked."""
+    value = result.record["mean"][PRIMARY] if is_complete(result.record) else None
+    sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
+    return value is None, sign * (value or 0.0), result.name
+
+
+def table_text(season: Season, results: Sequence[Result]) -> str:
+    """Return the table of a season: the mean over its scenes, best first. Equal results give equal texts."""
+    scenes = ", ".join(f"`{scene.id}`" for scene in season.scenes)
+    header = ["rank", "method", "submitted as", *(METRICS[m].title for m in _SHOWN), "fit, s"]
+    lines = [
+        f"# Season {season.season}",
+        "",
+        f"Means over {scenes}; {PROTOCOL['name']}, version {PROTOCOL['version']}.",
+        "",
+    ]
+    lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    for position, result in enumerate(results, start=1):
+        rank = str(position) if is_complete(result.record) else "-"
+        seconds = [cell["fit_seconds"] for cell in result.record["scenes"].values()]
+        fit = "-" if None in seconds else f"{math.fsum(seconds):.0f}"
+        values = [METRICS[m].format(result.record["mean"][m]) for m in _SHOWN]
+        lines.append(f"| {' | '.join([rank, result.name, result.submitted_as, *values, fit])} |")
+    return "\n".join(lines) + "\n"
+
+
+def write_table(seasons: Path, season: Season) -> Path:
+    """Write the table of a season's results and return its path."""
+    path = season_folder(seasons, season.season) / TABLE
+    write_text(path, table_text(season, read_results(seasons, season)))
+    return path

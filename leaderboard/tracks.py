@@ -1,0 +1,166 @@
+"""The tracks of a release: frozen lists of scenes with their revisions, and the place of a record among them.
+
+    leaderboard/releases/1.json       the tracks
+    leaderboard/releases/SHA256SUMS   the file's hash: a release does not change
+
+A record of exactly a track's scenes, revisions and split is public. Its folder is that of the first such track; its
+method is on the boards of all of them that withhold nothing it was given. Any other record is local.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, sha256_json
+from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+
+FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
+RELEASE = "1"
+PUBLIC, LOCAL, ARCHIVE = "entries", "local", "archive"
+REVISION_DIGITS = 12  # of revisions in paths and messages
+_SCENE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_NAMED = 3  # scenes that a message names
+
+
+@dataclass(frozen=True)
+class Track:
+    """A frozen list of scenes with their revisions; those of an announced track have none and take no entries."""
+
+    name: str
+    title: str
+    announced: bool
+    split: str
+    withheld: frozenset[str]
+    scenes: Mapping[str, str | None]
+
+
+@dataclass(frozen=True)
+class Release:
+    """The tracks of a release, and the noise ceilings of its scenes in dB, as far as they were measured."""
+
+    number: str
+    tracks: tuple[Track, ...]
+    ceilings_db: Mapping[str, float]
+
+    def ceiling_db(self, scene: str, revision: str) -> float | None:
+        """Return a scene's noise ceiling; None where it is not known, or where the revision is not the release's."""
+        known = any(track.scenes.get(scene) == revision for track in self.tracks)
+        return self.ceilings_db.get(scene) if known else None
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the entry of a record belongs.
+
+    `folder` is below the leaderboard's folder. `tracks` has the names of the public boards that list the entry; without
+    any it is local, and `why` is the reason.
+    """
+
+    folder: str
+    tracks: tuple[str, ...]
+    why: str
+
+    @property
+    def is_public(self) -> bool:
+        """True for an entry of a track."""
+        return bool(self.tracks)
+
+
+@cache
+def read_release(folder: Path, number: str) -> Release:
+    """Read a release. Raises UserError where its file is damaged, or is not the one that was frozen."""
+    path, sums = folder / f"{number}.json", folder / "SHA256SUMS"
+    data = read_json(path, f"release {number} of the leaderboard")
+    fix = "restore the file: a release does not change, what is new goes into the next one"
+    check_schema(data, load_schema("spike4dgs.leaderboard", "release.schema.json"), path, fix)
+    listed = sums.read_text(encoding="utf-8").splitlines() if sums.is_file() else []
+    if f"{(found := hashlib.sha256(path.read_bytes()).hexdigest())}  {path.name}" not in listed:
+        raise problem(path, f"the bytes whose hash {sums.name} lists", f"sha256 {found[:16]}...", fix)
+    tracks = tuple(
+        Track(name, t["title"], t["status"] == "announced", t["split"], frozenset(t["withheld"]), t["scenes"])
+        for name, t in data["tracks"].items()
+    )
+    return Release(data["release"], tracks, data["ceilings_db"])
+
+
+def current_release() -> Release:
+    """Return the release that this version ships: it decides where records belong."""
+    return read_release(FOLDER, RELEASE)
+
+
+def track_scenes(name: str) -> dict[str, str]:
+    """Return the revisions of a track's scenes by their ids, for downloads.
+
+    Raises UserError for an unknown track, and for one whose scenes are not released yet.
+    """
+    tracks = {track.name: track for track in current_release().tracks}
+    if name not in tracks:
+        raise problem("track", f"one of {', '.join(tracks)}", repr(name), "correct the name")
+    scenes = {scene: revision for scene, revision in tracks[name].scenes.items() if revision is not None}
+    if tracks[name].announced:
+        raise problem("track", "one whose scenes are released", f"{name}, which is only announced", "choose another")
+    return scenes
+
+
+def dataset_revision(dataset: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a record's or a track's scenes with their revisions and of its split, as hex digits."""
+    return sha256_json({"scenes": dict(dataset["scenes"]), "split": dataset["split"]})
+
+
+def short(revision: str) -> str:
+    """Return the first digits of a revision, for paths and messages."""
+    return revision[:REVISION_DIGITS]
+
+
+def place_of(record: Mapping[str, Any]) -> Place:
+    """Return where a record's entry belongs.
+
+    Raises UserError where a scene's id cannot be part of a file name, and where the dataset's name is not its scenes'.
+    """
+    dataset, release = record["dataset"], current_release()
+    ids = sorted(dataset["scenes"])
+    for scene in ids:
+        if not _SCENE_ID.fullmatch(scene):
+            fix = "correct the scene's id and score again"
+            raise problem("the record's dataset", "scene ids of letters, digits and . _ -", repr(scene[:120]), fix)
+    if dataset["name"] != "+".join(ids):
+        fix = "score the predictions again"
+        raise problem("the record's dataset", f"the name {'+'.join(ids)[:120]}", repr(dataset["name"][:120]), fix)
+    revision = short(dataset_revision(dataset))
+    same = [t for t in release.tracks if t.scenes == dataset["scenes"] and t.split == dataset["split"]]
+    given = set(record["method"].get("given", GIVEN))
+    if boards := tuple(t.name for t in same if not t.withheld & given):
+        return Place(f"{PUBLIC}/{release.number}-{same[0].name}@{revision}", boards, "")
+    more = f"+{len(ids) - 1}" if len(ids) > 1 else ""
+    return Place(f"{LOCAL}/{ids[0]}{more}@{revision}", (), why_local(dataset, release, same))
+
+
+def why_local(dataset: Mapping[str, Any], release: Release, same: list[Track]) -> str:
+    """Return the reason why a record belongs to no track; `same` are the tracks of its scenes, revisions and split."""
+    number = f"release {release.number}"
+    if same:
+        return f"the method was given what {', '.join(t.name for t in same)} of {number} withholds"
+    known = {scene: revision for t in release.tracks for scene, revision in t.scenes.items() if revision}
+    other = [
+        f"{scene}: revision {short(revision)} here, {short(known[scene])} in {number}"
+        for scene, revision in sorted(dataset["scenes"].items())
+        if scene in known and known[scene] != revision
+    ]
+    if other:
+        more = f"; and {len(other) - _NAMED} more" if len(other) > _NAMED else ""
+        return f"{'; '.join(other[:_NAMED])}{more}; see make-dataset --check"
+    ids = set(dataset["scenes"])
+    if announced := [t.name for t in release.tracks if t.announced and ids & set(t.scenes)]:
+        return f"{', '.join(announced)} of {number} takes no entries yet"
+    if splits := sorted({t.split for t in release.tracks if set(t.scenes) == ids}):
+        return f"split {dataset['split']} here, {', '.join(splits)} in {number}"
+    return f"no track of {number} has exactly these scenes"

@@ -1,0 +1,107 @@
+"""Predictions beside the truth and its noise: honest predictions neither equal the truth nor carry its noise.
+
+The truth is a Monte Carlo rendering T = S + n. Two second renderings A and B of one target have noise of their own, so
+that the mean of (T - A)(T - B) estimates the variance of n without bias. It gives
+
+    the ceiling      the PSNR of the truth against S, which no method exceeds that has not seen T
+    the noise share  mean of (P - A)(T - B) over mean of (T - A)(T - B), of high-passed images: the regression of the
+                     prediction P on n, which is 1 for P = T, whatever other noise is added, and 0 for any P that is
+                     independent of n
+
+Neither tells a denoised truth from a good method: fitting again does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.results.predictions import Predictions
+from spike4dgs.benchmark.scene.scene import Scene, Target
+
+Float64 = NDArray[np.float64]
+Renderings = tuple[Target, NDArray[np.float32], NDArray[np.float32]]
+SecondRenderings = Callable[[Scene], Renderings | None]
+_WINDOW = 3  # px of the high-pass: texture that predictions blur is left out, Monte Carlo noise is white
+
+
+@dataclass(frozen=True)
+class TruthCheck:
+    """The predictions of a scene beside its truth; without second renderings the last three are None."""
+
+    images: int
+    equal_images: int  # equal to the truth in every bit
+    equal_pixels: float  # share, without black and white pixels, which may well agree
+    noise_share: float | None = None
+    noise_share_error: float | None = None  # standard error
+    ceiling_db: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+
+def no_renderings(scene: Scene) -> None:
+    """Return no second renderings: their checks are left out."""
+
+
+def check_truth(predictions: Predictions, scene: Scene, second_renderings: SecondRenderings) -> TruthCheck:
+    """Compare predictions with the truth; with second renderings of a target, also with its noise."""
+    equal_images = equal = compared = 0
+    for target in scene.targets:
+        truth, image = scene.ground_truth(target), predictions.read(target)
+        gray = (truth > 0) & (truth < 1)
+        same = (truth == image) & gray
+        equal, compared = equal + int(same.sum()), compared + int(gray.sum())
+        equal_images += bool(gray.any() and np.array_equal(truth, image))
+    found = TruthCheck(len(scene.targets), equal_images, equal / max(compared, 1))
+    if (renderings := second_renderings(scene)) is None:
+        return found
+    target, first, second = renderings
+    truth, image = scene.ground_truth(target), predictions.read(target)
+    share, error = noise_share(image, truth, first, second)
+    noise = noise_ceiling_db(truth, first, second)
+    return TruthCheck(found.images, equal_images, found.equal_pixels, share, error, noise)
+
+
+def noise_ceiling_db(truth: NDArray[Any], first: NDArray[Any], second: NDArray[Any]) -> float | None:
+    """Return the PSNR of the truth [H, W] against what it would be without noise; None where no noise is seen."""
+    t, a, b = (_clipped(image) for image in (truth, first, second))
+    variance = float(np.mean((t - a) * (t - b)))
+    return -10 * math.log10(variance) if variance > 0 else None
+
+
+def noise_share(
+    image: NDArray[Any], truth: NDArray[Any], first: NDArray[Any], second: NDArray[Any]
+) -> tuple[float | None, float | None]:
+    """Return the share of the truth's noise that an image [H, W] carries, and its standard error.
+
+    The image is first scaled to the second renderings, since a copy may be darker. None where no noise is seen.
+    """
+    p, t, a, b = (_clipped(i) for i in (image, truth, first, second))
+    square = float(np.sum(p * p))
+    p = p * (float(np.sum(p * (a + b) / 2)) / square) if square > 0 else p
+    noise = _high_pass(t - a), _high_pass(t - b)
+    carried = (_high_pass(p - a) * noise[1] + _high_pass(p - b) * noise[0]) / 2
+    variance = noise[0] * noise[1]
+    if (mean := float(variance.mean())) <= 0:
+        return None, None
+    share = float(carried.mean()) / mean
+    spread = float(np.std(carried - share * variance))
+    return share, spread / math.sqrt(variance.size) / mean
+
+
+def _clipped(image: NDArray[Any]) -> Float64:
+    return np.clip(image.astype(np.float64), 0, 1)
+
+
+def _high_pass(image: Float64) -> Float64:
+    """Return an image [H, W] less the mean of each pixel's window."""
+    from scipy.ndimage import uniform_filter
+
+    return np.asarray(image - uniform_filter(image, _WINDOW))

@@ -1,0 +1,45 @@
+"""Fixtures of the seasons' tests: a season that was made once, and copies that a test may damage."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from dummy_methods import CountMethod
+from fake_renderer import render_fakes
+from made_season import NUMBER, WORLDS, Made
+
+from spike4dgs.generators.make_dataset import make_dataset
+from spike4dgs.leaderboard.season.make_command import make_season_make
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    made = Made(tmp_path_factory.mktemp("season"))
+    with pytest.MonkeyPatch.context() as patch:
+        render_fakes(patch)
+        make = make_season_make(make_dataset)
+        given = {"worlds": WORLDS, "profile": "tiny", "budget": "0.02"}
+        assert make(NUMBER, secret=made.secret, seasons=made.seasons, **given) == 0
+    made.predict(CountMethod("counts"), CountMethod("rough", steps=1))
+    return made
+
+
+@pytest.fixture
+def made(once: Made, tmp_path: Path) -> Made:
+    """A copy of a season that is made, and not scored."""
+    return Made(Path(shutil.copytree(once.root, tmp_path / "copy")))
+
+
+@pytest.fixture(scope="session")
+def scored_once(once: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    copy = Made(Path(shutil.copytree(once.root, tmp_path_factory.mktemp("scored") / "copy")))
+    assert copy.score("counts", "rough") == 0
+    return copy
+
+
+@pytest.fixture
+def scored(scored_once: Made, tmp_path: Path) -> Made:
+    """A copy of a season with two results."""
+    return Made(Path(shutil.copytree(scored_once.root, tmp_path / "copy")))

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_renderer import files, render_fakes
+from made_season import NUMBER, WORLDS, Made
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.generators.make_dataset import make_dataset
+from spike4dgs.leaderboard.season.make_command import make_season_make
+from spike4dgs.leaderboard.season.opening import NAME, read_opening
+from spike4dgs.leaderboard.season.secret_folder import pack_file, scene_folder, training_folder
+
+
+def command(made: Made, worlds: tuple[str, ...] = WORLDS, number: int = NUMBER, **options: Any) -> int:
+    given = {"profile": "tiny", "secret": made.secret, "seasons": made.seasons, **options}
+    return make_season_make(make_dataset)(number, worlds=worlds, **given)
+
+
+def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
+    season, drawn = made.season, read_opening(made.secret / NAME)
+    assert season.opening_sha256 == sha256_file(made.secret / NAME)
+    assert [s.id for s in season.scenes] == ["car-9003-tiny", "turntable-9003-tiny"] == [s.scene for s in drawn.scenes]
+    for scene, seed in zip(season.scenes, drawn.scenes, strict=True):
+        whole = open_scene(scene_folder(made.secret, scene.id))
+        assert str(whole.meta["source"]["seed"]) == seed.seed
+        assert (scene.revision, scene.pack_sha256) == (
+            whole.revision,
+            sha256_file(pack_file(made.secret, scene.id, training=False)),
+        )
+        part = open_scene(training_folder(made.secret, scene.id))
+        assert scene.training_revision == part.revision != whole.revision
+        assert scene.training_pack_sha256 == sha256_file(pack_file(made.secret, scene.id, training=True))
+    assert season.rendered_on["mitsuba_variant"] == "fake" and season.rendered_on["cpu"]
+    assert (season.streams, season.budget, season.fit_seed, season.closes) == ("published", "0.02", 0, None)
+
+
+def test_no_secret_is_in_the_public_folder(made: Made) -> None:
+    drawn, public = read_opening(made.secret / NAME), b"".join(files(made.seasons).values()).decode()
+    assert list(files(made.seasons)) == [f"{NUMBER}/season.json"]
+    for secret in (drawn.salt, *(s.seed for s in drawn.scenes)):
+        assert secret not in public and f"{int(secret, 16 if secret == drawn.salt else 10):x}" not in public
+
+
+def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    render_fakes(monkeypatch)
+    made, rendered = Made(tmp_path), []
+
+    def dying(worlds: tuple[str, ...], **options: Any) -> int:
+        if worlds == ("turntable",) and len(rendered) == 1:
+            rendered.append("died")
+            raise KeyboardInterrupt
+        rendered.append(worlds[0])
+        return make_dataset(worlds, **options)
+
+    make = make_season_make(dying)
+    given: dict[str, Any] = {"worlds": WORLDS, "profile": "tiny", "secret": made.secret, "seasons": made.seasons}
+    with pytest.raises(KeyboardInterrupt):
+        make(NUMBER, **given)
+    drawn = (made.secret / NAME).read_bytes()
+    assert not made.seasons.exists(), "nothing is committed to before all is made"
+    assert make(NUMBER, **given) == 0
+    assert (made.secret / NAME).read_bytes() == drawn
+    assert rendered == ["car", "died", "car", "turntable"]
+    assert made.season.opening_sha256 == sha256_file(made.secret / NAME)
+
+
+def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(made.root)
+    assert command(made) == 0 and "complete, kept" in capsys.readouterr().out
+    assert files(made.root) == before
+    with pytest.raises(UserError, match=r"expected the commitment .* choose another number or --secret"):
+        command(made, secret=made.root / "another")
+    assert files(made.seasons) == {f"{NUMBER}/season.json": before[f"seasons/{NUMBER}/season.json"]}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"worlds": ("car",)}, "give the same arguments"),
+        ({"number": 4}, "give the same arguments"),
+        ({"profile": "small"}, "give the same arguments"),
+        ({"number": -1}, "number: expected a number from 0 up"),
+        ({"worlds": ("car", "car")}, "--worlds: expected worlds, each once"),
+        ({"worlds": ()}, "--worlds: expected worlds, each once, found none"),
+        ({"closes": "soon"}, "--closes: expected a day"),
+        ({"budget": "much"}, "--budget: expected"),
+    ],
+)
+def test_other_arguments_are_refused(options: dict[str, Any], message: str, made: Made) -> None:
+    with pytest.raises(UserError, match=message):
+        command(made, **options)
+
+
+def test_another_version_of_the_code_does_not_finish_a_season(made: Made) -> None:
+    path = made.secret / NAME
+    data = json.loads(path.read_text())
+    data["harness"]["commit"] = "0" * 40
+    path.write_text(json.dumps(data, indent=2, sort_keys=True) + "\n")
+    with pytest.raises(UserError, match="with the same version of the code"):
+        command(made)

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dummy_methods import CountMethod, FailingMethod, run
+from fake_renderer import files
+from made_season import NUMBER, Made
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.method import Budget
+from spike4dgs.benchmark.results.predictions import open_predictions
+from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard.season.predict_command import predict_all
+from spike4dgs.leaderboard.season.results import read_results
+from spike4dgs.leaderboard.season.reveal_command import reveal
+from spike4dgs.leaderboard.season.score_command import score
+from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
+
+
+def edit(path: Path, **changes: Any) -> None:
+    write_json(path, json.loads(path.read_text()) | changes)
+
+
+def test_scores_are_those_of_whole_scenes(scored: Made, tmp_path: Path) -> None:
+    """The same method, fitted on the whole scenes by `run-benchmark`, has the same scores to the last bit."""
+    whole = [scene_folder(scored.secret, s.id) for s in scored.season.scenes]
+    expected = run(tmp_path / "out", whole, CountMethod("counts"), CountMethod("rough", steps=1), budget=Budget(0.5))
+    found = {r.name: r.record for r in read_results(scored.seasons, scored.season)}
+    for record in expected:
+        mine = found[record["method"]["name"]]
+        assert mine["mean"] == record["mean"] and mine["dataset"] == record["dataset"]
+
+
+def test_the_psnr_is_that_of_the_files(scored: Made) -> None:
+    (result,) = (r for r in read_results(scored.seasons, scored.season) if r.name == "counts")
+    for scene in (open_scene(scene_folder(scored.secret, s.id)) for s in scored.season.scenes):
+        predictions = open_predictions(scored.root / "runs/predictions/counts" / scene.id, scene.targets)
+        values = []
+        for t in scene.targets:  # linear radiance, clipped to [0, 1]
+            a, b = (np.clip(x.astype(np.float64), 0, 1) for x in (scene.ground_truth(t), predictions.read(t)))
+            values.append(-10 * np.log10(np.mean((a - b) ** 2)))
+        assert result.record["scenes"][scene.id]["metrics"]["psnr"] == pytest.approx(np.mean(values), abs=1e-6)
+
+
+def test_the_table_ranks_by_psnr(scored: Made) -> None:
+    results = read_results(scored.seasons, scored.season)
+    psnr = [r.record["mean"]["psnr"] for r in results]
+    assert psnr == sorted(psnr, reverse=True) and len(psnr) == 2
+    rows = [line for line in (scored.public / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
+    assert [row.split(" | ")[:4] for row in rows] == [
+        [f"| {i}", r.name, "predictions", f"{r.record['mean']['psnr']:.2f}"] for i, r in enumerate(results, start=1)
+    ]
+
+
+def test_a_name_is_scored_once(scored: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(scored.seasons)
+    assert scored.score("counts") == 0 and files(scored.seasons) == before
+    capsys.readouterr()
+    tuned = CountMethod("counts", steps=2)
+    scenes = open_committed(scored.secret, scored.season, training=True)
+    predict_all(scenes, [tuned], Settings(scored.root / "runs", budget=Budget()))
+    assert scored.score("counts") == 1 and files(scored.seasons) == before
+    assert "a name is scored once in a season: submit under another one" in capsys.readouterr().err
+
+
+def test_one_participants_mistake_does_not_stop_another(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = made.root / "runs/predictions/counts/car-9003-tiny"
+    edit(folder / "prediction.json", scene_revision="0" * 64)
+    assert made.score("counts", "rough") == 1
+    assert "expected predictions for scene revision" in capsys.readouterr().err
+    assert [r.name for r in read_results(made.seasons, made.season)] == ["rough"]
+
+
+def test_a_scene_without_predictions_is_not_left_out(made: Made) -> None:
+    (made.root / "runs/predictions/counts/car-9003-tiny").rename(made.root / "elsewhere")
+    assert made.score("counts", "rough") == 0
+    results = read_results(made.seasons, made.season)
+    assert [r.name for r in results] == ["rough", "counts"]
+    assert results[1].record["mean"]["psnr"] is None
+    assert "\n| - | counts | predictions | - |" in (made.public / "table.md").read_text()
+
+
+def test_a_method_gets_the_training_part_alone(made: Made) -> None:
+    seen = []
+
+    class Looking(CountMethod):
+        def fit(self, scene: Any, request: Any) -> Any:
+            seen.append((scene.revision, request.budget.scale))
+            return super().fit(scene, request)
+
+    predict_all(open_committed(made.secret, made.season, training=True), [Looking("l")], Settings(made.root / "o"))
+    assert [r for r, _ in seen] == [s.training_revision for s in made.season.scenes]
+
+
+def test_installed_methods_are_run_and_scored(made: Made) -> None:
+    assert score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("nearest-view",), device="cpu") == 0
+    (result,) = read_results(made.seasons, made.season)
+    assert (result.name, result.submitted_as) == ("nearest-view", "method")
+    assert {cell["budget"] for cell in result.record["scenes"].values()} == {0.02}
+
+
+def test_a_failing_method_is_named(made: Made) -> None:
+    scenes = open_committed(made.secret, made.season, training=True)
+    bad = FailingMethod("bad", ValueError("no luck"))
+    assert predict_all(scenes, [bad, CountMethod("good")], Settings(made.root / "out")) == {"bad"}
+    assert "no luck" in (made.root / "out/logs/bad__car-9003-tiny.log").read_text()
+    assert (made.root / "out/predictions/good/car-9003-tiny").is_dir()
+
+
+def test_nothing_is_scored_after_the_reveal(scored: Made) -> None:
+    assert reveal(NUMBER, secret=scored.secret, seasons=scored.seasons) == 0
+    with pytest.raises(UserError, match="expected a season whose seeds are secret, found revealed ones"):
+        scored.score("counts")
+
+
+def test_hidden_streams_take_methods_only(made: Made) -> None:
+    edit(made.public / "season.json", streams="hidden")
+    with pytest.raises(UserError, match="expected a season with published streams"):
+        made.score("counts")
+
+
+def test_nothing_to_score_is_an_error(made: Made) -> None:
+    with pytest.raises(UserError, match="expected --predictions or --methods, found neither"):
+        made.score()
+
+
+@pytest.mark.parametrize("folder", [scene_folder, training_folder])
+def test_another_scene_than_the_committed_one_is_not_scored(folder: Any, made: Made) -> None:
+    data = json.loads((made.public / "season.json").read_text())
+    key = "revision" if folder is scene_folder else "training_revision"
+    data["scenes"][1][key] = "0" * 64
+    write_json(made.public / "season.json", data)
+    with pytest.raises(UserError, match=r"turntable-9003-tiny: expected revision 0000.*, as committed"):
+        score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("nearest-view",), device="cpu")

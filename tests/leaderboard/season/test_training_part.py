@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_renderer import files
+from made_season import Made
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.results.score import open_for, score_scene
+from spike4dgs.benchmark.results.targets import has_truth
+from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.leaderboard.season.opening import NAME, read_opening
+from spike4dgs.leaderboard.season.secret_folder import scene_folder, training_folder
+from spike4dgs.leaderboard.season.training_part import training_files, write_training_part
+
+SCENE = "car-9003-tiny"
+DESCRIPTIONS = ("scene.json", "manifest.json", "targets.json", "croissant.json", "README.md")
+
+
+@pytest.fixture
+def whole(made: Made) -> Scene:
+    return open_scene(scene_folder(made.secret, SCENE))
+
+
+@pytest.fixture
+def part(made: Made) -> Scene:
+    return open_scene(training_folder(made.secret, SCENE))
+
+
+def test_no_byte_of_the_truth_is_in_it(made: Made, whole: Scene, part: Scene) -> None:
+    """Files are a training camera's recordings, byte for byte, or descriptions; no other file's bytes are anywhere."""
+    inside, outside = files(part.root), files(whole.root)
+    recordings = {name for name in inside if name in outside and inside[name] == outside[name]}
+    allowed = {name for name in outside if any(f"/{c}." in name for c in whole.train)} - {
+        name for name in outside if name.startswith("truth/")
+    }
+    assert {n for n in recordings if not n.startswith(("sparse/", "transforms_"))} == allowed
+    rest = {n for n in inside if n not in recordings and not n.startswith(("transforms_", "sparse/0/"))}
+    assert rest <= set(DESCRIPTIONS)
+    everything = b"".join(inside.values())
+    kept_back = {n: d for n, d in outside.items() if n not in inside and len(d) > 100}
+    assert {n.split("/")[0] for n in kept_back} >= {"images", "masks", "geometry", "truth", "spikes", "events"}
+    for name, data in kept_back.items():
+        assert data not in everything, name
+        assert hashlib.sha256(data).hexdigest().encode() not in everything, f"not even the hash of {name}"
+
+
+def test_the_seed_is_not_in_it(made: Made, part: Scene) -> None:
+    drawn = read_opening(made.secret / NAME)
+    everything = b"".join(files(training_folder(made.secret, SCENE)).values())
+    for seed in drawn.scenes:
+        assert seed.seed.encode() not in everything
+        for order in ("little", "big"):
+            assert int(seed.seed).to_bytes(16, order) not in everything  # type: ignore[arg-type]
+    assert "seed" not in part.meta["source"] and "notes" not in part.meta["source"]
+    assert (part.meta["source"]["world"], part.meta["source"]["variant"]) == ("car", 9003)
+
+
+def test_a_method_gets_the_same_from_it(whole: Scene, part: Scene) -> None:
+    a, b = whole.training, part.training
+    assert [c.id for c in a.cameras] == [c.id for c in b.cameras]
+    for x, y in zip(a.cameras, b.cameras, strict=True):
+        np.testing.assert_allclose(x.K, y.K)
+        np.testing.assert_allclose(x.R, y.R, atol=1e-12)
+        np.testing.assert_allclose(x.t, y.t, atol=1e-12)
+    for s, t in zip(a.streams, b.streams, strict=True):
+        assert s.packed.tobytes() == t.packed.tobytes()
+    for r, q in zip(a.recordings, b.recordings, strict=True):
+        assert r and q and r.flat.packed.tobytes() == q.flat.packed.tobytes()
+    assert part.targets == whole.targets and part.test == whole.test
+    assert a.events("cam_00").events.t.tolist() == b.events("cam_00").events.t.tolist()
+
+
+def test_what_is_kept_back_is_a_clear_error(part: Scene) -> None:
+    assert not has_truth(part)
+    with pytest.raises(UserError, match="expected a stream of cam_04, found none"):
+        part.stream("cam_04")
+    with pytest.raises(UserError, match="images/cam_04/000020.exr"):
+        part.ground_truth(part.targets[0])
+    with pytest.raises(UserError, match="expected a split among center"):
+        open_scene(part.root, split="corner")
+
+
+def test_predictions_of_it_are_scored_without_truth(made: Made, part: Scene) -> None:
+    folder = made.root / "runs/predictions/counts" / SCENE
+    cell = score_scene(open_for(folder, part), part, select_metrics(("psnr", "ssim", "brisque")))
+    assert cell["metrics"]["psnr"] is None and cell["metrics"]["brisque"] is not None
+
+
+def test_refinement_needs_the_held_out_stream(whole: Scene, part: Scene) -> None:
+    class Refining:
+        name, params, refines_views = "m", {}, True
+
+    names = [[i.name for i in Job(Refining(), s, 0, "cpu", None).variants] for s in (whole, part)]  # type: ignore[arg-type]
+    assert names == [["m", "m.refined"], ["m"]]
+
+
+def test_equal_scenes_have_equal_parts_and_others_do_not(whole: Scene, part: Scene, tmp_path: Path) -> None:
+    again = write_training_part(whole, tmp_path / SCENE)
+    assert files(again.root) == files(part.root)
+    copy = tmp_path / "changed"
+    shutil.copytree(whole.root, copy)
+    stream = bytearray((copy / "spikes/cam_00.dat").read_bytes())
+    stream[100] ^= 1
+    (copy / "spikes/cam_00.dat").write_bytes(stream)
+    write_manifest(copy)
+    assert write_training_part(open_scene(copy), tmp_path / "other").revision != part.revision
+
+
+def test_other_sensors_of_training_cameras_are_in_it(whole: Scene) -> None:
+    for camera in ("cam_00", "cam_04"):
+        for name in (f"conventional/{camera}/000000.png", f"calibration/maps/{camera}.npz"):
+            (whole.root / name).parent.mkdir(parents=True, exist_ok=True)
+            (whole.root / name).write_bytes(b"0")
+    write_manifest(whole.root)
+    names = training_files(open_scene(whole.root))
+    assert "conventional/cam_00/000000.png" in names and "conventional/cam_04/000000.png" not in names
+    assert {n.split("/")[0] for n in names} == {"spikes", "calibration", "conventional", "events"}

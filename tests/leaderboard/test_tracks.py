@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from submissions import edit, release_of, track, write_release
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.leaderboard import tracks
+from spike4dgs.leaderboard.tracks import current_release, dataset_revision, place_of
+
+NAMES = {
+    "outdoor-small",
+    "objects-small",
+    "outdoor-paper",
+    "objects-paper",
+    "uncalibrated",
+    "no-flat-field",
+    "quick-start",
+}
+
+
+def record_of(scenes: dict[str, str], split: str = "center", name: str | None = None, **method: Any) -> dict[str, Any]:
+    dataset = {"name": "+".join(sorted(scenes)) if name is None else name, "scenes": scenes, "split": split}
+    return {"dataset": dataset, "method": {"name": "m", "seed": 0, **method}}
+
+
+def of_track(name: str) -> dict[str, str]:
+    (found,) = (t for t in current_release().tracks if t.name == name)
+    return {scene: str(revision) for scene, revision in found.scenes.items()}
+
+
+def test_the_shipped_release_has_the_tracks_and_its_frozen_bytes() -> None:
+    assert {t.name for t in current_release().tracks} == NAMES
+    data = (tracks.FOLDER / "1.json").read_bytes()
+    assert (tracks.FOLDER / "SHA256SUMS").read_text() == f"{hashlib.sha256(data).hexdigest()}  1.json\n"
+    announced = {t.name for t in current_release().tracks if t.announced}
+    assert announced == {"outdoor-paper", "objects-paper"}
+
+
+def test_a_release_that_was_edited_is_refused(tmp_path: Path) -> None:
+    folder = write_release(tmp_path, {"a": track({"s": "0" * 64})})
+    assert tracks.read_release(folder, "1").tracks[0].scenes == {"s": "0" * 64}
+    tracks.read_release.cache_clear()
+    edit(folder / "1.json", lambda r: r["tracks"]["a"]["scenes"].update(s="1" * 64))
+    with pytest.raises(UserError, match=r"1\.json: expected the bytes whose hash SHA256SUMS lists"):
+        tracks.read_release(folder, "1")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r["tracks"].update({"../x": track({"s": "0" * 64})}),
+        lambda r: r["tracks"]["a"]["scenes"].update({"a/b": "0" * 64}),
+        lambda r: r["tracks"]["a"]["scenes"].update(s=None),
+        lambda r: r["tracks"]["a"].update(withheld=["everything"]),
+        lambda r: r["ceilings_db"].update(s=1e9),
+    ],
+)
+def test_a_release_follows_its_schema(tmp_path: Path, change: Any) -> None:
+    data = json.loads((write_release(tmp_path, {"a": track({"s": "0" * 64})}) / "1.json").read_text())
+    change(data)
+    write_release(tmp_path, data["tracks"], data["ceilings_db"])
+    with pytest.raises(UserError, match="expected a valid spike4dgs-release/1"):
+        tracks.read_release(tmp_path, "1")
+
+
+def test_a_tracks_scenes_and_revisions_are_public_and_the_path_carries_the_revision() -> None:
+    scenes = of_track("outdoor-small")
+    place = place_of(record_of(scenes))
+    revision = dataset_revision({"scenes": scenes, "split": "center"})
+    assert place.folder == f"entries/1-outdoor-small@{revision[:12]}" and place.tracks == ("outdoor-small",)
+    assert place_of(record_of(scenes, given=["flat-field"])).tracks == ("outdoor-small", "uncalibrated")
+    assert place_of(record_of(scenes, given=["poses"])).tracks == ("outdoor-small", "no-flat-field")
+    both = place_of(record_of(scenes, given=[]))
+    assert both.folder == place.folder and both.tracks == ("outdoor-small", "uncalibrated", "no-flat-field")
+
+
+def test_anything_else_is_local_and_says_why() -> None:
+    scenes, known = of_track("outdoor-small"), of_track("outdoor-small")["car-0-small"]
+    other = place_of(record_of({**scenes, "car-0-small": "ab" * 32}))
+    assert not other.is_public and other.folder.startswith("local/bicycle-0-small+4@")
+    assert other.why == f"car-0-small: revision {'ab' * 6} here, {known[:12]} in release 1; see make-dataset --check"
+    assert place_of(record_of(scenes, split="corner")).why == "split corner here, center in release 1"
+    assert place_of(record_of({"car-0-small": known})).why == "no track of release 1 has exactly these scenes"
+    paper = place_of(record_of({"car-0-paper": "0" * 64}))
+    assert paper.why == "outdoor-paper of release 1 takes no entries yet"
+    assert len({p.folder for p in (other, paper, place_of(record_of(scenes, split="corner")))}) == 3
+
+
+def test_a_method_that_was_given_what_every_track_withholds_is_local(tmp_path: Path, monkeypatch: Any) -> None:
+    release = write_release(tmp_path, {"unposed": track({"s": "0" * 64}, ("poses",))})
+    monkeypatch.setattr(tracks, "FOLDER", release)
+    assert "was given what unposed" in place_of(record_of({"s": "0" * 64})).why
+    assert place_of(record_of({"s": "0" * 64}, given=[])).tracks == ("unposed",)
+
+
+ids = st.text(min_size=1, max_size=120)
+
+
+@settings(deadline=None)
+@given(ids, st.text(max_size=60))
+def test_no_id_or_name_leads_out_of_the_folder(scene: str, name: str) -> None:
+    for record in (record_of({scene: "0" * 64}), record_of({"a": "0" * 64}, name=name)):
+        try:
+            folder = place_of(record).folder
+        except UserError as e:
+            assert "\n" not in str(e)
+            continue
+        parts = Path(folder).parts
+        assert len(parts) == 2 and parts[0] == "local" and not parts[1].startswith(".") and ".." not in parts
+
+
+@settings(deadline=None)
+@given(st.dictionaries(st.sampled_from("abcdef"), st.sampled_from(["0" * 64, "1" * 64]), min_size=1))
+def test_equal_paths_mean_equal_scenes_and_revisions(scenes: dict[str, str]) -> None:
+    folder = place_of(record_of(scenes)).folder
+    for scene in scenes:
+        changed = copy.deepcopy(scenes) | {scene: "2" * 64}
+        assert place_of(record_of(changed)).folder != folder
+    assert place_of(record_of(dict(reversed(scenes.items())))).folder == folder
+
+
+def test_a_release_of_the_tests_own(finished: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import shutil
+
+    done = Path(shutil.copytree(finished, tmp_path / "run"))
+    release_of(done, monkeypatch)
+    assert {t.name for t in current_release().tracks} == {"patterns", "unposed"}

@@ -1,0 +1,60 @@
+"""A server that answers as Hugging Face's hub does, for one dataset repository that is a folder here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+from urllib.parse import unquote
+
+from range_server import Behaviour, Handler
+
+REPOSITORY = "owner/name"
+_FILES, _TREE = "/resolve/main/", f"/api/datasets/{REPOSITORY}/tree/main"
+
+
+@contextmanager
+def serve_hub(root: Path) -> Iterator[tuple[str, Behaviour]]:
+    """Serve the folder as the repository REPOSITORY; yield the endpoint and the behaviour with its requests."""
+    seen = Behaviour()
+
+    class Hub(_Hub):
+        folder, behaviour = root, seen
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Hub)
+    server.daemon_threads = True
+    Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}", seen
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+class _Hub(Handler):
+    def do_GET(self) -> None:
+        path = self.path.partition("?")[0]
+        if _FILES in path:
+            self.path = f"/{path.partition(_FILES)[2]}"
+            super().do_GET()
+        elif path.startswith(_TREE):
+            inside = unquote(path.removeprefix(_TREE)).strip("/")
+            self._json([self._entry(p) for p in sorted((self.folder / inside).iterdir())])
+        else:
+            self._json({"id": REPOSITORY, "sha": "a" * 40, "siblings": [], "tags": []})
+
+    def _entry(self, path: Path) -> dict[str, Any]:
+        kind = {"type": "file", "size": path.stat().st_size} if path.is_file() else {"type": "directory"}
+        return {"path": path.relative_to(self.folder).as_posix(), "oid": "b" * 40, **kind}
+
+    def _json(self, value: Any) -> None:
+        data = json.dumps(value).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
