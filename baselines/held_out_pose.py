@@ -28,7 +28,7 @@ from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.observations.pinholes import make_lenses
 from spike4dgs.method.pose_refinement import rigid_motion
-from spike4dgs.method.splat import Views, render
+from spike4dgs.method.splat import Views
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.tracking.model import TrackedModel
 
@@ -92,7 +92,7 @@ class RefinableModel:
         depth_m = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
 
         def render_view(views: Views) -> Tensor:
-            return model.image(render(splats, views).image, views)
+            return model.rendered(splats, views)
 
         return refine_pose(render_view, camera, image, background, depth_m, self.refinement, model.device)
 

@@ -124,6 +124,8 @@ BEYOND = (
         "pixel",
         {
             **_FLAT,
+            "trainer.filter_variance": 1 / 12,
+            "trainer.filter_compensated": True,
             "trainer.freeze_background": True,
             "trainer.moving_change": 0.012,
             "trainer.initial_scale": 0.5,

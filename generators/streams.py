@@ -64,6 +64,7 @@ def sensor_facts(job: Job) -> dict[str, Any]:
     return {
         "model": SENSOR.name,
         "rows_bottom_up": True,
+        "pixel_filter": "box",  # of the truth too: see `rendering.render`
         "reset": SENSOR.reset,
         "most_spikes_per_tick": SENSOR.most_spikes_per_tick,
         "gain_map": job.gain_map,

@@ -203,7 +203,8 @@ def fit_gaussians(
     trainer.run(request.progress, request.checkpoint, job.key)
     cameras = with_lenses(job.scene, trainer.poses.cameras(start.cameras))
     duration_us, device = job.scene.duration_us, request.device
-    return FittedModel(trainer.pieces(), trainer.background, motion, duration_us, device, spec, cameras)
+    found = (trainer.pieces(), trainer.background, motion, duration_us, device, spec)
+    return FittedModel(*found, cameras, settings.pixel_filter)
 
 
 def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:

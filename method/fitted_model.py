@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,6 +24,7 @@ from spike4dgs.method.observations.pinholes import through_lens
 from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import join
+from spike4dgs.method.splat.types import PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 
 _MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
@@ -76,6 +77,7 @@ class FittedModel:
     device: str
     spec: MotionSpec
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
+    pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
 
     @property
     def size_bytes(self) -> int:
@@ -89,8 +91,12 @@ class FittedModel:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
         with one_torch_thread():
-            image = render(self.splats(t_us), views).image
-            return self.image(image, views)[0].clamp(min=0).cpu().numpy()
+            return self.rendered(self.splats(t_us), views)[0].clamp(min=0).cpu().numpy()
+
+    def rendered(self, splats: Splats, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
+        f = self.pixel_filter
+        return self.image(render(splats, views, eps2d=f.variance, antialiased=f.compensated).image, views)
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
@@ -114,7 +120,7 @@ class FittedModel:
         pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
         background = {BACKGROUND: to_file_names(self.background.tensors())}
         tensors = group(**pieces, **background, motion=self.motion.state_dict())
-        config = {"motion": self.spec.as_dict(), "pieces": len(pieces)}
+        config = {"motion": self.spec.as_dict(), "pieces": len(pieces), "filter": asdict(self.pixel_filter)}
         write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
     @classmethod
@@ -132,9 +138,18 @@ class FittedModel:
             Gaussians.from_file({k: v.to(device) for k, v in from_file_names(file.part(part)).items()})
             for part in (*(f"piece{i}" for i in range(count)), BACKGROUND)
         )
-        made = cls(tuple(pieces), background, motion.to(device), file.provenance.duration_us, device, spec)
+        duration_us, found = file.provenance.duration_us, _filter(file.config.get("filter", {}))
+        made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, pixel_filter=found)
         made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
         return made
+
+
+def _filter(value: Mapping[str, Any]) -> PixelFilter:
+    """Return the filter that a file names, or the customary one where it names none, as earlier versions' do."""
+    made = PixelFilter(**value)
+    if type(made.compensated) is not bool:
+        raise ValueError(f"a filter with `compensated` true or false, and not {shown(made.compensated)}")
+    return replace(made, variance=number(made.variance, 0, MAX_SIDE))
 
 
 def count_bytes(tensors: Iterable[Tensor]) -> int:

@@ -114,7 +114,10 @@ class Trainer:
         self.gaussians = self.gaussians.rows(moves).trainable()
 
     def _set_background(self, background: Gaussians) -> None:
-        self.background, self.projected = background, Background(background.splats(), self.training_images.views)
+        self.background, self.projected = (
+            background,
+            Background(background.splats(), self.training_images.views, self.settings.pixel_filter),
+        )
 
     def sample(self) -> Sample:
         """Return the current step's views and time."""
@@ -156,7 +159,8 @@ class Trainer:
         return loss.detach()
 
     def _render(self, splats: Splats, views: Views) -> RenderOutput:
-        return render(splats, views)
+        s = self.settings
+        return render(splats, views, eps2d=s.filter_variance, antialiased=s.filter_compensated)
 
     def _views(self, chosen: list[int]) -> Views:
         return Views(self.training_images.views.w2c[chosen], self.training_images.views.K[chosen], *self._size())

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from spike4dgs.method.observations.changes import POINTS
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.splat.types import EPS2D, PixelFilter
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,11 @@ class TrainerSettings(Settings):
     lr_poses: float = 2e-4  # radians, and translations by the scene's scale: 0.05 px a step at 225 px
     lr_poses_last: float = 2e-6
 
+    # The pixel filter, of the fit and of the fitted model. 0.3 px^2 without compensation is customary, and its blur
+    # helps where images are noisy.
+    filter_variance: float = EPS2D  # px^2; a pixel, which is a box, has 1/12
+    filter_compensated: bool = False  # keep a Gaussian's light where the filter enlarges it
+
     # Model only what moves.
     freeze_background: bool = False  # after the static stage, Gaussians where nothing changes become a background
     moving_change: float = POINTS.limit  # standard deviation over time, in white, above which points move
@@ -40,6 +46,11 @@ class TrainerSettings(Settings):
     lr_colors: float = 5e-3
     beta1: float = 0.9
     beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
+
+    @property
+    def pixel_filter(self) -> PixelFilter:
+        """The filter's two numbers."""
+        return PixelFilter(self.filter_variance, self.filter_compensated)
 
     def scaled(self, scale: float) -> TrainerSettings:
         """Return the same settings with the step counts multiplied by a budget's scale."""

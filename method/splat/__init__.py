@@ -2,6 +2,6 @@
 
 from spike4dgs.method.splat.api import render
 from spike4dgs.method.splat.kernels.threads import set_threads
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views
 
-__all__ = ["RenderOutput", "Splats", "Views", "render", "set_threads"]
+__all__ = ["PixelFilter", "RenderOutput", "Splats", "Views", "render", "set_threads"]

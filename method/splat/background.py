@@ -22,7 +22,7 @@ from spike4dgs.method.splat.cuda.background import make_layer, render_over
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.project import Geometry
-from spike4dgs.method.splat.types import EPS2D, NEAR, RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import NEAR, PixelFilter, RenderOutput, Splats, Views
 
 Array = np.ndarray
 
@@ -40,9 +40,9 @@ class _Layer:
 class Background:
     """Splats in views, neither of which changes. Splats rendered with it need the same number of channels."""
 
-    def __init__(self, splats: Splats, views: Views) -> None:
+    def __init__(self, splats: Splats, views: Views, pixel_filter: PixelFilter = PixelFilter()) -> None:
         self.splats = Splats(*(t.detach() for t in (*splats.geometry, splats.colors)))
-        self.views = views
+        self.views, self.pixel_filter = views, pixel_filter
         self._layers: dict[int, _Layer] = {}
         self._on_device: DeviceLayer | None = None
 
@@ -55,7 +55,7 @@ class Background:
         `radii` and `means2d` are those of `splats` alone. Raises UserError for values that are not finite.
         """
         if splats.means.device.type != "cpu":
-            self._on_device = self._on_device or make_layer(self.splats, self.views)
+            self._on_device = self._on_device or make_layer(self.splats, self.views, self.pixel_filter)
             return render_over(self._on_device, splats, chosen)
         if not torch.isfinite(splats.colors.detach().sum()):
             cpu.require_finite(splats)
@@ -67,8 +67,9 @@ class Background:
         return RenderOutput(image.permute(0, 2, 3, 1), alpha, None, radii, means2d)
 
     def settings(self) -> cpu.Settings:
-        """Return the kernels' settings: the defaults of `render`, in the size of the views."""
-        return cpu.Settings(self.views.width, self.views.height, NEAR, EPS2D, antialiased=False, depth=False)
+        """Return the kernels' settings: the background's filter, in the size of the views."""
+        f = self.pixel_filter
+        return cpu.Settings(self.views.width, self.views.height, NEAR, f.variance, f.compensated, depth=False)
 
     def layer(self, view: int) -> _Layer:
         """Return the background in a view. It is rendered on the first call."""

@@ -21,6 +21,18 @@ NEAR = 0.01  # Gaussians whose centre is nearer than this (in world units) are n
 EPS2D = 0.3  # variance of the pixel filter, px^2
 
 
+@dataclass(frozen=True)
+class PixelFilter:
+    """The filter that a model is fitted and rendered with: a Gaussian of this variance, added to every projection.
+
+    A sensor's pixel is a box of one pixel: variance 1/12 px^2. A compensated filter keeps a Gaussian's total light
+    (Mip-Splatting, Yu et al. 2024); without compensation, as customary, it makes small ones brighter.
+    """
+
+    variance: float = EPS2D  # px^2
+    compensated: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Splats:
     """N Gaussians as a renderer needs them. F is any number of colour channels."""

@@ -17,7 +17,7 @@ from spike4dgs.method.fitted_model import count_bytes
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.model_files.model_file import ModelFile, group, write_model
 from spike4dgs.method.observations.pinholes import through_lens
-from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat import PixelFilter, Splats, Views, render
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +127,20 @@ class TrackedModel:
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
-        image = render(self.splats(t_us), views).image
-        return self.image(image, views)[0].clamp(min=0).cpu().numpy()
+        return self.rendered(self.splats(t_us), views)[0].clamp(min=0).cpu().numpy()
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
         return self.at(t_us).splats()
+
+    @property
+    def pixel_filter(self) -> PixelFilter:
+        """The customary one."""
+        return PixelFilter()
+
+    def rendered(self, splats: Splats, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of what `splats` returns."""
+        return self.image(render(splats, views).image, views)
 
     def image(self, image: Tensor, views: Views) -> Tensor:
         """Return gray radiance [V, H, W] of the rendered channel [V, H, W, 1]."""

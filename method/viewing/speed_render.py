@@ -24,7 +24,7 @@ from spike4dgs.benchmark.speed.timing import show_table
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat.reference import Projection, composite, project
-from spike4dgs.method.splat.types import EPS2D, NEAR
+from spike4dgs.method.splat.types import NEAR, PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
 
@@ -35,6 +35,11 @@ PATCHES = ((0.2, 0.3), (0.5, 0.3), (0.8, 0.3), (0.2, 0.7), (0.5, 0.7), (0.8, 0.7
 @runtime_checkable
 class Splatting(Protocol):
     """A model that renders Gaussians."""
+
+    @property
+    def pixel_filter(self) -> PixelFilter:
+        """The filter of its images."""
+        ...
 
     def render(self, camera: Camera, t_us: float) -> Float32:
         """Return gray linear radiance [H, W]."""
@@ -122,7 +127,8 @@ def exact_patch(
     splats, views = model.splats(t_us), Views.from_cameras([camera])
     wide = Splats(*(t.double().cpu() for t in (*splats.geometry, splats.colors)))
     whole = (camera.width, camera.height)
-    seen = project(wide, views.w2c[0], views.K[0], whole, False, NEAR, EPS2D)
+    f = model.pixel_filter
+    seen = project(wide, views.w2c[0], views.K[0], whole, f.compensated, NEAR, f.variance)
     offset = torch.tensor(corner, dtype=torch.float64)
     half = torch.tensor(size, dtype=torch.float64) / 2
     near = ((seen.center - offset - half).abs() <= half + seen.radius[:, None]).all(-1)

@@ -10,7 +10,7 @@ from toy_world import ToyWorld
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.method import Budget, FitRequest, Model
 from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.splat import set_threads
+from spike4dgs.method.splat import PixelFilter, set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.4)  # 10 px in 12 ms
@@ -49,6 +49,14 @@ def test_the_loss_falls(name: str) -> None:
     losses = fitted(name)[1]
     quarter = len(losses) // 4
     assert np.mean(losses[-quarter:]) < 0.75 * np.mean(losses[:2])
+
+
+def test_a_model_has_the_filter_that_its_recipe_fits_with() -> None:
+    """A published row's is customary; the reference method's is a pixel's own."""
+    request = FitRequest(SHORT)
+    for name, expected in (("tfp+4dgs", PixelFilter()), ("spike4dgs-x", PixelFilter(1 / 12, compensated=True))):
+        model = METHODS[name].fit(WORLD.training, request)
+        assert isinstance(model, FittedModel) and model.pixel_filter == expected
 
 
 @pytest.mark.slow

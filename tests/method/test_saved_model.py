@@ -19,6 +19,7 @@ from spike4dgs.benchmark.results.provenance import Savable
 from spike4dgs.method.model_files.model_file import ModelFile, read_model, write_model
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.splat import PixelFilter
 
 FLAT = Path(__file__).parent / "flat_settings_models"  # of a version with one flat list of settings
 MOVING = [name for name in MODELS if name != "static"]
@@ -36,6 +37,17 @@ def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path) -> None
         assert image.std() > 0.01, "a test of nothing"
         np.testing.assert_array_equal(loaded.model.render(camera, t_us), image)
     assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
+
+
+def test_a_model_keeps_the_filter_that_it_was_fitted_with(tmp_path: Path) -> None:
+    wide = PixelFilter(4.0, compensated=True)
+    customary, fitted = model("paths"), dataclasses.replace(model("paths"), pixel_filter=wide)
+    fitted.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    images = [m.render(WORLD.held_out, 0.5 * DURATION_US) for m in (loaded, fitted, customary)]
+    assert loaded.pixel_filter == wide
+    np.testing.assert_array_equal(images[0], images[1])
+    assert abs(images[1] - images[2]).max() > 0.01, "the filter matters"
 
 
 @pytest.mark.parametrize("name", ["hexplane", "paths", "spacetime"])
@@ -134,6 +146,12 @@ def without(key: str) -> Any:
             lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}},
             "cannot read .ValueError: .* in place of",
         ),
+        (
+            lambda f: {"config": {**f.config, "filter": {"variance": -1.0}}},
+            "cannot read .ValueError: -1.0 is no number",
+        ),
+        (lambda f: {"config": {**f.config, "filter": {"compensated": 1}}}, "cannot read .ValueError: a filter with"),
+        (lambda f: {"config": {**f.config, "filter": {"sigma": 1.0}}}, "cannot read .TypeError"),
         (
             lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
             "cannot read .KeyError",

@@ -10,7 +10,7 @@ from splat_scenes import HARD, random_splats, views
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat import PixelFilter, Splats, Views, render
 from spike4dgs.method.splat.background import Background
 
 
@@ -18,14 +18,17 @@ def rows(splats: Splats, index: Tensor) -> Splats:
     return Splats(*(t[index].float() for t in (*splats.geometry, splats.colors)))
 
 
-def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int]) -> None:
+BOX = PixelFilter(1 / 12, compensated=True)
+
+
+def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int], f: PixelFilter = PixelFilter()) -> None:
     """Compare images and gradients of splats[moving] in front of the others."""
     few = Views(v.w2c[chosen], v.K[chosen], v.width, v.height)
     order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
     everything = [t.requires_grad_() for t in (*rows(splats, order).geometry, rows(splats, order).colors)]
     own = [t.requires_grad_() for t in (*rows(splats, moving).geometry, rows(splats, moving).colors)]
-    expected = render(Splats(*everything), few, backend="cpu")
-    found = Background(rows(splats, ~moving), v).render(Splats(*own), chosen)
+    expected = render(Splats(*everything), few, eps2d=f.variance, antialiased=f.compensated, backend="cpu")
+    found = Background(rows(splats, ~moving), v, f).render(Splats(*own), chosen)
     assert torch.equal(found.image, expected.image) and torch.equal(found.alpha, expected.alpha)
     n = int((~moving).sum())
     assert torch.equal(found.radii, expected.radii[:, n:])
@@ -45,11 +48,12 @@ def test_images_and_gradients_are_those_of_all_at_once(n: int, share: float, cha
     both_ways(random_splats(n, channels, seed=seed), views(3), moving, [2, 0])
 
 
+@pytest.mark.parametrize("pixel_filter", [PixelFilter(), BOX], ids=["customary", "box"])
 @pytest.mark.parametrize("scene", HARD)
-def test_hard_scenes(scene) -> None:  # type: ignore[no-untyped-def]
+def test_hard_scenes(scene, pixel_filter: PixelFilter) -> None:  # type: ignore[no-untyped-def]
     splats, v = scene()
     moving = torch.arange(len(splats)) % 3 == 0
-    both_ways(splats, v, moving, [0])
+    both_ways(splats, v, moving, [0], pixel_filter)
 
 
 def test_a_background_serves_many_renders() -> None:
