@@ -22,7 +22,7 @@ from spike4dgs.method.splat.cuda.background import make_layer, render_over
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.project import Geometry
-from spike4dgs.method.splat.types import NEAR, PixelFilter, RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import CUSTOMARY, NEAR, PixelFilter, RenderOutput, Splats, Views
 
 Array = np.ndarray
 
@@ -40,7 +40,7 @@ class _Layer:
 class Background:
     """Splats in views, neither of which changes. Splats rendered with it need the same number of channels."""
 
-    def __init__(self, splats: Splats, views: Views, pixel_filter: PixelFilter = PixelFilter()) -> None:
+    def __init__(self, splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> None:
         self.splats = Splats(*(t.detach() for t in (*splats.geometry, splats.colors)))
         self.views, self.pixel_filter = views, pixel_filter
         self._layers: dict[int, _Layer] = {}

@@ -33,6 +33,9 @@ class PixelFilter:
     compensated: bool = False
 
 
+CUSTOMARY = PixelFilter()
+
+
 @dataclass(frozen=True, eq=False)
 class Splats:
     """N Gaussians as a renderer needs them. F is any number of colour channels."""

@@ -148,7 +148,7 @@ def without(key: str) -> Any:
         ),
         (
             lambda f: {"config": {**f.config, "filter": {"variance": -1.0}}},
-            "cannot read .ValueError: -1.0 is no number",
+            "ValueError: -1.0 is no number",
         ),
         (lambda f: {"config": {**f.config, "filter": {"compensated": 1}}}, "cannot read .ValueError: a filter with"),
         (lambda f: {"config": {**f.config, "filter": {"sigma": 1.0}}}, "cannot read .TypeError"),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from spike4dgs.method.splat.cuda.lists import Lists, all_tiles, make_pairs, sort_pairs
 from spike4dgs.method.splat.cuda.render import Behind, Job, Projected, blend, grid_of, project_splats
-from spike4dgs.method.splat.types import NEAR, PixelFilter, RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import CUSTOMARY, NEAR, PixelFilter, RenderOutput, Splats, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Layer:
 
 
 @torch.no_grad()
-def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter = PixelFilter()) -> Layer:
+def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> Layer:
     """Render the background once into all views."""
     device = splats.means.device
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)

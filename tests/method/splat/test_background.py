@@ -12,6 +12,7 @@ from torch import Tensor
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import PixelFilter, Splats, Views, render
 from spike4dgs.method.splat.background import Background
+from spike4dgs.method.splat.types import CUSTOMARY
 
 
 def rows(splats: Splats, index: Tensor) -> Splats:
@@ -21,7 +22,7 @@ def rows(splats: Splats, index: Tensor) -> Splats:
 BOX = PixelFilter(1 / 12, compensated=True)
 
 
-def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int], f: PixelFilter = PixelFilter()) -> None:
+def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int], f: PixelFilter = CUSTOMARY) -> None:
     """Compare images and gradients of splats[moving] in front of the others."""
     few = Views(v.w2c[chosen], v.K[chosen], v.width, v.height)
     order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
