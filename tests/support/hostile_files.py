@@ -625,7 +625,7 @@ def _too_long(*_: object) -> None:
 
 
 def peak_memory_mb() -> float:
-    """Return this process's largest resident memory. The system's usage report also counts the parent's, at the fork."""
+    """Return this process's largest resident memory. What the system reports of usage also counts the parent's."""
     status = Path("/proc/self/status")
     if status.is_file():
         return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) / 1024
