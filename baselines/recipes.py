@@ -136,6 +136,11 @@ BEYOND = (
 )
 
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
+_X = BEYOND[-1].settings
+TRIAL = (
+    Recipe("x-pixel", "adaptive", "rig", "paths", "pixel", dict(_X)),
+    Recipe("x-exposure", "intervals", "rig", "paths", "exposure", dict(_X)),
+)
 SUPERVISED = tuple(
     Recipe(f"tfp+4dgs+{name}", "tfp", "rig", "hexplane", name) for name in ("spike", "pixel+spike", "spss")
 )
@@ -186,7 +191,7 @@ def _with_given(method: RecipeMethod) -> RecipeMethod:
 METHODS: dict[str, Method] = {
     **{
         recipe.name: _with_given(RecipeMethod(recipe, PARTS, description=describe(recipe)))
-        for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)
+        for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *TRIAL, *SUPERVISED)
     },
     **{recipe.name: _with_given(PosedRecipe(recipe, PARTS, description=describe(recipe))) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),

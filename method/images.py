@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -21,6 +22,8 @@ from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
+
+Float16 = NDArray[np.float16]
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,29 @@ def make_training_images(
 ) -> TrainingImages:
     """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
     ticks, made = make_images(scene, make, settings, device)
+    spans = make_spans(scene, make, ticks)
     images = torch.from_numpy(undistorted(scene, made)).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
-    return TrainingImages(Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking)
+    over = None if spans is None else torch.from_numpy(spans).to(device)
+    return TrainingImages(
+        Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, over
+    )
+
+
+def make_spans(scene: TrainingScene, make: ImageMaker, ticks: Sequence[int]) -> Float16 | None:
+    """Return the spans [T, C, 2, h, w] that the images of `make_training_images` are means over.
+
+    In ticks from each of `ticks`. None where the images show instants.
+    """
+    if not hasattr(make, "measured_over"):
+        return None
+    own = [local_ticks(scene.state(c.id).clock, ticks, scene.n_ticks)[0] for c in scene.cameras]
+    found = [make.measured_over(s, t) for s, t in zip(scene.streams, own, strict=True)]
+    if any(f is None for f in found):
+        return None
+    return np.stack(nearest_pixels(scene, [f.astype(np.float16) for f in found]), axis=1)
 
 
 def make_images(

@@ -80,10 +80,10 @@ class Trainer:
             own["poses"] = [self.poses.xi], Decay(s.lr_poses, s.lr_poses_last)
         self.learning_rates = {
             "means": Decay(s.lr_means * self.scale, s.lr_means_last * self.scale),
-            "log_scales": Decay(s.lr_scales, s.lr_scales),
-            "quats": Decay(s.lr_quats, s.lr_quats),
-            "logits": Decay(s.lr_opacities, s.lr_opacities),
-            "colors": Decay(s.lr_colors, s.lr_colors),
+            "log_scales": Decay(s.lr_scales, s.lr_last * s.lr_scales),
+            "quats": Decay(s.lr_quats, s.lr_last * s.lr_quats),
+            "logits": Decay(s.lr_opacities, s.lr_last * s.lr_opacities),
+            "colors": Decay(s.lr_colors, s.lr_last * s.lr_colors),
             **self.motion.learning_rates(),
             **{name: rate for name, (_, rate) in own.items()},
         }
@@ -129,7 +129,9 @@ class Trainer:
             views = order[: self.settings.views_per_step].sort().values
         tick = training.ticks[index]
         images = training.measured(index)[views]
-        return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step)
+        spans = None if training.spans is None else training.spans[index][views]
+        chosen, tick_t = tuple(views.tolist()), 1 / training.n_ticks
+        return Sample(tick * tick_t, tick, chosen, images, self.step, spans, tick_t)
 
     def train_step(self) -> Tensor:
         """Take one step; return the loss."""
@@ -143,6 +145,8 @@ class Trainer:
 
         def render_at(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
+            if outputs and not stage.deforms:  # at rest, one time is as good as another
+                return outputs[-1].image[..., 0]
             outputs.append(self.projected.render(splats, chosen) if self.projected else self._render(splats, views))
             image = outputs[-1].image
             return self.motion.image(image, views) if stage.deforms else image[..., 0]

@@ -44,6 +44,7 @@ class TrainerSettings(Settings):
     lr_quats: float = 2e-3
     lr_opacities: float = 0.05  # of their logits
     lr_colors: float = 5e-3
+    lr_last: float = 1.0  # of scales, rotations, opacities and colours at a stage's end, x their first
     beta1: float = 0.9
     beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -29,11 +28,10 @@ from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.spikes.times import spike_times
 from spike4dgs.method.settings import Settings
-
-_BLOCK = 64  # bytes of a tick, 512 pixels, whose spikes are gathered at a time
 
 
 @dataclass(frozen=True)
@@ -50,52 +48,6 @@ class AdaptiveSettings(Settings):
             raise problem("adaptive", expected, str(self), "correct the settings")
 
 
-@dataclass(frozen=True, eq=False)
-class SpikeTimes:
-    """The spikes of all pixels, one pixel after the other, in the stored order of pixels."""
-
-    ticks: NDArray[np.int32]  # [N] ascending within a pixel
-    starts: NDArray[np.int64]  # [P + 1] pixel p has ticks[starts[p]:starts[p + 1]]
-
-
-@lru_cache(maxsize=1)
-def spike_times(stream: SpikeStream) -> SpikeTimes:
-    """Return all spike times of a stream, cached for the last one: images are made stream by stream."""
-    packed, pixels = rows(stream.packed), stream.height * stream.width
-    starts = np.zeros(pixels + 1, np.int64)
-    blocks = -(-packed.shape[1] // _BLOCK)
-    in_threads(_count, blocks, packed, starts[1:])
-    np.cumsum(starts, out=starts)
-    ticks = np.empty(starts[-1], np.int32)
-    in_threads(_gather, blocks, packed, starts, ticks)
-    return SpikeTimes(ticks, starts)
-
-
-@kernel
-def _count(packed: UInt8, counts: NDArray[np.int64], start: int, stop: int) -> None:
-    first, end = start * _BLOCK, min(stop * _BLOCK, packed.shape[1])
-    for t in range(len(packed)):
-        for byte in range(first, end):
-            bits = packed[t, byte]
-            for k in range(8):
-                if bits >> k & 1 and 8 * byte + k < len(counts):
-                    counts[8 * byte + k] += 1
-
-
-@kernel
-def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], start: int, stop: int) -> None:
-    first, end, pixels = start * _BLOCK, min(stop * _BLOCK, packed.shape[1]), len(starts) - 1
-    at = starts[8 * first : min(8 * end, pixels)].copy()
-    for t in range(len(packed)):
-        for byte in range(first, end):
-            bits = packed[t, byte]
-            for k in range(8):
-                p = 8 * (byte - first) + k
-                if bits >> k & 1 and p < len(at):
-                    ticks[at[p]] = t
-                    at[p] += 1
-
-
 def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDArray[np.float64]:
     """Return the windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
     s = settings or AdaptiveSettings()
@@ -108,14 +60,21 @@ def adaptive_image(stream: SpikeStream, tick: int, settings: AdaptiveSettings | 
     s = settings or AdaptiveSettings()
     spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     pixels = stream.height * stream.width
-    level, image = np.empty(pixels, np.uint8), np.empty(pixels, np.float32)
-    in_threads(_choose, pixels, spikes.ticks, spikes.starts, tick, halves, level, small=pixels < 1 << 12)
-    square = np.ones((s.shared_px, s.shared_px), np.uint8)
-    shared = cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1)
+    shared, image = shared_levels(stream, tick, s), np.empty(pixels, np.float32)
     arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, shared, image)
     in_threads(_estimate, pixels, *arguments, small=pixels < 1 << 12)
     upright = image.reshape(stream.height, stream.width)
     return upright[::-1] if stream.rows_bottom_up else upright
+
+
+def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings) -> UInt8:
+    """Return the window that each pixel takes [H * W], an index into `half_windows`, in the stored order of pixels."""
+    spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
+    pixels = stream.height * stream.width
+    level = np.empty(pixels, np.uint8)
+    in_threads(_choose, pixels, spikes.ticks, spikes.starts, tick, halves, level, small=pixels < 1 << 12)
+    square = np.ones((s.shared_px, s.shared_px), np.uint8)
+    return np.asarray(cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1), np.uint8)
 
 
 @kernel

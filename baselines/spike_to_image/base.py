@@ -63,6 +63,7 @@ class ImageMaker:
     settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+    spans: Callable[[SpikeStream, int, Any], Float32] | None = None  # of a mean over time, [2, H, W]; None: an instant
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
 
     def with_settings(self, settings: Settings) -> ImageMaker:
@@ -97,3 +98,12 @@ class ImageMaker:
         found = images / np.float32(camera.radiance_gain) if self.corrected else camera.radiance(images)
         found[:, ~(camera.gain > 0)] = np.nan
         return found
+
+    def measured_over(self, stream: SpikeStream, ticks: Sequence[int]) -> Float32 | None:
+        """Return the span that each pixel's value is a mean over, [n, 2, H, W] in ticks from each of `ticks`.
+
+        None: the images show instants.
+        """
+        if self.spans is None:
+            return None
+        return np.stack([self.spans(stream, tick, self.settings) for tick in ticks])

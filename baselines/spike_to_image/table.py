@@ -6,6 +6,7 @@ import numpy as np
 
 from spike4dgs.baselines.spike_to_image.adaptive import ADAPTIVE
 from spike4dgs.baselines.spike_to_image.base import ImageMaker
+from spike4dgs.baselines.spike_to_image.intervals import INTERVALS
 from spike4dgs.baselines.spike_to_image.msdi import MSDI
 from spike4dgs.baselines.spike_to_image.spk2img.maker import SPK2IMG
 from spike4dgs.baselines.spike_to_image.tfi import TFI
@@ -15,7 +16,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
-IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, MSDI)}
+IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)}
 
 
 def make_image(name: str, stream: SpikeStream, tick: int, gain: float) -> Float32:

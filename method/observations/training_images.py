@@ -21,6 +21,7 @@ class TrainingImages:
     n_ticks: int  # length of the clip
     bad: Tensor | None = None  # bool [C, H, W], bad pixels, whose values are a neighbour's; None: there are none
     missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
+    spans: Tensor | None = None  # float16 [T, C, 2, H, W], ticks from the image's; None: images show instants
 
     def measured(self, index: int) -> Tensor:
         """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""
@@ -35,7 +36,8 @@ class TrainingImages:
         """Return the images of one time alone."""
         missing = None if self.missing is None else self.missing[index : index + 1]
         times = slice(index, index + 1)
-        return replace(self, ticks=self.ticks[times], images=self.images[times], missing=missing)
+        spans = None if self.spans is None else self.spans[times]
+        return replace(self, ticks=self.ticks[times], images=self.images[times], missing=missing, spans=spans)
 
 
 def known(image: Tensor, rendered: Tensor) -> Tensor:

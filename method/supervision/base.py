@@ -24,6 +24,8 @@ class Sample:
     views: tuple[int, ...]  # indices into the scene's training cameras
     images: Tensor  # [V, H, W] made from the spikes around the tick, 1.0 = white
     step: int  # of the fit: seeds what is random in a loss
+    spans: Tensor | None = None  # [V, 2, H, W] that the images are means over, ticks from `tick`; None: instants
+    tick_t: float = 0.0  # a tick as a share of the clip
 
 
 Render = Callable[[float], Tensor]  # t in [0, 1] -> the sample's views at that time, [V, H, W]

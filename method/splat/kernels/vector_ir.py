@@ -6,6 +6,7 @@ A vector of 16 floats is one AVX-512 register; 8 floats are one AVX2 register, o
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import llvmlite.binding
@@ -26,6 +27,7 @@ EXP2_POLYNOMIAL = (  # minimax on [-0.5, 0.5], relative error 2.4e-7
 )
 
 
+@cache
 def host_lanes() -> int:
     """Return the vector length that suits this machine: 16 floats with AVX-512, else 8."""
     return 16 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 8

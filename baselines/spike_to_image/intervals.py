@@ -1,0 +1,105 @@
+"""Intervals: what a pixel gathered between two of its spikes, as a mean over a known span of time.
+
+Between its spikes in ticks t_i and t_j a pixel gathers exactly j - i thresholds, whatever the light does in between.
+So
+
+    (j - i) / (t_j - t_i)    is the mean rate over    [t_i + 1/2, t_j + 1/2],
+
+up to half a tick at either end: a standard error of sqrt(2 / 12) / (t_j - t_i) of itself, and shot noise. It is no
+estimate of an instant, and a fit that compares it with its own mean over that span has no reason to make the span
+short. Of each pixel the spikes nearest to tick - half and tick + half are taken, if light changes within `half` ticks;
+where it does not, the longer window that `adaptive` finds, whose rate is that of any part of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.baselines.spike_to_image.adaptive import (
+    AdaptiveSettings,
+    adaptive_image,
+    half_windows,
+    shared_levels,
+)
+from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
+from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.spikes.times import spike_times
+
+
+@dataclass(frozen=True)
+class IntervalSettings(AdaptiveSettings):
+    """The windows of `adaptive`, and the span where light changes."""
+
+    half: float = 10.0  # ticks on either side
+
+
+def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
+    """Return spikes per tick [H, W] float32, each the mean over its pixel's span around `tick`."""
+    return intervals(stream, tick, settings)[0]
+
+
+def interval_spans(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
+    """Return the spans [2, H, W] of `interval_image`: first and last instant in ticks, from `tick`."""
+    return intervals(stream, tick, settings)[1]
+
+
+def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> tuple[Float32, Float32]:
+    """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module."""
+    s = settings or IntervalSettings()
+    spikes, pixels = spike_times(stream), stream.height * stream.width
+    image = adaptive_image(stream, tick, s)
+    rate = (image[::-1] if stream.rows_bottom_up else image).reshape(-1).copy()
+    changing = half_windows(stream.n_ticks, s)[shared_levels(stream, tick, s)] < s.half
+    spans = np.empty((2, pixels), np.float32)
+    spans[0], spans[1] = -s.half, s.half
+    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, s.half, changing, rate, spans)
+    rate, spans = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
+    return (rate[::-1], spans[:, ::-1]) if stream.rows_bottom_up else (rate, spans)
+
+
+@kernel
+def _nearest(times: NDArray[np.int32], instant: float) -> int:
+    """Return the index of the spike nearest to an instant; a spike of tick k is at k + 1/2."""
+    after = int(np.searchsorted(times, instant - 0.5))
+    if after == len(times) or (after > 0 and instant - 0.5 - times[after - 1] < times[after] + 0.5 - instant):
+        return after - 1
+    return after
+
+
+@kernel
+def _measure(
+    ticks: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    tick: int,
+    half: float,
+    changing: UInt8,
+    rate: Float32,
+    spans: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Set rate and span of the pixels that change, from the spikes nearest to either end."""
+    for p in range(start, stop):
+        times = ticks[starts[p] : starts[p + 1]]
+        if not changing[p] or len(times) < 2:
+            continue
+        i, j = _nearest(times, tick - half), _nearest(times, tick + half)
+        if i == j:  # one spike is nearest to both: the interval on the side where the tick lies
+            i, j = (i - 1, j) if (times[i] >= tick and i > 0) or j + 1 == len(times) else (i, j + 1)
+        rate[p] = np.float32((j - i) / (times[j] - times[i]))
+        spans[0, p], spans[1, p] = times[i] + 0.5 - tick, times[j] + 0.5 - tick
+
+
+INTERVALS = ImageMaker(
+    name="intervals",
+    definition="spikes / ticks from the spike nearest to tick - half to the one nearest to tick + half where light "
+    "changes, with its span of time; elsewhere as adaptive",
+    source="this project",
+    rate=interval_image,
+    spans=interval_spans,
+    settings=IntervalSettings(),
+)

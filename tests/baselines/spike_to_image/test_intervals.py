@@ -1,0 +1,117 @@
+"""Intervals between spikes: against a slow twin, against the light's exact mean over the span, and their error bars."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adaptive_image
+from spike4dgs.baselines.spike_to_image.intervals import IntervalSettings, intervals
+from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+
+
+def stream_of(spikes, bottom_up=True):
+    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20000.0, bottom_up)
+
+
+def fire(rates, charge):
+    """Spikes [T, H, W] of an ideal pixel: rates [T, H, W] in spikes per tick, charges [H, W] at the start."""
+    total = charge + np.cumsum(rates, axis=0)
+    return np.diff(np.floor(total), axis=0, prepend=np.floor(charge)[None]) > 0
+
+
+def sweeping(n, height, width, px_per_tick, seed=0):
+    """Rates [n, H, W] of a smooth texture that moves to the right, between 0.1 and 0.9 spikes per tick."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(0.05, 0.25, (4, 2)), rng.uniform(0, 2 * np.pi, 4)
+    t, y, x = np.mgrid[:n, :height, :width]
+    u = x - px_per_tick * (t + 0.5)
+    total = sum(np.sin(2 * np.pi * (a * u + b * y) + p) for (a, b), p in zip(*waves, strict=True))
+    return 0.5 + 0.1 * total
+
+
+def slow(spikes, tick, half):
+    """The definition for one pixel: rate, first and last instant; None with fewer than two spikes."""
+    instants = np.flatnonzero(spikes) + 0.5
+    if len(instants) < 2:
+        return None
+    i, j = (int(np.argmin(abs(instants - end))) for end in (tick - half, tick + half))
+    if i == j:
+        i, j = (i - 1, j) if (instants[i] > tick and i > 0) or j + 1 == len(instants) else (i, j + 1)
+    return (j - i) / (instants[j] - instants[i]), instants[i] - tick, instants[j] - tick
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(30, 120), st.booleans(), st.floats(3.5, 25.3), st.integers(0, 2**31))
+def test_what_changes_has_the_rate_and_the_span_of_the_definition(n, bottom_up, half, seed):
+    rng = np.random.default_rng(seed)
+    rates = rng.random((n, 4, 5)) ** 3 * rng.uniform(0, 1.2, (4, 5))
+    spikes, tick = fire(rates, rng.random((4, 5))), int(rng.integers(n))
+    s = IntervalSettings(half=half)
+    rate, spans = intervals(stream_of(spikes, bottom_up), tick, s)
+    still = adaptive_image(stream_of(spikes, bottom_up), tick, s)
+    for y, x in np.ndindex(4, 5):
+        twin = slow(spikes[:, y, x], tick, half)
+        if twin and tuple(spans[:, y, x]) != (np.float32(-half), np.float32(half)):
+            assert (rate[y, x], *spans[:, y, x]) == pytest.approx(twin, rel=1e-6)
+        else:
+            assert rate[y, x] == still[y, x]
+
+
+def test_constant_light_keeps_the_long_windows_of_adaptive():
+    spikes = fire(np.full((200, 6, 7), 0.3) * np.linspace(0.2, 2, 42).reshape(6, 7), np.full((6, 7), 0.4))
+    rate, spans = intervals(stream_of(spikes), 100)
+    np.testing.assert_array_equal(rate, adaptive_image(stream_of(spikes), 100))
+    assert (spans[0] == -10).all() and (spans[1] == 10).all()
+
+
+def errors(n=160, half=10.0, seed=0):
+    """Of pixels of moving light that change: rate minus the exact mean over its span, rate, and length of the span."""
+    rng = np.random.default_rng(seed)
+    rates = sweeping(n, 24, 40, 0.1, seed)
+    gathered = np.concatenate([np.zeros((1, 24, 40)), np.cumsum(rates, axis=0)])  # by the start of each tick
+    stream = stream_of(fire(rates, rng.random((24, 40))))
+    found = []
+    for tick in range(30, n - 30, 7):
+        rate, (first, last) = intervals(stream, tick, IntervalSettings(half=half))
+        y, x = np.nonzero((first != -half) | (last != half))
+        a, b = tick + first[y, x], tick + last[y, x]
+
+        def by(t, y=y, x=x):  # light gathered by an instant, in the middle of a tick
+            k = np.floor(t).astype(int)
+            return gathered[k, y, x] + (t - k) * rates[k, y, x]
+
+        found.append((rate[y, x] - (by(b) - by(a)) / (b - a), rate[y, x], b - a))
+    return (np.concatenate(column) for column in zip(*found, strict=True))
+
+
+def test_moving_light_is_measured_without_bias_and_as_precisely_as_said():
+    """sqrt(2 / 12) / length of the rate is the standard error that half a tick at either end makes: within 1.5."""
+    error, rate, length = errors()
+    implied = np.sqrt(1 / 6) * rate / length
+    assert len(error) > 3000, "a test of nothing"
+    assert 1 / 1.5 < np.sqrt(np.mean((error / implied) ** 2)) < 1.5
+    assert abs(error).max() < (rate / length * 1.0001).max(), "never more than half a tick at both ends"
+    assert abs(error.mean()) < 0.1 * implied.mean()
+
+
+def test_a_longer_span_is_more_precise():
+    short, long = (np.sqrt(np.mean(next(errors(half=half)) ** 2)) for half in (5.0, 20.0))
+    assert long < short / 3
+
+
+def test_the_maker_gives_images_and_spans():
+    spikes = fire(sweeping(80, 12, 16, 0.2), np.random.default_rng(1).random((12, 16)))
+    maker, stream = IMAGES["intervals"], stream_of(spikes)
+    images, spans = maker(stream, [20, 40], 0.5), maker.measured_over(stream, [20, 40])
+    rate, span = intervals(stream, 40)
+    np.testing.assert_allclose(images[1], rate / 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(spans[1], span)
+    assert IMAGES["adaptive"].measured_over(stream, [20]) is None, "an instant"
+
+
+def test_its_windows_are_those_of_adaptive():
+    assert IntervalSettings().shortest == AdaptiveSettings().shortest
