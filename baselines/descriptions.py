@@ -6,7 +6,7 @@ from spike4dgs.benchmark.method import Recipe
 
 _OWN = {
     "spike4dgs": "the paper's method: MSDI's points and images, 4DGS, SPSS",
-    "spike4dgs-x": "our own design: adaptive windows, a fixed background, and paths of what moves",
+    "spike4dgs-x": "our own design: means over known spans of time, a fixed background, and paths of what moves",
 }
 _MOTION = {
     "static": "3DGS, nothing moves",
@@ -21,10 +21,12 @@ _IMAGES = {
     "tfp": "from spike counts",
     "spk2img": "by Spk2ImgNet",
     "adaptive": "from the longest windows of constant light",
+    "intervals": "from the longest windows of constant light, and known spans where light changes",
     "msdi": "by MSDI",
 }
 _SUPERVISION = {
     "pixel": "",
+    "exposure": "means over time",
     "spike": "SpikeNeRF's loss",
     "spike-render": "SpikeGS's loss",
     "pixel+spike": "pixel loss and SpikeNeRF's",

@@ -9,7 +9,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -18,12 +17,10 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.observations.pinholes import nearest_pixels, undistorted
-from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.observations.training_images import Spans, TrainingImages
 from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
-
-Float16 = NDArray[np.float16]
 
 
 @dataclass(frozen=True)
@@ -60,6 +57,15 @@ class TunableImageMaker(ImageMaker, Protocol):
         ...
 
 
+@runtime_checkable
+class SpannedImageMaker(ImageMaker, Protocol):
+    """An image maker whose values may be means over known spans of time."""
+
+    def measured_over(self, stream: SpikeStream, ticks: Sequence[int]) -> Float32 | None:
+        """Return the first and the last instant of each pixel's span, [n, 2, H, W] in ticks from each of `ticks`."""
+        ...
+
+
 def maker_settings(maker: ImageMaker) -> Settings | None:
     """Return the maker's own numbers; None where it has none."""
     return maker.settings if isinstance(maker, TunableImageMaker) and fields(maker.settings) else None
@@ -93,29 +99,28 @@ def make_training_images(
 ) -> TrainingImages:
     """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
     ticks, made = make_images(scene, make, settings, device)
-    spans = make_spans(scene, make, ticks)
+    spans = make_spans(scene, make, ticks, device)
     images = torch.from_numpy(undistorted(scene, made)).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
-    over = None if spans is None else torch.from_numpy(spans).to(device)
     return TrainingImages(
-        Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, over
+        Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, spans
     )
 
 
-def make_spans(scene: TrainingScene, make: ImageMaker, ticks: Sequence[int]) -> Float16 | None:
-    """Return the spans [T, C, 2, h, w] that the images of `make_training_images` are means over.
-
-    In ticks from each of `ticks`. None where the images show instants.
-    """
-    if not hasattr(make, "measured_over"):
+def make_spans(scene: TrainingScene, make: ImageMaker, ticks: Sequence[int], device: str) -> Spans | None:
+    """Return the spans of time that the training images [T, C] are means over; None where they show instants."""
+    if not isinstance(make, SpannedImageMaker):
         return None
     own = [local_ticks(scene.state(c.id).clock, ticks, scene.n_ticks)[0] for c in scene.cameras]
     found = [make.measured_over(s, t) for s, t in zip(scene.streams, own, strict=True)]
-    if any(f is None for f in found):
+    measured = [f.astype(np.float16) for f in found if f is not None]
+    if not measured:
         return None
-    return np.stack(nearest_pixels(scene, [f.astype(np.float16) for f in found]), axis=1)
+    ends = np.stack(nearest_pixels(scene, measured), axis=1)
+    half = float(np.median((ends[:, :, 1] - ends[:, :, 0]).astype(np.float32))) / 2
+    return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
 
 
 def make_images(

@@ -129,9 +129,8 @@ class Trainer:
             views = order[: self.settings.views_per_step].sort().values
         tick = training.ticks[index]
         images = training.measured(index)[views]
-        spans = None if training.spans is None else training.spans[index][views]
-        chosen, tick_t = tuple(views.tolist()), 1 / training.n_ticks
-        return Sample(tick * tick_t, tick, chosen, images, self.step, spans, tick_t)
+        spans = None if training.spans is None else training.spans.at(index).at(views)
+        return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step, spans)
 
     def train_step(self) -> Tensor:
         """Take one step; return the loss."""

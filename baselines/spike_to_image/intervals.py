@@ -34,7 +34,7 @@ from spike4dgs.benchmark.spikes.times import spike_times
 class IntervalSettings(AdaptiveSettings):
     """The windows of `adaptive`, and the span where light changes."""
 
-    half: float = 10.0  # ticks on either side
+    half: float = 5.0  # ticks on either side: two renders follow what moves about a pixel in twice that
 
 
 def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
@@ -65,7 +65,7 @@ def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None 
 def _nearest(times: NDArray[np.int32], instant: float) -> int:
     """Return the index of the spike nearest to an instant; a spike of tick k is at k + 1/2."""
     after = int(np.searchsorted(times, instant - 0.5))
-    if after == len(times) or (after > 0 and instant - 0.5 - times[after - 1] < times[after] + 0.5 - instant):
+    if after == len(times) or (after > 0 and instant - 0.5 - times[after - 1] <= times[after] + 0.5 - instant):
         return after - 1
     return after
 

@@ -12,6 +12,19 @@ from spike4dgs.method.splat import Views
 
 
 @dataclass(frozen=True, eq=False)
+class Spans:
+    """Spans of time that the values of images are means over, in ticks from the image's own."""
+
+    ends: Tensor  # float16 [..., 2, H, W], the first and the last instant
+    half: float  # half the median length
+    n_ticks: int  # of the clip
+
+    def at(self, index: slice | int | Tensor) -> Spans:
+        """Return the spans of some images."""
+        return replace(self, ends=self.ends[index])
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingImages:
     """Images of all training views at some times."""
 
@@ -21,7 +34,7 @@ class TrainingImages:
     n_ticks: int  # length of the clip
     bad: Tensor | None = None  # bool [C, H, W], bad pixels, whose values are a neighbour's; None: there are none
     missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
-    spans: Tensor | None = None  # float16 [T, C, 2, H, W], ticks from the image's; None: images show instants
+    spans: Spans | None = None  # of [T, C]; None: the images show instants
 
     def measured(self, index: int) -> Tensor:
         """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""
@@ -36,7 +49,7 @@ class TrainingImages:
         """Return the images of one time alone."""
         missing = None if self.missing is None else self.missing[index : index + 1]
         times = slice(index, index + 1)
-        spans = None if self.spans is None else self.spans[times]
+        spans = None if self.spans is None else self.spans.at(times)
         return replace(self, ticks=self.ticks[times], images=self.images[times], missing=missing, spans=spans)
 
 

@@ -3,44 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
-from spike4dgs.method.supervision.pixel import PixelSettings
+from spike4dgs.method.supervision.base import Render, Sample, difference
+from spike4dgs.method.supervision.pixel import Pixel
 
 
-@dataclass(frozen=True)
-class ExposureSettings(PixelSettings):
-    """The weight of SSIM, and where the model is rendered (prefix `supervision`)."""
-
-    half: float = 10.0  # ticks; of the spans, about
-
-
-class Exposure(Supervision):
+class Exposure(Pixel):
     """`pixel`, with a mean over each pixel's span [a, b] in the place of an instant.
 
-    The light is rendered at the two points +- half / sqrt(3) of Gauss and Legendre, and taken as linear between and
-    beyond them: w_1 I_1 + w_2 I_2 with w_2 = 1/2 + (a + b) / 2 / (2 half / sqrt(3)), w_1 = 1 - w_2. Over [-half, half]
-    that is exact for light that is cubic in time.
+    The light is rendered at the two points +- half / sqrt(3) of Gauss and Legendre, half that of the spans, and taken
+    as linear between and beyond them: w_1 I_1 + w_2 I_2 with w_2 = 1/2 + (a + b) / 2 / (2 half / sqrt(3)), within
+    [0, 1], and w_1 = 1 - w_2. Over [-half, half] that is exact for light that is cubic in time. Images of instants are
+    compared as `pixel` does.
     """
-
-    defaults = ExposureSettings()
-
-    def __init__(self, settings: ExposureSettings, scene: TrainingScene) -> None:
-        super().__init__()
-        self.settings = settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """Return the loss of one sample."""
-        s = self.settings
         if sample.spans is None:
-            return difference(render(sample.t), sample.images, s.ssim_weight)
-        node = s.half / math.sqrt(3)
-        before, after = (render(sample.t + sign * node * sample.tick_t) for sign in (-1, 1))
-        middle = sample.spans.to(before).mean(1)  # [V, H, W]
+            return super().forward(render, sample)
+        node = sample.spans.half / math.sqrt(3)  # ticks
+        before, after = (render(sample.t + at / sample.spans.n_ticks) for at in (-node, node))
+        middle = sample.spans.ends.to(before).mean(1)  # [V, H, W] ticks
         later = (0.5 + middle / (2 * node)).clamp(0, 1)
-        return difference(torch.lerp(before, after, later), sample.images, s.ssim_weight)
+        return difference(torch.lerp(before, after, later), sample.images, self.ssim_weight)

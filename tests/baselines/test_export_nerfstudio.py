@@ -169,7 +169,10 @@ def test_cameras_that_do_not_fit_the_layout_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"images": "video"}, "--images: expected one of tfp, tfi, tfstp, spk2img, adaptive, msdi, found 'video'"),
+        (
+            {"images": "video"},
+            "--images: expected one of tfp, tfi, tfstp, spk2img, adaptive, intervals, msdi, found 'video'",
+        ),
         ({"every": 1}, "--every: expected 2 ticks or more, found 1"),
         ({"split": "left"}, "expected a split among center, found 'left'"),
     ],

@@ -95,7 +95,7 @@ CASES = [
     "one tick", "100,000 ticks", "NaN gain", "NaN dark rate", "dead pixels",
 ]  # fmt: skip
 FITS = [
-    ("adaptive", "paths", "pixel", {"freeze_background": True}, {}),
+    ("intervals", "paths", "exposure", {"freeze_background": True}, {}),
     ("tfp", "hexplane", "spss", {}, {}),
     ("tfi", "spacetime", "pixel+spike", {}, {}),
     ("tfp", "static", "spike", {}, {"spike_ticks": 1}),

@@ -182,7 +182,7 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
         ({"images": "none"}, "expected images among short, found 'none'"),
         ({"initialization": "colmap"}, "initialization among true"),
         ({"motion": "wobble"}, "motion among hexplane, paths, spacetime, spacetime-lite, static"),
-        ({"supervision": "spikes"}, r"supervision among pixel, pixel\+spike, spike"),
+        ({"supervision": "spikes"}, r"supervision among exposure, pixel, pixel\+spike, spike"),
     ],
 )
 def test_unknown_part_is_named(change, message):

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 from toy_world import ToyWorld
 
+from spike4dgs.method.observations.training_images import Spans
 from spike4dgs.method.supervision.base import Sample
-from spike4dgs.method.supervision.exposure import Exposure, ExposureSettings
+from spike4dgs.method.supervision.exposure import Exposure
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 
 WORLD, TICKS, TICK = ToyWorld(width=16, height=12, n_ticks=100, travel=0.1), 100, 40
@@ -32,8 +33,9 @@ def mean(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def loss(p: Tensor, image: Tensor, spans: Tensor | None, half: float = 10.0) -> float:
-    sample = Sample(TICK / TICKS, TICK, (0, 1), image, 0, spans, 1 / TICKS)
-    supervision = Exposure(ExposureSettings(ssim_weight=0.0, half=half), WORLD.training)
+    over = None if spans is None else Spans(spans, half, TICKS)
+    sample = Sample(TICK / TICKS, TICK, (0, 1), image, 0, over)
+    supervision = Exposure(PixelSettings(ssim_weight=0.0), WORLD.training)
     return float(supervision(lambda t: light(p, t), sample))
 
 
