@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,11 @@ from toy_world import GAIN, ToyWorld
 from spike4dgs.baselines import oracle
 from spike4dgs.baselines.oracle import RUNGS, OracleMethod, TrueImages, oracle_ladders, true_points, with_calibrations
 from spike4dgs.baselines.recipes import INITIALIZATIONS, METHODS, PARTS
+from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
+from spike4dgs.benchmark.results.record import read_record
 from spike4dgs.benchmark.runs.oracle.truth import Surfaces, Truth
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -190,3 +193,36 @@ def test_recipes_without_velocities_or_background_have_a_ladder_too(root: Path) 
 def test_what_is_no_recipe_of_the_trainer_with_given_poses_has_no_ladder(root: Path, name: str) -> None:
     with pytest.raises(UserError, match="--oracle: expected methods among .*spike4dgs-x"):
         oracle_ladders((name,), root, SAMPLES)
+
+
+@pytest.mark.slow
+def test_the_command_climbs_the_ladder_of_a_made_scene(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, out = tiny_data / "car-0-tiny", tmp_path / "out"
+    options = ["--oracle", "--oracle-samples", "16", "--budget", "0.005", "--device", "cpu", "--out", str(out)]
+    assert main(["run-benchmark", str(scene), *options, "--metrics", "psnr"]) == 0
+    assert "where things move" in " ".join(capsys.readouterr().out.split()) and not (out / "leaderboard").exists()
+    rows = list(csv.DictReader((out / "ladder.csv").read_text().splitlines()))
+    assert len(rows) == len(RUNGS) + 1 and all(r["scene"] == "car-0-tiny" and float(r["psnr"]) > 5 for r in rows)
+    (ladder,) = oracle_ladders((), out / "truth", 16)
+    for rung in ladder.rungs:
+        method = read_record(out / f"results/{rung.method.name}.json")["method"]
+        assert method.get("oracle") == (list(rung.method.oracle) if isinstance(rung.method, OracleMethod) else None)
+        if "oracle" in method:
+            assert main(["submit", str(out / f"results/{method['name']}.json"), "--leaderboard", str(out / "b")]) == 2
+    assert not (out / "b").exists()
+    kept = {p: p.stat().st_mtime_ns for p in out.rglob("prediction.json")}
+    assert main(["run-benchmark", str(scene), *options, "--metrics", "psnr"]) == 0
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("prediction.json")} == kept and len(kept) == len(rows)
+
+
+def test_the_command_refuses_imported_scenes_and_a_leaderboard(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--oracle", "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(["run-benchmark", str(small_scene), *out]) == 2
+    assert "expected a scene whose world is here, for --oracle, found source 'test'" in capsys.readouterr().err
+    assert main(["run-benchmark", str(small_scene), *out, "--leaderboard", str(tmp_path / "board")]) == 2
+    assert "--oracle: expected no table and no leaderboard beside it" in capsys.readouterr().err
+    assert not (tmp_path / "out/predictions").exists() and not (tmp_path / "board").exists()
