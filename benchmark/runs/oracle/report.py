@@ -142,7 +142,12 @@ def _text(table: LadderTable, title: str, place: str, column: str) -> str:
     if column not in _GAINS:
         return f"{value:.0f}"
     gain = table.gain(title, place, column)
-    return f"{value:.2f}" if gain is None or title == next(iter(table.rungs)) else f"{value:.2f} ({gain:+.2f})"
+    return f"{value:.2f}" if gain is None or title == next(iter(table.rungs)) else f"{value:.2f} ({_signed(gain)})"
+
+
+def _signed(gain: float) -> str:
+    """Return a gain with its sign, which a rounded zero has none of: +0.00."""
+    return f"{round(gain, 2) + 0.0:+.2f}"
 
 
 def plot(path: Path, table: LadderTable) -> None:
@@ -156,7 +161,7 @@ def plot(path: Path, table: LadderTable) -> None:
         axes.imshow(gains, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
         for y, row in enumerate(gains):
             for x, gain in enumerate(row):
-                text, color = ("-", "black") if math.isnan(gain) else (f"{gain:+.2f}", _ink(gain / largest))
+                text, color = ("-", "black") if math.isnan(gain) else (_signed(gain), _ink(gain / largest))
                 axes.text(x, y, text, ha="center", va="center", fontsize=8, color=color)
         axes.set_xticks(range(len(others)), [_folded(title) for title in others], fontsize=7)
         labels = [f"{p}: {_text(table, plain, p, _GAINS[0])} / {_text(table, plain, p, _GAINS[1])}" for p in places]
