@@ -96,9 +96,12 @@ def find_truth(scene: Scene) -> WorldTruth:
 
 def _alike(a: Camera, b: Camera) -> bool:
     """Return whether two cameras are the same but for the rounding of a file."""
-    facts = [np.concatenate([c.w2c.ravel(), c.K.ravel(), np.append(c.distortion, np.zeros(5))[:5]]) for c in (a, b)]
+
+    def facts(c: Camera) -> np.ndarray:
+        return np.concatenate([c.w2c.ravel(), c.K.ravel(), np.append(c.distortion, np.zeros(5))[:5]])
+
     same_size = (a.width, a.height) == (b.width, b.height)
-    return same_size and bool(np.allclose(*facts, rtol=_SAME_POSE, atol=_SAME_POSE))
+    return same_size and bool(np.allclose(facts(a), facts(b), rtol=_SAME_POSE, atol=_SAME_POSE))
 
 
 def surfaces(renderer: MultiViewRenderer, n_ticks: int, ticks: Sequence[int]) -> Arrays:
@@ -128,5 +131,6 @@ def _lift(cameras: Sequence[Camera], depths: np.ndarray, chosen: np.ndarray) -> 
     points = []
     for camera, depth, mask in zip(cameras, depths, chosen, strict=True):
         v, u = np.nonzero(mask)
-        points.append(camera.unproject(np.stack([u, v], axis=1) + 0.5, depth[mask].astype(np.float64)))
+        centres = np.stack([u, v], axis=1).astype(np.float64) + 0.5
+        points.append(camera.unproject(centres, depth[mask].astype(np.float64)))
     return np.concatenate(points)
