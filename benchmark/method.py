@@ -119,11 +119,12 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Seven attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
+    Eight attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
     the data sets that learned parts have seen, `given`, which of `GIVEN` it uses (all if absent; tracks of the
     leaderboard withhold some), `refines_views`: its models have `refine` (see `refinement`), `description`, one line
     for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called before the clock of a fit
-    starts, and `rasterizes`: False lets it run on a GPU without numba-cuda.
+    starts, `rasterizes`: False lets it run on a GPU without numba-cuda, and `oracle`: what the truth replaces in it (no
+    leaderboard takes its records).
     """
 
     name: str

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.scene import Scene, Target
-from spike4dgs.generators.profiles import RATE_HZ, Job, Profile
+from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.tasks import cameras_of, held_out_view, world_of
-from spike4dgs.generators.worlds import WORLDS
+from spike4dgs.generators.tasks import cameras_of, held_out_view, recorded_job, world_of
 
 _SEEDS = (1_000_003, 2_000_003)  # added to a scene's seed; its own files use the next few after it
 
@@ -22,12 +21,10 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     Each has the samples of ground truth in every pixel. None for a scene that no world of this installation made, and
     for a split whose held-out cameras have no target of that camera.
     """
-    source = scene.meta["source"]
-    if source["kind"] != "mitsuba" or source["world"] not in WORLDS:
+    job = recorded_job(scene.meta["source"])
+    if job is None:
         return None
-    profile = Profile(**{**source["sampling"], "views": tuple(source["sampling"]["views"])})
-    made = {key: source[key] for key in ("world", "variant", "seed", "seconds")}
-    job = Job(profile_name=source["profile"], profile=profile, lens=tuple(source.get("lens", ())), **made)
+    profile = job.profile
     camera = cameras_of(job)[held_out_view(job)]
     if not (targets := [t for t in scene.targets if t.camera == camera.id]):
         return None

@@ -7,7 +7,7 @@ needs no common file system.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -17,13 +17,34 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.array.lens import Distortion
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
+from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job, Profile
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
 from spike4dgs.generators.rig import HELD_OUT_VIEW, cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 _POINTS_PER_VIEW = 250  # of the sparse model
+
+
+def recorded_job(source: Mapping[str, Any]) -> Job | None:
+    """Return the job whose `settings` are in the `source` of a scene.json.
+
+    None for a scene that no world of this installation made.
+    """
+    if source["kind"] != "mitsuba" or source["world"] not in WORLDS:
+        return None
+    same = ("gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "lens_spread", "noise")
+    return Job(
+        source["world"],
+        source["variant"],
+        int(source["seed"]),
+        source["profile"],
+        Profile(**{**source["sampling"], "views": tuple(source["sampling"]["views"])}),
+        source["seconds"],
+        adaptive=source.get("adaptive_keys", True),
+        lens=tuple(source.get("lens", ())),
+        **{name: source[name] for name in same if name in source},
+    )
 
 
 @lru_cache(maxsize=1)

@@ -105,7 +105,15 @@ def checked(record: Record, where: Path) -> Record:
     check_form(record, where)
     record = with_later_metrics(record)
     check_record(record, where)
+    check_no_oracle(record, where)
     return record
+
+
+def check_no_oracle(record: Record, where: str | Path) -> None:
+    """Raise UserError for the record of an oracle: a method that was given the truth, or freed of its own limits."""
+    if marked := record["method"].get("oracle"):
+        fix = "submit the record of the method itself"
+        raise problem(where, "a method that fits from spikes", f"an oracle ({', '.join(marked)})", fix)
 
 
 def check_numbers(value: Any, where: Path) -> None:
@@ -151,6 +159,7 @@ def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, An
     """
     name = entry_path(record)
     path = leaderboard / name
+    check_no_oracle(record, path)
     for other in entry_paths(leaderboard, name.partition("/")[0]):
         if other != name and other.casefold() == name.casefold():
             fix = "rename the method: some file systems take the two for one"

@@ -21,6 +21,7 @@ from spike4dgs.leaderboard.entry import (
     RE_FITTED,
     RE_SCORED,
     check_folder,
+    check_no_oracle,
     check_numbers,
     entry_path,
     lock,
@@ -119,6 +120,7 @@ def submit_all(
 def _verify(result: Path, files: Files) -> Verified:
     """Read a record and verify it as far as its files are given."""
     record = read_record(result)
+    check_no_oracle(record, result)
     check_numbers(record, result)
     entry_path(record)  # names that cannot be file names are refused before the work
     opened = open_scenes(files.scenes, files.allow_gaps, record["dataset"]["split"]) if files.scenes else []

@@ -201,10 +201,7 @@ def middle_camera(cameras: Sequence[Camera]) -> Camera:
 
 def thin(cameras: Sequence[Camera], cloud: Cloud, settings: CloudSettings) -> Cloud:
     """Return one point, the mean, per cell of `cell_px` px and `cell_parallax_px` in the middle camera."""
-    uv, z = middle_camera(cameras).project(cloud.points)
-    step = inverse_depth_step(cameras, settings.cell_parallax_px)
-    keep = z > 0
-    cells = np.column_stack([np.floor(uv[keep] / settings.cell_px), np.floor(1 / (z[keep] * step))]).astype(np.int64)
+    keep, cells = cells_of(cameras, cloud.points, settings)
     _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     inverse = inverse.reshape(-1)
 
@@ -214,6 +211,17 @@ def thin(cameras: Sequence[Camera], cloud: Cloud, settings: CloudSettings) -> Cl
     merged = np.stack([mean(axis) for axis in cloud.points[keep].T], axis=-1)
     believed = count >= 2  # seen from one view only: not worth a Gaussian
     return Cloud(merged[believed], mean(cloud.values[keep])[believed].astype(np.float32))
+
+
+def cells_of(
+    cameras: Sequence[Camera], points: NDArray[np.float64], settings: CloudSettings
+) -> tuple[Mask, NDArray[np.int64]]:
+    """Return which points [N, 3] are in front of the middle camera, and the cells [K, 3] that those lie in."""
+    uv, z = middle_camera(cameras).project(points)
+    step = inverse_depth_step(cameras, settings.cell_parallax_px)
+    keep = z > 0
+    cells = np.column_stack([np.floor(uv[keep] / settings.cell_px), np.floor(1 / (z[keep] * step))])
+    return keep, cells.astype(np.int64)
 
 
 def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: CloudSettings) -> Cloud:

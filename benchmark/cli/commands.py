@@ -78,6 +78,8 @@ COMMANDS: dict[str, Command] = {
             "spike4dgs.leaderboard.submit_command:submit_all",
             "spike4dgs.baselines.speed.images:images",
             "spike4dgs.leaderboard.tracks:track_scenes",
+            "spike4dgs.baselines.oracle:oracle_ladders",
+            "spike4dgs.generators.oracle:find_truth",
         ),
     ),
     "methods": Command(

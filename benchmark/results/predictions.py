@@ -38,7 +38,8 @@ class MethodInfo:
     """The identity of a method.
 
     `trained_on` lists the data sets that learned parts were trained on (contamination), `given` what of `method.GIVEN`
-    it was given; None stands for all, and for older records.
+    it was given; None stands for all, and for older records. `oracle` lists what an oracle replaced by the truth or
+    freed of a limit: no leaderboard takes such a record.
     """
 
     name: str
@@ -47,12 +48,15 @@ class MethodInfo:
     seed: int | None = None
     trained_on: tuple[str, ...] = ()
     given: tuple[str, ...] | None = None
+    oracle: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; without `given` where it is None."""
-        given = {} if self.given is None else {"given": list(self.given)}
-        rest = {k: v for k, v in asdict(self).items() if k != "given"}
-        return {**rest, "trained_on": list(self.trained_on), **given}
+        """Return plain values for JSON; without `given` where it is None, and without `oracle` where it is empty."""
+        added = {} if self.given is None else {"given": list(self.given)}
+        if self.oracle:
+            added["oracle"] = list(self.oracle)
+        rest = {k: v for k, v in asdict(self).items() if k not in ("given", "oracle")}
+        return {**rest, "trained_on": list(self.trained_on), **added}
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def read_info(root: Path) -> PredictionInfo:
     schema = load_schema("spike4dgs.benchmark", "prediction.schema.json")
     check_schema(data, schema, root / INFO, "correct it (see the predictions module for the smallest valid one)")
     values = {k: v for k, v in data.items() if k not in ("schema", "method")}
-    lists = {key: tuple(data["method"][key]) for key in ("trained_on", "given") if key in data["method"]}
+    lists = {key: tuple(data["method"][key]) for key in ("trained_on", "given", "oracle") if key in data["method"]}
     method = {**data["method"], **lists}
     return PredictionInfo(method=MethodInfo(**method), **values)
 

@@ -52,7 +52,8 @@ class Job:
         m = self.method
         version = getattr(m, "version", None) or harness()["version"]
         given = None if (found := getattr(m, "given", None)) is None else tuple(found)
-        return MethodInfo(m.name, version, dict(m.params), self.seed, tuple(getattr(m, "trained_on", ())), given)
+        trained_on, oracle = (tuple(getattr(m, name, ())) for name in ("trained_on", "oracle"))
+        return MethodInfo(m.name, version, dict(m.params), self.seed, trained_on, given, oracle)
 
     @property
     def variants(self) -> tuple[MethodInfo, ...]:

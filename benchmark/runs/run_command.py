@@ -5,8 +5,10 @@ table.*. Records that earlier runs left in OUT on the same scenes are in all of 
 show the first seed; results.csv and the leaderboard have all of them.
 A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 
-Submitting a record and measuring images from spikes are the work of other rooms, which this one does not import: the
-command line passes the functions in.
+With `--oracle` it climbs a ladder of oracles instead (`oracle.ladder`), whose records go into no leaderboard.
+
+Submitting a record, measuring images from spikes, oracles and their truth are the work of other rooms, which this one
+does not import: the command line passes the functions in.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.results.record import Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results
+from spike4dgs.benchmark.runs.oracle.ladder import SAMPLES, FindTruth, MakeLadders, climb
 from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 
@@ -61,6 +64,8 @@ class RunBenchmark:
     submit: Submit
     measure_images: Callable[[Sequence[str]], int]  # the command line of `speed images`, which makes table 6
     track_scenes: Callable[[str], dict[str, str]]  # the revisions of a track's scenes by their ids
+    make_ladders: MakeLadders
+    find_truth: FindTruth  # what a ladder's oracles are given
 
     def run_benchmark(
         self,
@@ -85,6 +90,8 @@ class RunBenchmark:
         leaderboard: Path | None = None,
         replace: bool = False,
         allow_gaps: bool = False,
+        oracle: bool = False,
+        oracle_samples: int = SAMPLES,
     ) -> int:
         """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it was.
 
@@ -116,6 +123,10 @@ class RunBenchmark:
             leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
             replace: Replace entries of the same name in that leaderboard.
             allow_gaps: Accept recordings with gaps.
+            oracle: Climb a ladder instead: each method as it is, then with the true images, points, velocities or
+                calibration, with more Gaussians, with more steps. METHODS are recipes, spike4dgs-x if left out; the
+                scenes are made ones. OUT gets ladder.md, ladder.csv and ladder_METHOD.png, and no leaderboard.
+            oracle_samples: Samples per pixel of the true images, a power of two.
         """
         if poses != POSES[0] and table in (None, IMAGE_TABLE):
             fix = "without a table, name the methods, such as tfp+colmap+4dgs"
@@ -128,16 +139,22 @@ class RunBenchmark:
         if track is not None:
             scenes = self._track_folders(track, scenes, table, data, source)
         scenes = table_scenes(paper, data, profile) if paper else scenes
-        chosen = _choose_methods(methods, paper)
+        if oracle:
+            _check_no_entries(table, leaderboard, replace)
+        chosen = [] if oracle else _choose_methods(methods, paper)
         if scheduler is None or device == "auto":
             device = choose_device(device, rasterizes=any(getattr(m, "rasterizes", True) for m in chosen))
         console = make_console()
         common = (seed, device, make_budget(budget), metrics, seeds, workers, scheduler)
+        if oracle:
+            opened = open_scenes(scenes, allow_gaps, split)
+            settings = Settings(_folder_of_split(out, split, opened), *common)
+            return self._climb(opened, methods, oracle_samples, settings, console)
         splits = paper.splits if paper and paper.splits and split is None else (split,)
         runs, submissions = [], []
         for name in splits:
             opened = open_scenes(scenes, allow_gaps, name)
-            folder = out / name if name and not all(s.is_default_split for s in opened) else out
+            folder = _folder_of_split(out, name, opened)
             settings = Settings(folder, *common)
             records = run_matrix(opened, chosen, settings, console)
             earlier, left_out = earlier_records(folder, records)
@@ -159,10 +176,17 @@ class RunBenchmark:
             self._submit(records, scenes, settings, leaderboard, replace, allow_gaps)
             for records, settings in submissions
         ]
-        failed = _failed_cells([r for records, _ in submissions for r in records])
-        if failed:
-            print(f"failed: {', '.join(failed)}", file=sys.stderr)
-        return 1 if failed or any(refused) else 0
+        return _say_failed(_failed_cells([r for records, _ in submissions for r in records])) or int(any(refused))
+
+    def _climb(
+        self, scenes: Sequence[Scene], names: Sequence[str], samples: int, settings: Settings, console: Console
+    ) -> int:
+        """Climb the ladders of methods; return the command's exit code."""
+        truth = settings.out / "truth"
+        ladders = self.make_ladders(names, truth, samples)
+        records = climb(scenes, ladders, self.find_truth, truth, samples, settings, console)
+        _say(console, f"ladder: {settings.out}/ladder.md, ladder.csv and ladder_*.png")
+        return _say_failed(_failed_cells(records))
 
     def _track_folders(
         self, track: str, scenes: tuple[Path, ...], table: int | None, data: Path, source: str | None
@@ -208,9 +232,11 @@ def make_run_benchmark(
     submit: Submit,
     measure_images: Callable[[Sequence[str]], int],
     track_scenes: Callable[[str], dict[str, str]],
+    make_ladders: MakeLadders,
+    find_truth: FindTruth,
 ) -> Callable[..., int]:
     """Return the command `run-benchmark`, which calls these functions of other rooms."""
-    return RunBenchmark(submit, measure_images, track_scenes).run_benchmark
+    return RunBenchmark(submit, measure_images, track_scenes, make_ladders, find_truth).run_benchmark
 
 
 def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
@@ -233,6 +259,19 @@ def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> lis
     return [known[name] for name in dict.fromkeys(names or known)]
 
 
+def _folder_of_split(out: Path, split: str | None, scenes: Sequence[Scene]) -> Path:
+    """Return the folder of a run: OUT, or OUT/SPLIT for another split than the scenes' default."""
+    return out / split if split and not all(s.is_default_split for s in scenes) else out
+
+
+def _check_no_entries(table: int | None, leaderboard: Path | None, replace: bool) -> None:
+    """Raise UserError for options that an oracle's records have no use for."""
+    given = {"--table": table is not None, "--leaderboard": leaderboard is not None, "--replace": replace}
+    if beside := [name for name, there in given.items() if there]:
+        expected = "no table and no leaderboard beside it: they show what methods do without the truth"
+        raise problem("--oracle", expected, ", ".join(beside), "leave it out")
+
+
 def plain_name(record: Record) -> str:
     """Return the name of a record's method, without the mark of refined held-out views."""
     return str(record["method"]["name"]).removesuffix(SUFFIX)
@@ -241,6 +280,13 @@ def plain_name(record: Record) -> str:
 def _failed_cells(records: Sequence[Record]) -> list[str]:
     cells = [(r["method"], scene, c["status"]) for r in records for scene, c in r["scenes"].items()]
     return [f"{m['name']} on {scene}, seed {m['seed']}" for m, scene, status in cells if status == "failed"]
+
+
+def _say_failed(failed: Sequence[str]) -> int:
+    """Print the cells that failed on stderr; return the exit code."""
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _say(console: Console, text: str) -> None:

@@ -20,6 +20,7 @@ from spike4dgs.generators.worlds import WorldScene
 
 GROW_PX = 3  # around moving objects; more than `image_motion.COARSE_PX`
 _STEP_S = 5e-6  # over which image speed is measured
+_TICK_S = 5e-5  # over which, to either side, velocity is measured: what bends within a tick is below every other error
 _STEEPEST = 0.05  # least sine of the angle between light and surface at which a shadow's speed is computed
 
 
@@ -57,10 +58,19 @@ class Visibility:
     def depths(self, t_s: float) -> np.ndarray:
         """Return float32: z in camera coordinates where the ray through the pixel's centre ends (inf: no surface)."""
         snapshot = self._snapshot(t_s)
-        distance = np.where(snapshot.seen, snapshot.hits.distance, self._static_hits[0]).reshape(self.shape)
-        forward = np.stack([c.R[2] for c in self.cameras])  # [C, 3]
-        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
-        return (distance * cosine).astype(np.float32)
+        return self._z(np.where(snapshot.seen, snapshot.hits.distance, self._static_hits[0]))
+
+    def static_depths(self) -> np.ndarray:
+        """Return the same without moving objects."""
+        return self._z(self._static_hits[0])
+
+    def velocities(self, t_s: float) -> np.ndarray:
+        """Return [C, H, W, 3] float32, m/s: the velocity of the surface point that is seen; 0 where that is static."""
+        snapshot, out = self._snapshot(t_s), np.zeros((int(np.prod(self.shape)), 3), np.float32)
+        seen = np.flatnonzero(snapshot.seen)
+        before, after = (self._moved(seen, snapshot, t_s, t_s + step) for step in (-_TICK_S, _TICK_S))
+        out[seen] = (after - before) / (2 * _TICK_S)
+        return out.reshape(*self.shape, 3)
 
     def traced(self, t_s: float) -> np.ndarray:
         """Return bool: within 3 px of a pixel that sees a moving object or lies in the main light's shadow of one."""
@@ -100,6 +110,12 @@ class Visibility:
         return self.depths(t_s), numbers.reshape(self.shape), flow.reshape(*self.shape, 2)
 
     # ------------------------------------------------------------ internals
+
+    def _z(self, distance: np.ndarray) -> np.ndarray:
+        """Return z in camera coordinates [C, H, W] float32 of points at a distance [N] along the centre rays."""
+        forward = np.stack([c.R[2] for c in self.cameras])  # [C, 3]
+        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
+        return np.asarray(distance.reshape(self.shape) * cosine, dtype=np.float32)
 
     def _snapshot(self, t_s: float) -> _Snapshot:
         if self._last is None or self._last[0] != t_s:

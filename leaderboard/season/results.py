@@ -13,6 +13,7 @@ from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.results.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.leaderboard.entry import check_no_oracle
 from spike4dgs.leaderboard.season.season_file import Season, season_folder
 
 SCHEMA = "spike4dgs-season-result/1"
@@ -51,6 +52,7 @@ def write_result(seasons: Path, number: int, result: Result) -> None:
     against hidden scenes.
     """
     path = result_path(seasons, number, result.name)
+    check_no_oracle(result.record, path)
     if path.exists():
         if read_result(path).predictions_sha256 != result.predictions_sha256:
             fix = "a name is scored once in a season: submit under another one"
@@ -66,6 +68,7 @@ def read_result(path: Path) -> Result:
     check_schema(data, schema, path, "score the submission again")
     result = Result(data["submitted_as"], with_later_metrics(data["record"]))
     check_record(result.record, path)
+    check_no_oracle(result.record, path)
     if result.name != path.stem:
         raise problem(path, f"the result of {path.stem}", result.name, "rename the file")
     return result

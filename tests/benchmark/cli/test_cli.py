@@ -188,6 +188,8 @@ def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
         submit=lambda results, **options: submitted.extend(results) or 0,
         measure_images=lambda arguments: measured.append(arguments) or 0,
         track_scenes={"moon": {small_scene.name: open_scene(small_scene).revision}}.__getitem__,
+        make_ladders=lambda names, truth, samples: (),
+        find_truth=lambda scene: None,
     )
     monkeypatch.setattr("spike4dgs.benchmark.runs.run_command.find_methods", lambda: {"counts": CountMethod()})
     out = tmp_path / "out"

@@ -19,7 +19,11 @@ from spike4dgs.benchmark.runs.run_command import RunBenchmark
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
 COMMAND = RunBenchmark(
-    submit=lambda results, **options: 0, measure_images=lambda arguments: 0, track_scenes=lambda name: {}
+    submit=lambda results, **options: 0,
+    measure_images=lambda arguments: 0,
+    track_scenes=lambda name: {},
+    make_ladders=lambda names, truth, samples: (),
+    find_truth=lambda scene: None,
 )
 VIEWS = tuple(f"views-{n}" for n in range(3, 9))
 
