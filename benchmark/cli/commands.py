@@ -115,6 +115,16 @@ COMMANDS: dict[str, Command] = {
         "check a leaderboard's release, entries and boards",
         "verify-leaderboard leaderboard",
     ),
+    "leaderboard": Command(
+        "spike4dgs.leaderboard.page.show_command:show",
+        "print the ranking of the tracks, with rank intervals and ties",
+        "leaderboard --track outdoor-small --metric psnr_dynamic",
+    ),
+    "leaderboard build": Command(
+        "spike4dgs.leaderboard.page.build_command:build",
+        "write the leaderboard as a page that a browser opens from the disk",
+        "leaderboard build --runs runs/small --out runs/leaderboard",
+    ),
     "season make": Command(
         "spike4dgs.leaderboard.season.make_command:make_season_make",
         "draw secret seeds, make hidden scenes, write the commitments to them",
