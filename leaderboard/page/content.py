@@ -16,9 +16,11 @@ from spike4dgs.benchmark.results.record import COSTS
 from spike4dgs.leaderboard.page.intervals import Comparison
 from spike4dgs.leaderboard.page.rows import Board, Row
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded
-from spike4dgs.leaderboard.tracks import current_release
+from spike4dgs.leaderboard.tracks import PUBLIC, current_release
 
 PARTS = ("images", "initialization", "motion", "supervision")
+# Of the scenes of a track, which make-dataset made with every term of the noise: see docs/sensor.md.
+SENSOR = "The sensor is noisy: gains that differ from pixel to pixel, dark current with hot pixels, shot noise."
 PAPER_TABLES = (1, 2)  # those of whole methods by scene
 
 
@@ -54,6 +56,7 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
         "why": board.why,
         "withheld": list(board.withheld),
         "split": board.dataset["split"],
+        "sensor": SENSOR if board.folder == PUBLIC else "",
         "scenes": [
             {"id": s, "revision": (revision := board.dataset["scenes"][s]), "ceiling": release.ceiling_db(s, revision)}
             for s in board.scenes

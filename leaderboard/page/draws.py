@@ -5,7 +5,7 @@ The hash is lowbias32 of C. Wellons' hash-prospector, a bijection of 32 bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,9 @@ def _lowbias32(x: UInt32) -> UInt32:
     return np.asarray(x ^ (x >> np.uint32(16)))
 
 
+@lru_cache(maxsize=4)  # the metrics of a board have the same images
 def draw_weights(
-    images: Sequence[int], seeds: int, most_seeds: int, replicates: int, scenes: bool, seed: int
+    images: tuple[int, ...], seeds: int, most_seeds: int, replicates: int, scenes: bool, seed: int
 ) -> Float64:
     """Return the weights [replicates, sum(images) * seeds] of resampled means over scenes, their images and seeds.
 

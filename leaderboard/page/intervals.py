@@ -71,14 +71,15 @@ def resampled_means(
     `values`: for each method and scene its scores [images, seeds]. All methods have the same scenes and images; a
     method has the same number of seeds on all scenes.
     """
-    images = [len(scene) for scene in values[0]]
+    images = tuple(len(scene) for scene in values[0])
     seeds = [method[0].shape[1] for method in values]
     found = np.empty((replicates, len(values)))
     for n in sorted(set(seeds)):
         columns = [m for m, count in enumerate(seeds) if count == n]
         weights = draw_weights(images, n, max(seeds), replicates, scenes, seed)
         flat = np.stack([np.concatenate(values[m]).reshape(-1) for m in columns], axis=1)
-        found[:, columns] = weights @ flat
+        # Not a matrix product of BLAS, whose threads wait for each other on a busy machine.
+        found[:, columns] = np.einsum("ru,um->rm", weights, flat)
     return found
 
 

@@ -23,7 +23,7 @@ def test_the_hash_is_the_published_one() -> None:
 
 
 def test_a_replicate_is_what_a_loop_draws() -> None:
-    images, seeds, most, replicates = [3, 2, 4], 2, 3, 50
+    images, seeds, most, replicates = (3, 2, 4), 2, 3, 50
     weights = draw_weights(images, seeds, most, replicates, True, 4).reshape(replicates, sum(images), seeds)
     stride = 1 + max(images) + most
     for r in range(replicates):
@@ -40,7 +40,7 @@ def test_a_replicate_is_what_a_loop_draws() -> None:
 
 def test_every_resample_of_three_images_comes_equally_often() -> None:
     replicates = 54_000
-    weights = draw_weights([3], 1, 1, replicates, False, 1)
+    weights = draw_weights((3,), 1, 1, replicates, False, 1)
     found = Counter(tuple(np.rint(3 * w).astype(int)) for w in weights)
     exact = Counter(tuple(draw.count(i) for i in range(3)) for draw in itertools.product(range(3), repeat=3))
     for counts, ways in exact.items():
@@ -50,14 +50,14 @@ def test_every_resample_of_three_images_comes_equally_often() -> None:
 
 
 def test_weights_sum_to_one_and_scenes_count_once_where_they_are_not_drawn() -> None:
-    drawn = draw_weights([5, 2], 3, 3, 200, True, 0)
-    fixed = draw_weights([5, 2], 3, 3, 200, False, 0)
+    drawn = draw_weights((5, 2), 3, 3, 200, True, 0)
+    fixed = draw_weights((5, 2), 3, 3, 200, False, 0)
     np.testing.assert_allclose(drawn.sum(1), 1)
     np.testing.assert_allclose(fixed.reshape(200, 7, 3)[:, :5].sum((1, 2)), 0.5)
     assert drawn.reshape(200, 7, 3)[:, :5].sum((1, 2)).std() > 0.2
 
 
 def test_other_numbers_of_seeds_share_the_draws_of_scenes_and_images() -> None:
-    one = draw_weights([4, 3], 1, 3, 100, True, 2)
-    three = draw_weights([4, 3], 3, 3, 100, True, 2).reshape(100, 7, 3).sum(2)
+    one = draw_weights((4, 3), 1, 3, 100, True, 2)
+    three = draw_weights((4, 3), 3, 3, 100, True, 2).reshape(100, 7, 3).sum(2)
     np.testing.assert_allclose(one, three)
