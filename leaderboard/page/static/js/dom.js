@@ -9,14 +9,14 @@ Spike4DGS.dom = (() => {
       else if (key === "checked" || key === "value" || key === "selected") node[key] = value;
       else if (value !== null && value !== false && value !== undefined) node.setAttribute(key, value === true ? "" : value);
     }
-    node.append(...children.flat().filter((c) => c !== null && c !== undefined && c !== false));
+    node.append(...children.flat(Infinity).filter((c) => c !== null && c !== undefined && c !== false));
     return node;
   }
 
   const byId = (id) => document.getElementById(id);
 
   const fill = (node, ...children) => {
-    node.replaceChildren(...children.flat().filter(Boolean));
+    node.replaceChildren(...children.flat(Infinity).filter(Boolean));
     return node;
   };
 

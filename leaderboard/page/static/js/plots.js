@@ -46,6 +46,23 @@ Spike4DGS.plots = (() => {
     return decades.flatMap((e) => steps.map((s) => s * 10 ** e)).filter((v) => v >= low && v <= high);
   }
 
+  /* Return 1, 2 and 5 of the decades, or even steps where a domain has less than three of them. */
+  function ticksOf(domain) {
+    const ticks = logTicks(domain);
+    return ticks.length < 3 ? d3.ticks(...domain, 4) : ticks;
+  }
+
+  /* Return the points whose names do not lie on those of others, best first. */
+  function labelled(points, domain, ends) {
+    const found = [];
+    const x = d3.scaleLog(domain, [0, 1]);
+    const y = d3.scaleLinear(ends, [0, 1]);
+    for (const p of points) {
+      if (found.every((q) => Math.abs(x(p.x) - x(q.x)) > 0.28 || Math.abs(y(p.y) - y(q.y)) > 0.07)) found.push(p);
+    }
+    return found;
+  }
+
   function front(points, higherIsBetter, cheapIsLow) {
     const sorted = d3.sort(points, (p) => (cheapIsLow ? p.x : -p.x), (p) => (higherIsBetter ? -p.value : p.value));
     const found = [];
@@ -71,13 +88,14 @@ Spike4DGS.plots = (() => {
     const plot = Plot.plot({
       width: 420, height: 300, marginLeft: 48, marginRight: 16, marginBottom: 34, style: { background: "none", fontSize: "12px" },
       ariaLabel: title, ariaDescription: "The table has the same values.",
-      x: { type: "log", domain, ticks: logTicks(domain), tickFormat: (v) => d3.format("~g")(v), label: null, grid: true },
+      x: { type: "log", domain, ticks: ticksOf(domain), tickFormat: (v) => d3.format("~g")(v), label: null, grid: true },
       y: { domain: metric.higher ? range.ends : [...range.ends].reverse(), label: heading(metric), grid: true, nice: false, ticks: 5 },
       marks: [
-        Plot.line(best, { x: "x", y: "y", curve: metric.higher ? "step-after" : "step-after", stroke: "currentColor", strokeOpacity: 0.35 }),
+        Plot.line(best, { x: "x", y: "y", curve: cost.higher ? "step-before" : "step-after", stroke: "currentColor", strokeOpacity: 0.35 }),
         Plot.dot(points.filter((p) => p.hidden), { x: "x", y: "y", r: 4, fill: "#999", fillOpacity: 0.6 }),
-        Plot.dot(points.filter((p) => !p.hidden), { x: "x", y: "y", r: 5, fill: (p) => color(p.item), symbol: (p) => (p.y === p.value ? "circle" : "triangle2"), stroke: "var(--ground)" }),
-        Plot.text(best, { x: "x", y: "y", text: "name", dy: -10, fill: "currentColor", stroke: "var(--ground)", strokeWidth: 3, textAnchor: (p) => null }),
+        Plot.dot(points.filter((p) => !p.hidden && p.y === p.value), { x: "x", y: "y", r: 5, fill: (p) => color(p.item), stroke: "var(--ground)" }),
+        Plot.text(points.filter((p) => !p.hidden && p.y !== p.value), { x: "x", y: "y", text: () => "▼", fill: (p) => color(p.item) }),
+        Plot.text(labelled([...best].reverse(), domain, range.ends), { x: "x", y: "y", text: "name", dy: -11, fill: "currentColor", stroke: "var(--ground)", strokeWidth: 3 }),
         Plot.tip(points, Plot.pointer({ x: "x", y: "y", title: tipText, fill: "var(--ground)" })),
       ],
     });
