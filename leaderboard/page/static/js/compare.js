@@ -61,8 +61,9 @@ Spike4DGS.compare = (() => {
     const nameB = board.rows[b].name;
     const split = Math.min(Math.max(state.split ?? 50, 0), 100);
     const pane = (id, title, alt) => el("figure", { class: "pane", id }, el("div", { class: "frame" },
-      el("img", { alt, draggable: "false" }), id === "pane-truth" ? null : el("img", { class: "over", alt: "", draggable: "false" }),
-      id === "pane-truth" ? null : el("div", { class: "bar", "aria-hidden": "true" })), el("figcaption", {}, title));
+      el("img", { alt, draggable: "false" }),
+      id !== "pane-truth" && [el("div", { class: "over" }, el("img", { alt: "", draggable: "false" })),
+        el("div", { class: "bar", "aria-hidden": "true" })]), el("figcaption", {}, title));
     const node = el("div", { class: "compare" },
       el("div", { class: "sliders" },
         el("label", {}, el("span", {}, `Slider: ${nameA} on the left, ${nameB} on the right`),
@@ -121,8 +122,9 @@ Spike4DGS.compare = (() => {
   function frame(node, picture, crop) {
     const [x, y, w, h] = crop ?? [0, 0, picture.width, picture.height];
     node.style.aspectRatio = `${w} / ${h}`;
+    const percent = { left: -x / w, top: -y / h, width: picture.width / w, height: picture.height / h };
     for (const img of node.querySelectorAll("img")) {
-      img.style.objectViewBox = `inset(${(100 * y) / picture.height}% ${(100 * (picture.width - x - w)) / picture.width}% ${(100 * (picture.height - y - h)) / picture.height}% ${(100 * x) / picture.width}%)`;
+      for (const [key, value] of Object.entries(percent)) img.style[key] = `${100 * value}%`;
     }
   }
 

@@ -58,7 +58,8 @@ Spike4DGS.details = (() => {
 
   function recordOf(record, named) {
     const scenes = Object.entries(record.cells);
-    return el("section", {}, el("h3", {}, named ? `Seed ${record.seed ?? 0}` : "Record"),
+    const title = named ? `Seed ${record.seed ?? 0}` : "Record";
+    return el("section", { "aria-label": title }, el("h3", {}, title),
       el("p", {}, "Command"), code(record.command),
       list([["Written", record.created], ["Seed", record.seed], ["Code", harness(record.harness)]]),
       el("p", {}, "Predictions, sha256 of SHA256SUMS"),
