@@ -3,6 +3,7 @@
     OUT/index.html, page.css, js/, vendor/     the program, copied
     OUT/data/boards.js                         every board with its cells: the first view
     OUT/data/scores-B-METRIC.js, details-B.js  loaded when a reader asks for them
+    OUT/data/cells-B.csv                       every cell of a board, for other programs
     OUT/pictures/                              images of finished runs
 
 Browsers do not let a page from a disk fetch JSON. So data are scripts, of one call with one JSON text: no value of an
@@ -23,6 +24,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_bytes, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.runs.earlier import write_results
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics, score_content
 from spike4dgs.leaderboard.page.intervals import (
     FEWEST_SCENES,
@@ -80,6 +82,8 @@ def write_site(
         one = board_content(board, identifier)
         one["scored"] = _write_scores(board, number, put)
         put(f"details-{number}", details(board))
+        write_results(table := out / "data" / f"cells-{number}.csv", [r for row in board.rows for r in row.records])
+        written.add(table)
         pictures = write_pictures(out, board, number, data, written, left_out.append)
         one["pictures"] = [p is not None for p in pictures]
         put(f"pictures-{number}", pictures)

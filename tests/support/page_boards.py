@@ -57,6 +57,7 @@ def row(name: str, cells: dict[str, dict[str, Any]], **changes: Any) -> Row:
     }
     record = {
         "method": method | changes,
+        "dataset": {"split": "center"},
         "scenes": cells,
         "environment": MACHINE,
         "harness": CODE,

@@ -51,7 +51,6 @@ Spike4DGS.controls = (() => {
     const selects = Object.keys(TITLES).map((name) => {
       const values = [...new Set(board.rows.map((row) => facet(row, name)))].sort();
       if (state[name] && !values.includes(state[name])) values.push(state[name]);
-      if (values.length < 2 && !state[name]) return null;
       const options = [["", "any"], ...values.map((v) => [v, v])];
       return field(TITLES[name], el("select", { name, onchange: (e) => change({ [name]: e.target.value }) },
         options.map(([v, text]) => el("option", { value: v, selected: v === state[name] }, text))));

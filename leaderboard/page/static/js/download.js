@@ -68,7 +68,8 @@ Spike4DGS.download = (() => {
     const name = `spike4dgs-${view.board.id.replace(/[^\w.+-]/g, "_")}-${view.metric}`;
     byId("below").prepend(el("p", { class: "downloads" }, "Download what is shown: ",
       [["csv", "CSV"], ["json", "JSON"], ["tex", "LaTeX"]].map(([kind, title]) =>
-        el("button", { type: "button", "data-kind": kind, onclick: () => save(name, kind, text(kind, page, view, state, ranks)) }, title))));
+        el("button", { type: "button", "data-kind": kind, onclick: () => save(name, kind, text(kind, page, view, state, ranks)) }, title)),
+      el("a", { href: `data/cells-${page.boards.indexOf(view.board)}.csv`, download: `${name}-cells.csv` }, "all cells as CSV")));
   }
 
   return { buttons, text };

@@ -84,6 +84,8 @@ Spike4DGS.plots = (() => {
     const [low, high] = d3.extent(points, (p) => p.x);
     const domain = [low / 1.25, high * 1.25];
     const best = front(points.filter((p) => !p.hidden), metric.higher, !cost.higher);
+    const names = labelled([...best].reverse(), domain, range.ends);
+    const isRight = (p) => Math.log(p.x / low) > 0.75 * Math.log(high / low);
     const tipText = (p) => `${p.name}\n${metric.title} ${p.value.toFixed(metric.digits)}\n${cost.title} ${p.x.toFixed(cost.digits)}${p.hidden ? "\nhidden by filters" : ""}`;
     const plot = Plot.plot({
       width: 420, height: 300, marginLeft: 48, marginRight: 16, marginBottom: 34, style: { background: "none", fontSize: "12px" },
@@ -95,7 +97,8 @@ Spike4DGS.plots = (() => {
         Plot.dot(points.filter((p) => p.hidden), { x: "x", y: "y", r: 4, fill: "#999", fillOpacity: 0.6 }),
         Plot.dot(points.filter((p) => !p.hidden && p.y === p.value), { x: "x", y: "y", r: 5, fill: (p) => color(p.item), stroke: "var(--ground)" }),
         Plot.text(points.filter((p) => !p.hidden && p.y !== p.value), { x: "x", y: "y", text: () => "▼", fill: (p) => color(p.item) }),
-        Plot.text(labelled([...best].reverse(), domain, range.ends), { x: "x", y: "y", text: "name", dy: -11, fill: "currentColor", stroke: "var(--ground)", strokeWidth: 3 }),
+        ...[true, false].map((right) => Plot.text(names.filter((p) => isRight(p) === right), { x: "x", y: "y", text: "name",
+          dy: -11, dx: right ? 6 : 0, textAnchor: right ? "end" : "middle", fill: "currentColor", stroke: "var(--ground)", strokeWidth: 3 })),
         Plot.tip(points, Plot.pointer({ x: "x", y: "y", title: tipText, fill: "var(--ground)" })),
       ],
     });
@@ -107,7 +110,7 @@ Spike4DGS.plots = (() => {
   function curves(node, lines, metric, at, names) {
     const series = lines.flatMap((line) => line.values.map((value, i) => ({ i, value, ...line })));
     const plot = Plot.plot({
-      width: 640, height: 220, marginLeft: 48, style: { background: "none", fontSize: "12px" },
+      width: Math.min(640, window.innerWidth - 28), height: 220, marginLeft: 48, style: { background: "none", fontSize: "12px" },
       ariaLabel: `${metric.title} of each image`, ariaDescription: "The scores of both methods at the shown image are in the text.",
       x: { label: "image", ticks: Math.min(names.length, 10), tickFormat: "d" }, y: { label: heading(metric), grid: true, zero: false },
       marks: [

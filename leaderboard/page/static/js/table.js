@@ -32,7 +32,7 @@ Spike4DGS.table = (() => {
       view.columns.map((c) => [
         el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
-      el("td", {}, item.row.label))));
+      el("td", { class: "nowrap" }, item.row.label))));
     const caption = el("caption", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
       `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold together; `,
       "methods that cannot be told apart tie (=).");
