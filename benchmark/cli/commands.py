@@ -116,14 +116,10 @@ COMMANDS: dict[str, Command] = {
         "verify-leaderboard leaderboard",
     ),
     "leaderboard": Command(
-        "spike4dgs.leaderboard.page.show_command:show",
-        "print the ranking of the tracks, with rank intervals and ties",
-        "leaderboard --track outdoor-small --metric psnr_dynamic",
+        "spike4dgs.leaderboard.page.show_command:show", "print the ranking, with intervals of the ranks", "leaderboard"
     ),
     "leaderboard build": Command(
-        "spike4dgs.leaderboard.page.build_command:build",
-        "write the leaderboard as a page that a browser opens from the disk",
-        "leaderboard build --runs runs/small --out runs/leaderboard",
+        "spike4dgs.leaderboard.page.build_command:build", "write the leaderboard as a page", "leaderboard build"
     ),
     "season make": Command(
         "spike4dgs.leaderboard.season.make_command:make_season_make",

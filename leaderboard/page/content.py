@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import published
@@ -167,7 +166,7 @@ def _details(row: Row) -> dict[str, Any]:
     checks = {path: e["verification"] for path, e in row.entries.items()}
     return {
         "entries": [
-            {"path": path, "sha256": sha256_json(e), "submitted": e["submitted"]} for path, e in row.entries.items()
+            {"path": path, "sha256": row.hashes[path], "submitted": e["submitted"]} for path, e in row.entries.items()
         ],
         "run": row.run.as_posix() if row.run else None,
         "version": method["version"],

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.results.record import Record, is_complete, read_record
 from spike4dgs.leaderboard.entry import Entry, read_entries
@@ -31,6 +32,7 @@ class Row:
     why: str
     records: tuple[Record, ...]
     entries: Mapping[str, Entry] = field(default_factory=dict)  # by path
+    hashes: Mapping[str, str] = field(default_factory=dict)  # of the entries' files, as in the ledger
     run: Path | None = None
     predictions: dict[str, Path] = field(default_factory=dict)
 
@@ -68,7 +70,7 @@ def gather(leaderboard: Path, runs: Sequence[Path]) -> tuple[list[Board], list[d
     for folder, file in make_boards(leaderboard).items():
         entries, _ = read_entries(leaderboard, folder)
         refused += file["refused"]
-        boards += [_board(folder, board, entries) for board in file["boards"]]
+        boards += [_board(leaderboard, folder, board, entries) for board in file["boards"]]
     for run in runs:
         for records in seeds_of_methods(run_records(run)):
             for board in _boards_of(boards, records[0]):
@@ -85,14 +87,15 @@ def run_records(run: Path) -> list[Record]:
     return [read_record(path) for path in paths]
 
 
-def _board(folder: str, board: Mapping[str, Any], entries: Mapping[str, Entry]) -> Board:
+def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], entries: Mapping[str, Entry]) -> Board:
     rows = []
     for row in board["rows"]:
         own = {path: entries[path] for path in row["entries"]}
         why = "" if row["rank"] else "archived" if folder == ARCHIVE else reason(row)
         name = Path(row["entries"][0]).stem if len(own) == 1 else row["method"]
         records = tuple(e["record"] for e in own.values())
-        rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own))
+        hashes = {path: sha256_json(read_json(leaderboard / path, "a leaderboard entry")) for path in own}
+        rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes))
     name, title = board["track"] or board["title"], board["title"]
     return Board(name, title, folder, board["why"], tuple(board["withheld"]), board["dataset"], rows)
 
