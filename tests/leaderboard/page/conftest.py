@@ -7,8 +7,17 @@ from pathlib import Path
 import pytest
 
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard.page.rows import Board, gather
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
+
+
+@pytest.fixture(scope="session")
+def committed() -> list[Board]:
+    """The boards of the committed entries, none of which is refused."""
+    boards, refused = gather(COMMITTED, ())
+    assert not refused
+    return boards
 
 
 @pytest.fixture(scope="session")

@@ -10,13 +10,13 @@ import pytest
 from page_boards import board, cell, failed, row
 
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics
-from spike4dgs.leaderboard.page.rows import find_board, gather
+from spike4dgs.leaderboard.page.rows import Board, find_board
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
-def test_cells_are_those_of_the_entry_and_published_values_those_of_the_paper() -> None:
-    found = find_board(gather(COMMITTED, ())[0], "outdoor-small")
+def test_cells_are_those_of_the_entry_and_published_values_those_of_the_paper(committed: list[Board]) -> None:
+    found = find_board(committed, "outdoor-small")
     content = board_content(found, "outdoor-small")
     number = {m["id"]: i for i, m in enumerate(page_metrics())}
     index = next(i for i, r in enumerate(content["rows"]) if r["name"] == "tfp+4dgs")

@@ -8,15 +8,14 @@ import pytest
 from submissions import enter, release_of
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.page.rows import OWN, find_board, gather, titles
+from spike4dgs.leaderboard.page.rows import OWN, Board, find_board, gather, titles
 from spike4dgs.leaderboard.tracks import ARCHIVE, PUBLIC
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
-def test_the_committed_entries_are_all_there() -> None:
-    boards, refused = gather(COMMITTED, ())
-    assert not refused
+def test_the_committed_entries_are_all_there(committed: list[Board]) -> None:
+    boards = committed
     for folder, name in ((PUBLIC, "entries"), (ARCHIVE, "archive")):
         rows = [r for b in boards if b.folder == folder for r in b.rows]
         assert {path for r in rows for path in r.entries} == {
@@ -49,6 +48,6 @@ def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
         gather(tmp_path / "none", (tmp_path,))
 
 
-def test_an_unknown_track_is_refused() -> None:
+def test_an_unknown_track_is_refused(committed: list[Board]) -> None:
     with pytest.raises(UserError, match="outdoor-small"):
-        find_board(gather(COMMITTED, ())[0], "indoor")
+        find_board(committed, "indoor")

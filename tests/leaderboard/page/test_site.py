@@ -12,10 +12,7 @@ from page_boards import board, cell, row
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.leaderboard.page import site
-from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.page.site import FIRST_VIEW_BYTES, script, write_site
-
-COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -26,9 +23,8 @@ def small() -> list[site.Board]:
     return [board("b", [row(n, {"s": cell({"psnr": np.arange(3) + i})}) for i, n in enumerate(("one", "two"))])]
 
 
-def test_the_committed_entries_fit_the_first_view(tmp_path: Path) -> None:
-    boards, refused = gather(COMMITTED, ())
-    written = write_site(tmp_path / "page", boards, refused)
+def test_the_committed_entries_fit_the_first_view(committed: list[site.Board], tmp_path: Path) -> None:
+    written = write_site(tmp_path / "page", committed)
     assert written.first_view_bytes < FIRST_VIEW_BYTES and not written.left_out
     html = (tmp_path / "page/index.html").read_text()
     linked = re.findall(r'(?:src|href)="([^"#]+)"', html)
