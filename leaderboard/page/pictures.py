@@ -63,13 +63,13 @@ def _write_scene(
 ) -> dict[str, Any]:
     truths = [scene.ground_truth(t) for t in scene.targets]
 
-    def write(name: str, image: UInt8, lossless: bool) -> None:
+    def write(name: str, image: UInt8) -> None:
         path = out / below / name
-        write_bytes(path, webp(image, lossless))
+        write_bytes(path, webp(image))
         written.add(path)
 
     for k, truth in enumerate(truths):
-        write(f"truth/{k}.webp", encode_srgb(truth), True)
+        write(f"truth/{k}.webp", encode_srgb(truth))
     rows = []
     for i, folder in folders.items():
         try:
@@ -79,8 +79,8 @@ def _write_scene(
                 continue
             for k, (target, truth) in enumerate(zip(scene.targets, truths, strict=True)):
                 image = predictions.read(target, truth.shape)
-                write(f"{i}/{k}.webp", encode_srgb(image), True)
-                write(f"{i}/{k}-error.webp", error_image(image, truth), False)
+                write(f"{i}/{k}.webp", encode_srgb(image))
+                write(f"{i}/{k}-error.webp", error_image(image, truth))
             rows.append(i)
         except UserError as e:
             say(f"no images of {board.rows[i].name} on {scene.id}: {e}")
@@ -121,10 +121,10 @@ def _bounds(mask: NDArray[np.bool_]) -> Box | None:
     return x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y
 
 
-def webp(image: UInt8, lossless: bool) -> bytes:
-    """Return an 8-bit image, gray [H, W] or RGB [H, W, 3], as WebP."""
+def webp(image: UInt8) -> bytes:
+    """Return an 8-bit image, gray [H, W] or RGB [H, W, 3], as lossless WebP."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).convert("RGB").save(out, "WEBP", lossless=lossless, quality=90)
+    Image.fromarray(image).convert("RGB").save(out, "WEBP", lossless=True)
     return out.getvalue()

@@ -22,6 +22,24 @@ from spike4dgs.leaderboard.page.site import write_site
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 HOSTILE = '<img src=x onerror="window.hacked=1"></script><script>window.hacked=1</script>'
 ROWS, SCENES, FILTER_MS = 1000, 45, 100.0
+FILTER = """(async () => {
+  const times = [];
+  const until = async (key) => {
+    while (document.body.dataset[key] !== location.hash) {
+      const channel = new MessageChannel();  // a task of its own, without the delay of a timer
+      await new Promise((resolve) => { channel.port1.onmessage = resolve; channel.port2.postMessage(0); });
+    }
+  };
+  for (const state of %s) {
+    const start = performance.now();
+    location.hash = "#" + state;
+    await until("drawn");
+    document.body.offsetHeight;
+    times.push(performance.now() - start);
+    await until("whole");
+  }
+  return times;
+})()"""
 
 
 def hostile_board() -> Board:
@@ -322,29 +340,22 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
 def test_a_thousand_rows_of_45_scenes_filter_at_once(
     shown: Page, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The time of the page's own thread: what other programs do to a busy machine is not the page's."""
+    """From the change of a filter to the laid out table, in the page's own clock."""
     page = shown
     write_site(tmp_path / "page", [large_board(ROWS, SCENES, 60)])
     page.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
-    page.call("Performance.enable", timeDomain="threadTicks")
-
-    def busy_ms() -> float:
-        found = {m["name"]: m["value"] for m in page.call("Performance.getMetrics")["metrics"]}
-        return 1000 * float(found["TaskDuration"])
-
-    times = []
-    for state in ("motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"):
-        before = busy_ms()
-        page.value(f"location.hash = '#{state}'")
-        wait_for("rows", lambda s=state: page.value("document.body.dataset.ready === location.hash"))
-        page.value("document.body.offsetHeight")
-        times.append(busy_ms() - before)
-        settle(page)
+    states = ["motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"]
+    times = page.call("Runtime.evaluate", expression=FILTER % states, awaitPromise=True, returnByValue=True)
+    measured = times["result"]["value"]
     with capsys.disabled():
         print(
-            f"\n{ROWS} rows x {SCENES} scenes, a filter: {', '.join(f'{t:.0f}' for t in times)} ms of the page's thread"
+            f"\n{ROWS} rows x {SCENES} scenes, a filter: {', '.join(f'{t:.0f}' for t in measured)} ms to the new table"
         )
-    assert min(times) < 5 * FILTER_MS, "with a generous factor for slow machines"
+    count = page.value("document.getElementById('count').textContent")
+    assert count.startswith("167 rows, the first 100 drawn; 833 rows hidden"), (
+        "a third of the rows, every second of them"
+    )
+    assert min(measured) < 20 * FILTER_MS, "with a generous factor for busy machines"
 
 
 def test_a_screen_in_the_dark(page: Page) -> None:

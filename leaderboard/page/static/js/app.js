@@ -20,25 +20,31 @@ Spike4DGS.app = (() => {
     else if (next !== location.hash) location.hash = next;
   }
 
-  /* Return {rows, better, leftOut} of the view's metric and scenes: as built where all scenes count, else computed. */
-  async function comparison(view, state) {
+  /* Return {rows, better, leftOut} of the view's metric and scenes: as built where all scenes count, else computed.
+     Null where that takes a while and was not done yet; `wait` does it. */
+  function comparison(view, state, wait) {
     if (!view.metric) return { rows: [], better: [], leftOut: {} };
     const number = page.boards.indexOf(view.board);
-    const scores = await Spike4DGS.load(`scores-${number}-${view.metric}`);
+    const scores = Spike4DGS.ready(`scores-${number}-${view.metric}`);
+    if (!scores) return null;
     const fixed = state.iv === "fixed";
     if (view.scenes.length === view.board.scenes.length && !fixed) return scores;
     const key = [number, view.metric, view.scenes, fixed].join("|");
-    if (!cache.has(key)) {
-      const few = scores.rows.length <= MOST_COMPARED && scores.rows.length > 0;
-      const why = Object.fromEntries(scores.rows.map((i) => [i, `intervals of more than ${MOST_COMPARED} rows come for all scenes only`]));
-      const higher = page.index.get(view.metric).higher;
-      const found = few && Spike4DGS.intervals.compare(Spike4DGS.intervals.nested(scores, view.scenes), higher, page.bootstrap, fixed);
-      cache.set(key, few ? { ...scores, better: found.better } : { rows: [], better: [], leftOut: { ...scores.leftOut, ...why } });
-    }
-    return cache.get(key);
+    if (!cache.has(key) && wait) cache.set(key, computed(view, scores, fixed));
+    return cache.get(key) ?? null;
   }
 
-  /* Fill in what the last letter of "better" strings says: rows of 0 and 1. */
+  function computed(view, scores, fixed) {
+    if (scores.rows.length > MOST_COMPARED || !scores.rows.length) {
+      const why = Object.fromEntries(scores.rows.map((i) => [i, `intervals of more than ${MOST_COMPARED} rows come for all scenes only`]));
+      return { rows: [], better: [], leftOut: { ...scores.leftOut, ...why } };
+    }
+    const values = Spike4DGS.intervals.nested(scores, view.scenes);
+    const found = Spike4DGS.intervals.compare(values, page.index.get(view.metric).higher, page.bootstrap, fixed);
+    return { ...scores, better: found.better };
+  }
+
+  /* The page comes with lines of 0 and 1. */
   const lit = (better) => better.map((line) => (typeof line === "string" ? Array.from(line, (c) => c === "1") : line));
 
   let drawing = 0;
@@ -56,24 +62,30 @@ Spike4DGS.app = (() => {
     Spike4DGS.controls.about(page, board);
     Spike4DGS.controls.form(page, board, state, view, change);
     const shown = view.shown.map((item) => item.index);
-    const number = page.boards.indexOf(board);
-    const known = Spike4DGS.ready(`scores-${number}-${view.metric}`);
-    if (!known) Spike4DGS.table.draw(page, state, view, null, {}, act);
-    const found = await comparison(view, state);
-    if (turn !== drawing) return;
+    let found = comparison(view, state, false);
+    if (!found) {
+      Spike4DGS.table.draw(page, state, view, null, {}, act);
+      document.body.dataset.drawn = location.hash || "#";
+      if (view.metric) await Spike4DGS.load(`scores-${page.boards.indexOf(board)}-${view.metric}`);
+      await painted();
+      if (turn !== drawing) return;
+      found = comparison(view, state, true);
+    }
     const ranks = Spike4DGS.intervals.ranks(found.rows, lit(found.better), shown);
     Spike4DGS.table.draw(page, state, view, ranks, found.leftOut, act);
+    document.body.dataset.drawn = location.hash || "#";
     Spike4DGS.download.buttons(page, view, state, ranks);
     await Spike4DGS.details.draw(page, state, view, () => change({ row: "" }));
     document.body.dataset.ready = location.hash || "#";
     // What lies below the table may wait for the next frame.
-    requestAnimationFrame(() => setTimeout(async () => {
-      if (turn !== drawing) return;
-      Spike4DGS.plots.draw(page, state, view, change);
-      await Spike4DGS.compare.draw(page, state, view, change);
-      if (turn === drawing) document.body.dataset.whole = location.hash || "#";
-    }));
+    await painted();
+    if (turn !== drawing) return;
+    Spike4DGS.plots.draw(page, state, view, change);
+    await Spike4DGS.compare.draw(page, state, view, change);
+    if (turn === drawing) document.body.dataset.whole = location.hash || "#";
   }
+
+  const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
 
   function footer() {
     const empty = page.empty.map((t) => `${t.name} (${t.announced ? "announced" : "open"})`).join(", ");

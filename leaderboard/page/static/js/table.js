@@ -2,7 +2,7 @@
 /* The ranking: a real table, with what is hidden counted above it. */
 Spike4DGS.table = (() => {
   const { el, byId, fill, format, heading, plural } = Spike4DGS.dom;
-  const MOST = 200; // rows that are drawn at once; a button shows the others
+  const MOST = 100; // rows that are drawn at once, for speed; a button shows the others
 
   /* `ranks`: row number -> {best, worst, ties}; null while they are computed. `leftOut`: why others have none. */
   function draw(page, state, view, ranks, leftOut, act) {
