@@ -51,12 +51,12 @@ class Comparison:
     @property
     def best_ranks(self) -> NDArray[np.int64]:
         """One more than the number of methods that are better."""
-        return 1 + self.better.sum(0)
+        return np.asarray(1 + self.better.sum(0))
 
     @property
     def worst_ranks(self) -> NDArray[np.int64]:
         """The number of methods, less those that are worse."""
-        return len(self.means) - self.better.sum(1)
+        return np.asarray(len(self.means) - self.better.sum(1))
 
     def tied(self, i: int) -> list[int]:
         """Return the methods that cannot be told from method `i`."""

@@ -89,9 +89,9 @@ def write_site(
         put(f"pictures-{number}", pictures)
         content.append(one)
     put("boards", {**facts(boards), "boards": content, "refused": list(refused)})
-    for path in [*(out / "data").glob("*"), *(out / "pictures").rglob("*.webp")]:
-        if path not in written:
-            path.unlink()
+    for earlier in [*(out / "data").glob("*"), *(out / "pictures").rglob("*.webp")]:
+        if earlier not in written:
+            earlier.unlink()
     first = [p for p in written if p.relative_to(out).parts[0] not in ("data", "pictures")] + [out / MARK]
     return Site(len(written), sum(p.stat().st_size for p in first), tuple(left_out))
 
