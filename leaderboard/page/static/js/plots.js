@@ -112,7 +112,7 @@ Spike4DGS.plots = (() => {
     const plot = Plot.plot({
       width: Math.min(640, window.innerWidth - 28), height: 220, marginLeft: 48, style: { background: "none", fontSize: "12px" },
       ariaLabel: `${metric.title} of each image`, ariaDescription: "The scores of both methods at the shown image are in the text.",
-      x: { label: "image", ticks: Math.min(names.length, 10), tickFormat: "d" }, y: { label: heading(metric), grid: true, zero: false },
+      x: { label: "image", ticks: d3.range(0, names.length, Math.ceil(names.length / 10)), tickFormat: "d" }, y: { label: heading(metric), grid: true, zero: false },
       marks: [
         at === null ? null : Plot.ruleX([at], { stroke: "currentColor", strokeOpacity: 0.5, strokeDasharray: "3,3" }),
         Plot.line(series.filter((d) => !d.color), { x: "i", y: "value", z: "name", stroke: "#999", strokeOpacity: 0.5, strokeWidth: 1 }),
