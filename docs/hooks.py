@@ -44,6 +44,15 @@ def on_config(config: Any, **kwargs: Any) -> Any:
     return config
 
 
+def on_post_build(config: Any, **kwargs: Any) -> None:
+    """Write the leaderboard's page into the site, from the committed entries."""
+    from spike4dgs.leaderboard.page.rows import gather
+    from spike4dgs.leaderboard.page.site import write_site
+
+    boards, refused = gather(ROOT / "leaderboard", ())
+    write_site(Path(config["site_dir"]) / "leaderboard_page", boards, refused)
+
+
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
     """Expand `<!-- include FILE [SECTION] -->`, `<!-- names of ROOM -->` and `<!-- modules of ROOM -->`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)

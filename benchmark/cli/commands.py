@@ -117,6 +117,12 @@ COMMANDS: dict[str, Command] = {
         "check a leaderboard's release, entries and boards",
         "verify-leaderboard leaderboard",
     ),
+    "leaderboard": Command(
+        "spike4dgs.leaderboard.page.show_command:show", "print the ranking, with intervals of the ranks", "leaderboard"
+    ),
+    "leaderboard build": Command(
+        "spike4dgs.leaderboard.page.build_command:build", "write the leaderboard as a page", "leaderboard build"
+    ),
     "season make": Command(
         "spike4dgs.leaderboard.season.make_command:make_season_make",
         "draw secret seeds, make hidden scenes, write the commitments to them",

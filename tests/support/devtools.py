@@ -35,6 +35,7 @@ class Page:
 
     def __init__(self, socket: Any) -> None:
         self._socket, self._calls = socket, 0
+        self.events: list[dict[str, Any]] = []  # what the browser told between answers, of the domains enabled
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Call a method of the protocol and wait for its answer."""
@@ -45,10 +46,34 @@ class Page:
             if answer.get("id") == self._calls:
                 assert "error" not in answer, answer
                 return dict(answer["result"])
+            self.events.append(answer)
 
     def value(self, expression: str) -> Any:
         """Return the value of a JavaScript expression."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def show(self, url: str, ready: str, width: int = WIDTH, height: int = HEIGHT) -> None:
+        """Load a page in a window of that size and wait until the expression `ready` is true; errors are noted."""
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+        self.call("Page.navigate", url=url)
+        wait_for(ready, lambda: self.value(ready))
+
+    def errors(self) -> list[str]:
+        """Return what went wrong in the page so far: exceptions, and errors and warnings on its console."""
+        self.value("1")  # what came before this answer has been read
+        found = []
+        for event in self.events:
+            p = event.get("params", {})
+            if event["method"] == "Runtime.exceptionThrown":
+                found.append(str(p["exceptionDetails"].get("exception", p["exceptionDetails"]).get("description")))
+            elif event["method"] == "Runtime.consoleAPICalled" and p["type"] in ("error", "warning", "assert"):
+                found.append(str([a.get("value", a.get("description")) for a in p["args"]]))
+            elif event["method"] == "Log.entryAdded" and p["entry"]["level"] in ("error", "warning"):
+                found.append(f"{p['entry']['text']} {p['entry'].get('url', '')}")
+        return found
 
     def press(self, key: str) -> None:
         """Press and release a key."""
@@ -61,7 +86,7 @@ class Page:
         return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
 
 
-KEYS = {"End": 35, "Home": 36, "ArrowRight": 39}
+KEYS = {"End": 35, "Home": 36, "ArrowRight": 39, "Tab": 9, "Escape": 27}
 
 
 @contextmanager

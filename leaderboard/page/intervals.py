@@ -1,0 +1,135 @@
+"""Rank intervals: which methods a benchmark can tell apart, by a paired bootstrap over scenes, images and seeds.
+
+All methods are scored on the same images, so a replicate draws the same scenes and images for all of them, and what
+counts is the differences of their means. The intervals of all differences hold together (max-t: Romano and Wolf 2005),
+with probability LEVEL. From them follow the intervals of the ranks (Mogstad, Romano, Shaikh and Wilhelm, "Inference for
+Ranks", Review of Economic Studies 2024): a method's rank is at best one more than the number of those that beat it. Two
+methods tie where the interval of their difference contains 0.
+
+A bootstrap of few scenes gives intervals that are too narrow. They are widened by sqrt(n / (n - 1)), and the critical
+value is taken from Student's distribution with n - 1 degrees of freedom in place of the normal one (Hesterberg, "What
+Teachers Should Know about the Bootstrap", The American Statistician 2015), where n counts what is resampled first. The
+tail is that of the simultaneous critical value, not of a single interval. In simulations of six equal methods on five
+scenes, all rank intervals hold in 94 % of the cases; with the factor of single intervals in 84 %.
+
+Below FEWEST_SCENES scenes are not resampled: then an interval is about these scenes and not about others like them.
+Images of a scene follow each other in time. They are drawn as if they did not depend on each other, which makes the
+intervals of less than FEWEST_SCENES scenes too narrow where errors last over several images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.leaderboard.page.draws import Float64, draw_weights
+
+LEVEL = 0.95
+REPLICATES = 2000
+SEED = 20251
+FEWEST_SCENES = 3  # two scenes have one difference: no spread can be estimated from it
+MOST_UNITS = 60  # of the table of widened critical values: more units count as so many
+GRID = np.linspace(1, 6, 51)  # critical values of the table; it is interpolated, as on the page
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Methods compared by one metric on the same images.
+
+    `means` [M]; `half_widths` [M, M] of the intervals of their differences; `better` [M, M]: i is better than j by more
+    than that; `best_ranks` and `worst_ranks` [M], from 1.
+    """
+
+    means: Float64
+    half_widths: Float64
+    better: NDArray[np.bool_]
+
+    @property
+    def best_ranks(self) -> NDArray[np.int64]:
+        """One more than the number of methods that are better."""
+        return np.asarray(1 + self.better.sum(0))
+
+    @property
+    def worst_ranks(self) -> NDArray[np.int64]:
+        """The number of methods, less those that are worse."""
+        return np.asarray(len(self.means) - self.better.sum(1))
+
+    def tied(self, i: int) -> list[int]:
+        """Return the methods that cannot be told from method `i`."""
+        return [j for j in range(len(self.means)) if j != i and not (self.better[i, j] or self.better[j, i])]
+
+
+def resampled_means(
+    values: Sequence[Sequence[Float64]], scenes: bool, replicates: int = REPLICATES, seed: int = SEED
+) -> Float64:
+    """Return the resampled means [replicates, M] of methods.
+
+    `values`: for each method and scene its scores [images, seeds]. All methods have the same scenes and images; a
+    method has the same number of seeds on all scenes.
+    """
+    images = tuple(len(scene) for scene in values[0])
+    seeds = [method[0].shape[1] for method in values]
+    found = np.empty((replicates, len(values)))
+    for n in sorted(set(seeds)):
+        columns = [m for m, count in enumerate(seeds) if count == n]
+        weights = draw_weights(images, n, max(seeds), replicates, scenes, seed)
+        flat = np.stack([np.concatenate(values[m]).reshape(-1) for m in columns], axis=1)
+        # Not a matrix product of BLAS, whose threads wait for each other on a busy machine.
+        found[:, columns] = np.einsum("ru,um->rm", weights, flat)
+    return found
+
+
+@cache
+def widened_values(n: int) -> Float64:
+    """Return the critical values for `n` resampled units in the place of those in GRID, of four digits.
+
+    sqrt(n / (n - 1)) times the value that Student's t with n - 1 degrees of freedom exceeds as rarely as a normal
+    number does the given one.
+
+    >>> f"{np.interp(1.96, GRID, widened_values(5)):.2f} {np.interp(2.9, GRID, widened_values(5)):.2f}"
+    '3.11 6.76'
+    """
+    from scipy.stats import norm, t
+
+    if not 2 <= n <= MOST_UNITS:
+        raise ValueError(f"2 to {MOST_UNITS} units expected, found {n}")
+    values = np.sqrt(n / (n - 1)) * t.isf(norm.sf(GRID), n - 1)
+    return np.array([float(f"{v:.4g}") for v in values])
+
+
+def compare(
+    values: Sequence[Sequence[Float64]], higher_is_better: bool, replicates: int = REPLICATES, seed: int = SEED
+) -> Comparison:
+    """Compare methods by their scores, given as in `resampled_means`; scenes are drawn too if they are enough."""
+    scenes = len(values[0]) >= FEWEST_SCENES
+    draws = resampled_means(values, scenes, replicates, seed)
+    means = np.array([np.mean([scene.mean() for scene in method]) for method in values])
+    units = len(values[0]) if scenes else sum(len(scene) for scene in values[0])
+    half = _half_widths(draws - means, units)
+    difference = means[:, None] - means[None]
+    better = (difference if higher_is_better else -difference) > half
+    return Comparison(means, half, better)
+
+
+def _half_widths(deviations: Float64, units: int) -> Float64:
+    """Return the half widths [M, M] of simultaneous intervals of all differences, from deviations [R, M] of means.
+
+    They are infinite for a single unit, of which there is no spread.
+    """
+    replicates, n = deviations.shape
+    errors, largest = np.zeros((n, n)), np.zeros(replicates)
+    for i in range(n - 1):
+        d = deviations[:, i, None] - deviations[:, i + 1 :]
+        errors[i, i + 1 :] = spread = np.sqrt(np.mean(d * d, axis=0))
+        ratios = np.abs(d[:, spread > 0]) / spread[spread > 0]
+        largest = np.maximum(largest, ratios.max(axis=1, initial=0))
+    # The smallest value that at least LEVEL of the replicates do not exceed, without interpolation, as on the page.
+    critical = np.sort(largest)[int(np.ceil(LEVEL * replicates)) - 1]
+    if units < 2:
+        return np.where(np.eye(n) > 0, 0, np.inf)
+    wide = np.interp(critical, GRID, widened_values(min(units, MOST_UNITS)))
+    return np.asarray((errors + errors.T) * wide)

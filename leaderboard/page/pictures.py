@@ -1,0 +1,130 @@
+"""The images of finished runs as files for the page: truth, predictions, error maps, and where things move."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import write_bytes
+from spike4dgs.benchmark.reports.error_map import error_image
+from spike4dgs.benchmark.results.predictions import open_predictions
+from spike4dgs.benchmark.results.targets import has_truth
+from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.leaderboard.page.rows import Board
+
+FOLDER = "pictures"
+MARGIN = 0.15  # around what moves, of its size
+SMALLEST = 24  # pixels of a crop's side: smaller ones show no context
+
+Box = tuple[int, int, int, int]  # x, y, width, height in pixels
+
+
+def write_pictures(
+    out: Path, board: Board, number: int, data: Path, written: set[Path], say: Callable[[str], None]
+) -> list[Any]:
+    """Write the images of a board's rows that have predictions; return for each scene what is there, or None.
+
+    Truth comes from the scene folders in `data`. What cannot be shown is told to `say`, with the reason. The paths are
+    added to `written`.
+    """
+    found: list[Any] = []
+    for s, name in enumerate(board.scenes):
+        folders = {i: row.predictions[name] for i, row in enumerate(board.rows) if name in row.predictions}
+        found.append(None)
+        if not folders:
+            continue
+        try:
+            scene = open_scene(data / name, allow_gaps=True, split=board.dataset["split"])
+            if (revision := board.dataset["scenes"][name]) != scene.revision:
+                say(f"no images of {name}: {data / name} has another revision than {revision[:12]}")
+                continue
+            if has_truth(scene):
+                found[-1] = _write_scene(out, f"{FOLDER}/{number}/{s}", scene, board, folders, written, say)
+        except UserError as e:
+            say(f"no images of {name}: {e}")
+    return found
+
+
+def _write_scene(
+    out: Path,
+    below: str,
+    scene: Scene,
+    board: Board,
+    folders: dict[int, Path],
+    written: set[Path],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    truths = [scene.ground_truth(t) for t in scene.targets]
+
+    def write(name: str, image: UInt8) -> None:
+        path = out / below / name
+        write_bytes(path, webp(image))
+        written.add(path)
+
+    for k, truth in enumerate(truths):
+        write(f"truth/{k}.webp", encode_srgb(truth))
+    rows = []
+    for i, folder in folders.items():
+        try:
+            predictions = open_predictions(folder, scene.targets)
+            if predictions.sha256 != board.rows[i].first["scenes"][scene.id]["predictions_sha256"]:
+                say(f"no images of {board.rows[i].name} on {scene.id}: {folder} has others than were scored")
+                continue
+            for k, (target, truth) in enumerate(zip(scene.targets, truths, strict=True)):
+                image = predictions.read(target, truth.shape)
+                write(f"{i}/{k}.webp", encode_srgb(image))
+                write(f"{i}/{k}-error.webp", error_image(image, truth))
+            rows.append(i)
+        except UserError as e:
+            say(f"no images of {board.rows[i].name} on {scene.id}: {e}")
+    height, width = truths[0].shape
+    return {
+        "folder": below,
+        "width": width,
+        "height": height,
+        "names": [t.name for t in scene.targets],
+        "ms": [scene.t_us(t.tick) / 1000 for t in scene.targets],
+        "crops": crops([scene.moving(t) for t in scene.targets]),
+        "rows": rows,
+    }
+
+
+def crops(moving: Sequence[NDArray[np.bool_]]) -> list[Box | None]:
+    """Return a box around what moves in each image, all of one size; None where nothing does."""
+    tight = [_bounds(mask) for mask in moving]
+    height, width = moving[0].shape
+    known = [box for box in tight if box]
+    if not known:
+        return [None] * len(tight)
+    w = min(width, max(SMALLEST, *(round(b[2] * (1 + 2 * MARGIN)) for b in known)))
+    h = min(height, max(SMALLEST, *(round(b[3] * (1 + 2 * MARGIN)) for b in known)))
+
+    def centred(box: Box) -> Box:
+        x, y = box[0] + box[2] // 2 - w // 2, box[1] + box[3] // 2 - h // 2
+        return min(max(x, 0), width - w), min(max(y, 0), height - h), w, h
+
+    return [centred(box) if box else None for box in tight]
+
+
+def _bounds(mask: NDArray[np.bool_]) -> Box | None:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return None
+    x, y = int(columns[0]), int(rows[0])
+    return x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y
+
+
+def webp(image: UInt8) -> bytes:
+    """Return an 8-bit image, gray [H, W] or RGB [H, W, 3], as lossless WebP."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).convert("RGB").save(out, "WEBP", lossless=True)
+    return out.getvalue()

@@ -1,0 +1,164 @@
+"""The rows of the page: what the committed entries and a reader's own finished runs claim, board by board."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json, sha256_json
+from spike4dgs.benchmark.reports.console import seeds_of_methods
+from spike4dgs.benchmark.results.record import Record, is_complete, read_record
+from spike4dgs.leaderboard.entry import Entry, read_entries
+from spike4dgs.leaderboard.rank import make_boards, reason
+from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of, short
+
+OWN = "own run"  # the label of a reader's records, beside those of entries
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method on a board: the records of its seeds, and what is known of them.
+
+    `why` is the reason where the row is not `ranked`. `predictions` has the folders of a run that holds the images of
+    the first seed, by scene.
+    """
+
+    name: str
+    label: str
+    ranked: bool
+    why: str
+    records: tuple[Record, ...]
+    entries: Mapping[str, Entry] = field(default_factory=dict)  # by path
+    hashes: Mapping[str, str] = field(default_factory=dict)  # of the entries' files, as in the ledger
+    run: Path | None = None
+    predictions: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def first(self) -> Record:
+        """The record of the first seed."""
+        return self.records[0]
+
+
+@dataclass(frozen=True)
+class Board:
+    """Rows on the same scenes, revisions and split. `folder` is the leaderboard's: entries, local or archive."""
+
+    name: str
+    title: str
+    folder: str
+    why: str
+    withheld: tuple[str, ...]
+    dataset: Mapping[str, Any]
+    rows: list[Row]
+
+    @property
+    def scenes(self) -> list[str]:
+        """The scenes' ids, sorted."""
+        return sorted(self.dataset["scenes"])
+
+
+def gather(leaderboard: Path, runs: Sequence[Path]) -> tuple[list[Board], list[dict[str, str]]]:
+    """Return the boards of a leaderboard's entries with the rows of finished runs, and the refused entries.
+
+    A run's record that equals an entry, image by image, lends its images to the entry's row. Raises UserError where a
+    run has no records.
+    """
+    boards, refused = [], []
+    for folder, file in make_boards(leaderboard).items():
+        entries, _ = read_entries(leaderboard, folder)
+        refused += file["refused"]
+        boards += [_board(leaderboard, folder, board, entries) for board in file["boards"]]
+    for run in runs:
+        for records in seeds_of_methods(run_records(run)):
+            for board in _boards_of(boards, records[0]):
+                _add_run(board, run, records)
+    order = (PUBLIC, LOCAL, ARCHIVE)
+    return sorted(boards, key=lambda b: order.index(b.folder)), refused
+
+
+def run_records(run: Path) -> list[Record]:
+    """Return the records of a finished run, of all seeds. Raises UserError where there is none."""
+    paths = sorted([*run.glob("results/*.json"), *run.glob("seed-*/results/*.json")])
+    if not paths:
+        raise problem(run, "a folder of run-benchmark with results/*.json", "none", "check the path of --runs")
+    return [read_record(path) for path in paths]
+
+
+def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], entries: Mapping[str, Entry]) -> Board:
+    rows = []
+    for row in board["rows"]:
+        own = {path: entries[path] for path in row["entries"]}
+        why = "" if row["rank"] else "archived" if folder == ARCHIVE else reason(row)
+        name = Path(row["entries"][0]).stem if len(own) == 1 else row["method"]
+        records = tuple(e["record"] for e in own.values())
+        hashes = {path: sha256_json(read_json(leaderboard / path, "a leaderboard entry")) for path in own}
+        rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes))
+    name, title = board["track"] or board["title"], board["title"]
+    return Board(name, title, folder, board["why"], tuple(board["withheld"]), board["dataset"], rows)
+
+
+def _boards_of(boards: list[Board], record: Record) -> Iterator[Board]:
+    """Yield the boards that a record belongs to; one that has no entries yet is added."""
+    place, dataset = place_of(record), record["dataset"]
+    names = place.tracks or (place.folder.partition("/")[2].partition("@")[0],)
+    tracks = {t.name: t for t in current_release().tracks}
+    for name in names:
+        for board in boards:
+            if board.dataset == dataset and board.folder != ARCHIVE and board.name == name:
+                break
+        else:
+            track = tracks.get(name) if place.is_public else None
+            title, withheld = (track.title, tuple(sorted(track.withheld))) if track else (name, ())
+            board = Board(name, title, PUBLIC if track else LOCAL, place.why, withheld, dataset, [])
+            boards.append(board)
+        yield board
+
+
+def _add_run(board: Board, run: Path, records: Sequence[Record]) -> None:
+    first = records[0]
+    row = next((r for r in board.rows if _images(first) in map(_images, r.records)), None)
+    if row is None:
+        name = f"{run.name}/{first['method']['name']}"
+        complete = all(map(is_complete, records))
+        missing = ", ".join(f"{s} {c['status']}" for s, c in first["scenes"].items() if c["status"] != "ok")
+        row = Row(name, OWN, complete, missing, tuple(records), run=run)
+        board.rows.append(row)
+    row.predictions.update(_folders(run, first))
+
+
+def _images(record: Record) -> tuple[Any, ...]:
+    """Return what tells a record's images: the hashes of its predictions, by scene."""
+    method = record["method"]
+    hashes = sorted((scene, cell["predictions_sha256"]) for scene, cell in record["scenes"].items())
+    return method["name"], method["seed"], *hashes
+
+
+def _folders(run: Path, record: Record) -> dict[str, Path]:
+    """Return the predictions folders by scene, of the run or of one of its further seeds."""
+    name, seed = record["method"]["name"], record["method"]["seed"]
+    for root in (run / f"seed-{seed}", run):
+        found = {s: root / "predictions" / name / s for s, c in record["scenes"].items() if c["status"] == "ok"}
+        if all(folder.is_dir() for folder in found.values()):
+            return found
+    return {}
+
+
+def find_board(boards: Sequence[Board], name: str) -> Board:
+    """Return the board of a name. Raises UserError where there is none."""
+    for board in boards:
+        if board.name == name:
+            return board
+    raise problem("--track", f"one of {', '.join(b.name for b in boards)}", repr(name), "correct the name")
+
+
+def titles(boards: Iterable[Board]) -> list[str]:
+    """Return a distinct identifier for each board, for links: its name, with its revision where a name comes twice."""
+    boards = list(boards)
+    names = [b.name if b.folder != ARCHIVE else f"archive-{b.name}" for b in boards]
+    return [
+        name if names.count(name) == 1 else f"{name}@{short(dataset_revision(board.dataset))}"
+        for name, board in zip(names, boards, strict=True)
+    ]

@@ -1,0 +1,82 @@
+"""The scores of a board image by image, and its methods compared by them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.leaderboard.page.draws import Float64
+from spike4dgs.leaderboard.page.intervals import Comparison, compare
+from spike4dgs.leaderboard.page.rows import Board, Row
+
+DIGITS = 7  # significant ones of a score on the page: more than any metric is accurate to
+
+
+@dataclass(frozen=True)
+class ImageScores:
+    """One metric on a board.
+
+    `images`: for each scene the names of the images that every compared row has a score of. `values`: for each of
+    these rows, by its number on the board, and each scene the scores [images, seeds]. `left_out`: why other rows are
+    not compared, by number.
+    """
+
+    images: list[list[str]]
+    values: dict[int, list[Float64]]
+    left_out: dict[int, str]
+
+
+def rounded(value: float | None) -> float | None:
+    """Return a number with `DIGITS` significant digits: what the page has, so that it computes the same."""
+    return None if value is None else float(f"{value:.{DIGITS}g}")
+
+
+def image_scores(board: Board, metric: str) -> ImageScores:
+    """Return the scores of a metric.
+
+    A row is compared if it may be ranked and has a score for every image that most rows have one for. An image without
+    a score in every row, such as the first of a temporal error, has no part in any mean.
+    """
+    left_out = {i: row.why or "not ranked" for i, row in enumerate(board.rows) if not row.ranked}
+    scored = {i: _scored(row, board.scenes, metric) for i, row in enumerate(board.rows) if i not in left_out}
+    union = [sorted(set().union(*(names[s] for names in scored.values()))) for s in range(len(board.scenes))]
+    for i, names in scored.items():
+        lacking = sum(len(set(u) - n) for u, n in zip(union, names, strict=True))
+        if lacking or not all(union):
+            left_out[i] = f"no {METRICS[metric].title} of {lacking} images" if lacking else "no scores"
+    values = {i: [] if i in left_out else _values(board.rows[i], board.scenes, union, metric) for i in scored}
+    return ImageScores(union, {i: v for i, v in values.items() if v}, left_out)
+
+
+def _scored(row: Row, scenes: list[str], metric: str) -> list[set[str]]:
+    """Return for each scene the images that have a score from every seed."""
+    return [
+        set.intersection(
+            *(
+                {name for name, values in r["scenes"][scene]["per_image"].items() if values[metric] is not None}
+                for r in row.records
+            )
+        )
+        for scene in scenes
+    ]
+
+
+def _values(row: Row, scenes: list[str], images: list[list[str]], metric: str) -> list[Float64]:
+    def of(record: Mapping[str, Any], scene: str, name: str) -> float | None:
+        return rounded(record["scenes"][scene]["per_image"][name][metric])
+
+    return [
+        np.array([[of(record, scene, name) for record in row.records] for name in names], np.float64)
+        for scene, names in zip(scenes, images, strict=True)
+    ]
+
+
+def compare_rows(scores: ImageScores, metric: str) -> Comparison | None:
+    """Return the comparison of the rows in `scores.values`, in their order; None where there is none to compare."""
+    if not scores.values:
+        return None
+    return compare(list(scores.values.values()), METRICS[metric].higher_is_better)

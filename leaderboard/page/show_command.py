@@ -1,0 +1,88 @@
+"""`leaderboard`: print the ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.results.record import COSTS
+from spike4dgs.leaderboard.page.intervals import LEVEL
+from spike4dgs.leaderboard.page.rows import Board, find_board, gather
+from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
+
+
+def show(
+    *,
+    track: str | None = None,
+    metric: str = PRIMARY,
+    runs: tuple[Path, ...] = (),
+    leaderboard: Path = Path("leaderboard"),
+) -> int:
+    """Print the ranking of each track with the intervals of its ranks.
+
+    Methods whose rank intervals start with the same number cannot be told apart from the best of them. `leaderboard
+    build` writes the same as a page, with filters, plots and images.
+
+    Args:
+        track: Only this track.
+        metric: Metric to rank by, such as psnr_dynamic.
+        runs: Folders of run-benchmark, to see own methods beside the entries.
+        leaderboard: Leaderboard folder.
+    """
+    if metric not in METRICS:
+        raise problem("--metric", f"one of {', '.join(METRICS)}", repr(metric), "correct the name")
+    boards, _ = gather(leaderboard, runs)
+    console = make_console()
+    for board in [find_board(boards, track)] if track else boards:
+        if track or any(row.ranked for row in board.rows):
+            console.print(ranking_table(board, metric))
+    return 0
+
+
+def ranking_table(board: Board, metric: str) -> Table:
+    """Return a board's ranking by a metric as a table; rows without a rank come last, with the reason."""
+    scores = image_scores(board, metric)
+    comparison = compare_rows(scores, metric)
+    m = METRICS[metric]
+    table = Table(title=f"{board.name}: {board.title}", box=None, title_justify="left")
+    table.caption = f"rank: simultaneous {LEVEL:.0%} intervals; methods that cannot be told apart tie"
+    for title in (
+        "rank",
+        "method",
+        f"{m.title}{f', {m.unit}' if m.unit else ''}",
+        "ties with",
+        *(t for t, _ in COSTS.values()),
+    ):
+        table.add_column(title, justify="left" if title in ("method", "ties with") else "right")
+    numbers = list(scores.values)
+    if comparison is not None:
+        for k in np.argsort(-comparison.means if m.higher_is_better else comparison.means, kind="stable"):
+            best, worst = comparison.best_ranks[k], comparison.worst_ranks[k]
+            tied = [board.rows[numbers[j]].name for j in comparison.tied(int(k))]
+            rank = str(best) if best == worst else f"{best}-{worst}"
+            shown = ", ".join(tied) if len(tied) <= 3 else f"{len(tied)} methods"
+            name = board.rows[numbers[k]].name
+            table.add_row(
+                rank, Text(name), m.format(comparison.means[k]), Text(shown), *_costs(board.rows[numbers[k]].records)
+            )
+    for i, why in scores.left_out.items():
+        table.add_row("-", Text(board.rows[i].name), "", Text(why), *_costs(board.rows[i].records))
+    return table
+
+
+def _costs(records: tuple[Mapping[str, Any], ...]) -> list[str]:
+    """Return the means over scenes and seeds; a dash where one is missing."""
+    cells = [cell for r in records for cell in r["scenes"].values()]
+    values = {cost: [cell[cost] for cell in cells] for cost in COSTS}
+    return [
+        "-" if None in values[cost] else f"{sum(values[cost]) / len(cells):.{digits}f}"
+        for cost, (_, digits) in COSTS.items()
+    ]

@@ -1,0 +1,88 @@
+"use strict";
+/* The ranking: a real table, with what is hidden counted above it. */
+Spike4DGS.table = (() => {
+  const { el, byId, fill, format, heading, plural } = Spike4DGS.dom;
+  const MOST = 100; // rows that are drawn at once, for speed; a button shows the others
+
+  /* `ranks`: row number -> {best, worst, ties}; null while they are computed. `leftOut`: why others have none. */
+  function draw(page, state, view, ranks, leftOut, act) {
+    const rows = state.all ? view.shown : view.shown.slice(0, MOST);
+    const metric = page.index.get(view.metric);
+    const names = page.published(view.board)?.names ?? {};
+    const paper = view.metric in names && view.shown.some((item) => item.published !== null);
+    const sortHeader = (id, title, hint) => {
+      const sorted = view.sortBy === id ? (view.descending ? "descending" : "ascending") : null;
+      const flip = () => act.change({ s: id, d: sorted ? (view.descending ? "asc" : "desc") : "" });
+      return el("th", { scope: "col", "aria-sort": sorted, class: id === "name" ? "name" : "number" },
+        el("button", { type: "button", title: hint, onclick: flip }, title, sorted && el("span", { class: "arrow", "aria-hidden": "true" }, view.descending ? " ▼" : " ▲")));
+    };
+    const head = el("thead", {}, el("tr", {},
+      el("th", { scope: "col", class: "number" }, "Rank"),
+      sortHeader("name", "Method", "Sort by name"),
+      view.columns.map((c) => [
+        sortHeader(c.id, c.id === "fit_seconds" ? "fit, s a scene" : heading(c), c.definition),
+        c === metric && paper && el("th", { scope: "col", class: "number paper", title: view.board.published.source }, `${names[view.metric]}, paper`)]),
+      el("th", { scope: "col" }, "Verified")));
+    const best = bestValues(view);
+    const body = el("tbody", {}, rows.map((item) => el("tr", { "data-row": item.row.name },
+      rankCell(view, item, ranks, leftOut),
+      el("th", { scope: "row", class: "name" },
+        el("button", { type: "button", class: "link", "aria-haspopup": "dialog", onclick: () => act.change({ row: item.row.name }) }, item.row.name),
+        note(view, item)),
+      view.columns.map((c) => [
+        el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
+        c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
+      el("td", { class: "nowrap" }, item.row.label))));
+    const caption = el("caption", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
+      `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold together; `,
+      "methods that cannot be told apart tie (=).");
+    fill(byId("table"), caption, head, body);
+    fill(byId("below"),
+      view.shown.length > rows.length && el("button", { type: "button", id: "more", onclick: () => act.change({ all: true }) },
+        `Show all ${view.shown.length} rows`),
+      paper && el("p", { class: "small" }, `Paper: ${view.board.published.source}`));
+    count(view, rows.length, act);
+  }
+
+  function bestValues(view) {
+    const found = {};
+    for (const c of view.columns) {
+      const values = view.shown.map((item) => item.values[c.id]).filter((v) => v !== null);
+      found[c.id] = values.length ? (c.higher ? Math.max(...values) : Math.min(...values)) : null;
+    }
+    return found;
+  }
+
+  function rankCell(view, item, ranks, leftOut) {
+    if (ranks === null) return el("td", { class: "number rank" }, "…");
+    const rank = ranks.get(item.index);
+    if (!rank) {
+      const why = leftOut[item.index] ?? (item.row.why || "not compared");
+      return el("td", { class: "number rank", title: why }, "–", el("span", { class: "hidden-text" }, ` no rank: ${why}`));
+    }
+    const text = rank.best === rank.worst ? String(rank.best) : `${rank.best}–${rank.worst}`;
+    const tied = rank.ties.map((i) => view.board.rows[i].name);
+    const said = tied.length ? `cannot be told apart from ${tied.join(", ")}` : "told apart from every other row";
+    return el("td", { class: "number rank", title: said }, tied.length ? "= " : "", text, el("span", { class: "hidden-text" }, `, ${said}`));
+  }
+
+  function note(view, item) {
+    const lines = [];
+    if (item.missing.length) {
+      const which = item.missing.map((s) => `${view.board.scenes[s].id} ${item.row.cells[s].why}`);
+      lines.push(`incomplete: ${which.join("; ")}`);
+    } else if (!item.row.ranked && item.row.why) lines.push(`not ranked: ${item.row.why}`);
+    if (item.row.seeds.length > 1) lines.push(`${item.row.seeds.length} seeds`);
+    return lines.map((text) => el("div", { class: "note" }, text));
+  }
+
+  function count(view, drawn, act) {
+    const hidden = view.hidden.length;
+    const more = view.shown.length > drawn ? `, the first ${drawn} drawn` : "";
+    fill(byId("count"),
+      el("span", {}, `${plural(view.shown.length, "row")}${more}; ${plural(hidden, "row")} hidden by filters`),
+      hidden > 0 && el("button", { type: "button", onclick: act.unfilter }, "Show them"));
+  }
+
+  return { draw };
+})();

@@ -1,0 +1,109 @@
+"""Rank intervals against closed forms, exact enumeration, and simulations with known ranks."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from spike4dgs.leaderboard.page.draws import Float64
+from spike4dgs.leaderboard.page.intervals import GRID, LEVEL, MOST_UNITS, compare, resampled_means, widened_values
+
+
+def scored(values: Float64) -> list[list[Float64]]:
+    """Scores [M, scenes, images] as methods, scenes, [images, one seed]."""
+    return [[scene[:, None] for scene in method] for method in values]
+
+
+def test_the_standard_error_of_a_mean_is_sigma_by_root_n() -> None:
+    values = np.random.default_rng(0).gamma(2, size=(1, 1, 30))
+    draws = resampled_means(scored(values), False, replicates=20_000)
+    exact = values.std() / math.sqrt(30)  # the bootstrap's population is the sample: n, not n - 1
+    assert draws.std() == pytest.approx(exact, rel=4 / math.sqrt(2 * 20_000))
+    assert draws.mean() == pytest.approx(values.mean(), abs=4 * exact / math.sqrt(20_000))
+
+
+def test_tiny_cases_against_all_resamples() -> None:
+    """Three scenes of two images: 27 draws of scenes, and 4 of images for each drawn scene."""
+    values = np.array([[0.0, 1.0], [4.0, 6.0], [9.0, 9.5]])
+    pairs = list(itertools.product(range(2), repeat=2))
+    exact = [
+        np.mean([values[scene, list(pair)].mean() for scene, pair in zip(scenes, images, strict=True)])
+        for scenes in itertools.product(range(3), repeat=3)
+        for images in itertools.product(pairs, repeat=3)
+    ]
+    draws = resampled_means(scored(values[None]), True, replicates=40_000)[:, 0]
+    assert draws.std() == pytest.approx(np.std(exact), rel=0.02)
+    for q in (0.05, 0.25, 0.5, 0.75, 0.95):
+        assert np.mean(draws <= np.quantile(exact, q)) == pytest.approx(
+            np.mean(exact <= np.quantile(exact, q)), abs=0.01
+        )
+
+
+def test_seeds_add_their_variance() -> None:
+    values = np.random.default_rng(3).normal(size=(6, 4))  # images, seeds
+    images, seeds = values.mean(1), values.mean(0)
+    draws = resampled_means([[values]], False, replicates=40_000)[:, 0]
+    rest = values - images[:, None] - seeds[None] + values.mean()
+    # Images and seeds are crossed: each is drawn with replacement, so their variances add, and that of their product.
+    exact = images.var() / 6 + seeds.var() / 4 + rest.var() / 24
+    assert draws.var() == pytest.approx(exact, rel=0.03)
+
+
+def test_the_draws_are_paired() -> None:
+    """A constant difference has no error, however much the images vary."""
+    base = np.random.default_rng(1).normal(scale=10, size=(4, 12))
+    found = compare(scored(np.stack([base, base + 0.01, base])), True)
+    assert found.half_widths.max() < 1e-6
+    assert found.best_ranks.tolist() == [2, 1, 2] and found.worst_ranks.tolist() == [3, 1, 3]
+    assert found.tied(0) == [2] and found.tied(1) == []
+
+
+def test_lower_is_better_turns_the_ranks_around() -> None:
+    values = np.arange(3)[:, None, None] + np.random.default_rng(2).normal(scale=0.01, size=(3, 5, 9))
+    assert compare(scored(values), True).best_ranks.tolist() == [3, 2, 1]
+    assert compare(scored(values), False).best_ranks.tolist() == [1, 2, 3]
+
+
+def test_a_method_alone_has_rank_one() -> None:
+    found = compare(scored(np.ones((1, 2, 3))), True)
+    assert found.best_ranks.tolist() == found.worst_ranks.tolist() == [1]
+
+
+def test_critical_values_are_widened_to_students() -> None:
+    at = dict(zip(GRID.round(9), widened_values(5), strict=True))
+    assert at[2.0] == pytest.approx(math.sqrt(5 / 4) * 2.8693, rel=1e-3)  # t of 4 degrees with the tail 0.02275
+    assert np.abs(widened_values(MOST_UNITS) / GRID - 1).max() < 0.25
+
+
+def test_of_a_single_image_nothing_is_told() -> None:
+    found = compare(scored(np.array([[[1.0]], [[2.0]]])), True)
+    assert found.best_ranks.tolist() == [1, 1] and found.worst_ranks.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize(
+    "effects", [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 1.0, 1.0, 0.5, 0.0, 0.0)], ids=["equal", "some"]
+)
+@pytest.mark.parametrize("n_scenes", [5, 12])
+def test_intervals_cover_known_ranks(effects: tuple[float, ...], n_scenes: int) -> None:
+    """Methods differ by known effects, scenes and images add noise; the true ranks are in the intervals as promised."""
+    truth, rng, trials = np.array(effects), np.random.default_rng(n_scenes), 150
+    best = 1 + (truth[None] > truth[:, None]).sum(1)  # of methods that are equal any order is right:
+    worst = len(truth) - (truth[None] < truth[:, None]).sum(1)
+    covered, separated = 0, 0.0
+    for trial in range(trials):
+        scenes = rng.normal(size=(1, n_scenes, 1)) * 3
+        by_scene = rng.normal(size=(len(truth), n_scenes, 1)) * 0.5
+        noise = rng.normal(size=(len(truth), n_scenes, 8)) * 0.3
+        found = compare(scored(truth[:, None, None] + scenes + by_scene + noise), True, replicates=400, seed=trial)
+        # Each pair in the wrong order would put a true rank outside of some interval.
+        covered += bool((found.best_ranks <= best).all() and (found.worst_ranks >= worst).all())
+        separated += found.better.mean()
+    error = math.sqrt(LEVEL * (1 - LEVEL) / trials)
+    assert covered / trials > LEVEL - 3 * error
+    if any(effects) and n_scenes == 12:
+        assert separated / trials > 0.2, "they also tell methods apart"
+    if not any(effects):
+        assert covered / trials < 1, "and they are not so wide that they never err"

@@ -1,0 +1,369 @@
+"""The page in a real browser, opened from the disk: filters, sort, address, slider, downloads, hostile names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from devtools import Page, browser, wait_for
+from page_boards import board, cell, failed, large_board, row
+
+from spike4dgs.leaderboard.page.intervals import compare
+from spike4dgs.leaderboard.page.rows import Board, find_board, gather
+from spike4dgs.leaderboard.page.scores import image_scores
+from spike4dgs.leaderboard.page.site import write_site
+
+COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
+HOSTILE = '<img src=x onerror="window.hacked=1"></script><script>window.hacked=1</script>'
+ROWS, SCENES, FILTER_MS = 1000, 45, 100.0
+FILTER = """(async () => {
+  const times = [];
+  const until = async (key) => {
+    while (document.body.dataset[key] !== location.hash) {
+      const channel = new MessageChannel();  // a task of its own, without the delay of a timer
+      await new Promise((resolve) => { channel.port1.onmessage = resolve; channel.port2.postMessage(0); });
+    }
+  };
+  for (const state of %s) {
+    const start = performance.now();
+    location.hash = "#" + state;
+    await until("drawn");
+    document.body.offsetHeight;
+    times.push(performance.now() - start);
+    await until("whole");
+  }
+  return times;
+})()"""
+
+
+def hostile_board() -> Board:
+    """Every text that an entry can hold tries to run; a method is named as a key of every object."""
+    first = row(HOSTILE, {"s": cell({"psnr": np.array([30.0, 31.0])})}, version=HOSTILE, trained_on=[HOSTILE])
+    first.first["method"]["params"] |= {"motion": HOSTILE, "__proto__": {"polluted": 1}, "settings": {HOSTILE: HOSTILE}}
+    first.first["command"] = HOSTILE
+    second = row("constructor", {"s": failed(HOSTILE)}, why=HOSTILE)
+    return replace(board("hostile", [first, second], title=HOSTILE), why=HOSTILE)
+
+
+def seeds_board() -> Board:
+    """Two methods on four scenes: one with three seeds."""
+    rng = np.random.default_rng(5)
+
+    def records(name: str, level: float) -> Any:
+        return row(name, {f"s{i}": cell({"psnr": level + rng.normal(size=6)}) for i in range(4)})
+
+    many = [records("many", 30) for _ in range(3)]
+    return board("seeds", [replace(many[0], records=tuple(m.first for m in many)), records("one", 30.4)])
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as one:
+        yield one
+        assert one.errors() == [], "nothing went wrong in any of the tests"
+
+
+@pytest.fixture(scope="module")
+def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The committed entries, a run with images, and boards made for the tests, as one page."""
+    out = tmp_path_factory.mktemp("page") / "page"
+    boards, refused = gather(COMMITTED, (finished / "out",))
+    made = [seeds_board(), hostile_board()]
+    write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
+    return out
+
+
+@pytest.fixture
+def page(shown: Page, folder: Path) -> Page:
+    address = (folder / "index.html").as_uri()
+    if not shown.value(f"location.href.startsWith({json.dumps(address)})"):
+        shown.show(address, "Boolean(document.body?.dataset.whole)", 1400, 900)
+    return shown
+
+
+def go(page: Page, state: str) -> None:
+    """Show a state and wait until all of it is drawn."""
+    page.value(f"location.hash = {json.dumps('#' + state)}")
+    settle(page)
+
+
+def settle(page: Page) -> None:
+    wait_for("the page", lambda: page.value("document.body.dataset.whole === location.hash"))
+
+
+def names(page: Page) -> list[str]:
+    return page.value("[...document.querySelectorAll('#table tbody tr')].map(r => r.dataset.row)")
+
+
+def column(page: Page, title: str) -> list[str]:
+    """The cells of the column whose header starts so."""
+    cells = f"[...document.querySelectorAll('#table thead th')].findIndex(h => h.innerText.startsWith({title!r}))"
+    return page.value(
+        f"[...document.querySelectorAll('#table tbody tr')].map(r => r.cells[{cells}].textContent.trim())"
+    )
+
+
+def choose(page: Page, name: str, value: str) -> None:
+    """Choose an option or fill a field as a person does: the change is told to the page."""
+    field = f"document.querySelector('[name={name}]')"
+    page.value(f"{field}.value = {json.dumps(value)}; {field}.dispatchEvent(new Event('change', {{bubbles: true}}))")
+    settle(page)
+
+
+def test_it_opens_from_the_disk_and_ranks_as_the_board_does(page: Page) -> None:
+    go(page, "t=outdoor-small")
+    rows = json.loads((COMMITTED / "leaderboard.json").read_text())["boards"][0]["rows"]
+    assert names(page) == [r["method"] for r in rows]
+    assert [float(v) for v in column(page, "PSNR, dB")] == [round(r["mean"]["psnr"], 2) for r in rows]
+    assert page.value("document.title") == "outdoor-small: Spike4DGS leaderboard"
+    assert column(page, "Rank")[0].startswith("= 1–2") and "spike4dgs" in column(page, "Rank")[0]
+    assert column(page, "PSNR, paper")[0] == "–", "the paper has no such method"
+
+
+def test_filters_count_what_they_hide_and_live_in_the_address(page: Page) -> None:
+    go(page, "t=outdoor-small")
+    choose(page, "motion", "hexplane")
+    assert page.value("location.hash") == "#t=outdoor-small&motion=hexplane"
+    assert "5 rows; 8 rows hidden by filters" in page.value("document.getElementById('count').textContent")
+    choose(page, "maxfit", "85")
+    assert "spike4dgs" not in names(page) and "tfi+4dgs" in names(page)
+    page.value("document.querySelector('#count button').click()")
+    settle(page)
+    assert page.value("location.hash") == "#t=outdoor-small" and len(names(page)) == 13
+
+
+def test_the_address_restores_everything(page: Page) -> None:
+    go(page, "t=outdoor-small&m=ssim&s=fit_seconds&d=desc&calibration=given&scenes=car-0-small,van-0-small")
+    assert page.value("document.querySelector('[name=m]').value") == "ssim"
+    assert page.value("document.querySelector('[name=calibration]').value") == "given"
+    fits = [float(v) for v in column(page, "fit")]
+    assert fits == sorted(fits, reverse=True)
+    chosen = "[...document.querySelectorAll('[name=scene]:checked')].map(c => c.value)"
+    assert page.value(chosen) == ["car-0-small", "van-0-small"]
+    record = json.loads(next(COMMITTED.glob("entries/1-outdoor-small@*/spike4dgs-x.json")).read_text())["record"]
+    mean = np.mean([record["scenes"][s]["metrics"]["ssim"] for s in ("car-0-small", "van-0-small")])
+    assert column(page, "SSIM")[names(page).index("spike4dgs-x")] == f"{mean:.4f}"
+
+
+def test_headers_sort_and_say_so(page: Page) -> None:
+    go(page, "t=outdoor-small")
+    header = "[...document.querySelectorAll('#table thead th')].find(h => h.innerText.startsWith('FLIP'))"
+    page.value(f"{header}.querySelector('button').click()")
+    settle(page)
+    assert page.value(f"{header}.getAttribute('aria-sort')") == "ascending", "lower is better comes first"
+    flip = [float(v) for v in column(page, "FLIP")]
+    assert flip == sorted(flip)
+    page.value(f"{header}.querySelector('button').click()")
+    settle(page)
+    assert [float(v) for v in column(page, "FLIP")] == sorted(flip, reverse=True)
+
+
+def test_a_row_that_lacks_a_scene_has_no_mean_until_the_scene_is_left_out(page: Page) -> None:
+    go(page, "t=hostile")
+    assert column(page, "PSNR, dB")[names(page).index("constructor")] == "–"
+    assert "incomplete: s failed" in page.value("document.getElementById('table').textContent")
+
+
+def better_of(page: Page, name: str, scenes: list[int]) -> Any:
+    """What the page's own bootstrap says of a board."""
+    found = page.value(
+        f"(() => {{ const {{page}} = Spike4DGS.app.current(); const b = page.boards.findIndex(b => b.id === {name!r});"
+        f"const s = Spike4DGS.ready(`scores-${{b}}-psnr`);"
+        f"const values = Spike4DGS.intervals.nested(s, {scenes});"
+        "return Spike4DGS.intervals.compare(values, true, page.bootstrap).better })()"
+    )
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", ["outdoor-small", "quick-start", "seeds"])
+def test_the_pages_intervals_are_pythons(page: Page, committed: list[Board], name: str) -> None:
+    go(page, f"t={name}")
+    compared = seeds_board() if name == "seeds" else find_board(committed, name)
+    values = list(image_scores(compared, "psnr").values.values())
+    scenes = list(range(len(compared.scenes)))
+    np.testing.assert_array_equal(better_of(page, name, scenes), compare(values, True).better)
+    some = scenes[:-1]
+    expected = compare([[method[s] for s in some] for method in values], True).better
+    np.testing.assert_array_equal(better_of(page, name, some), expected)
+
+
+def test_ranks_follow_the_chosen_scenes(page: Page) -> None:
+    go(page, "t=outdoor-small&scenes=car-0-small")
+    one = column(page, "Rank")
+    go(page, "t=outdoor-small&iv=fixed")
+    fixed = column(page, "Rank")
+    go(page, "t=outdoor-small")
+    assert fixed != column(page, "Rank") != one and fixed[0].startswith("1,"), "of these five scenes alone it is first"
+
+
+def image(page: Page, pane: str) -> np.ndarray:
+    """The pixels of a pane on the screen, gray."""
+    frame = f"document.querySelector('#{pane} .frame')"
+    page.value(f"{frame}.scrollIntoView({{block: 'center'}})")
+    loaded = "[...document.querySelectorAll('.frame img')].every(i => i.complete && i.naturalWidth)"
+    wait_for("images", lambda: page.value(loaded))
+    box = page.value(f"(() => {{ const b = {frame}.getBoundingClientRect(); return [b.x, b.y, b.width, b.height] }})()")
+    x, y, w, h = (round(v) for v in box)
+    return page.screenshot()[y : y + h, x : x + w].astype(float)
+
+
+def test_slider_scrubber_and_crop(page: Page, data: Path) -> None:
+    own = "t=pattern-0%2B1&a=out%2Ftfp%2B4dgs&b=out%2Frough&scene=pattern-1"
+    go(page, f"{own}&k=0&split=100")
+    a = image(page, "pane-images")
+    go(page, f"{own}&k=0&split=0")
+    b = image(page, "pane-images")
+    assert np.abs(a - b).mean() > 0.3
+    slider = "document.querySelector('[name=split]')"
+    page.value(f"{slider}.value = 50; {slider}.dispatchEvent(new Event('input'))")
+    mixed, w = image(page, "pane-images"), a.shape[1]
+    assert np.abs(mixed[:, : w // 2 - 6] - a[:, : w // 2 - 6]).mean() < 0.5, "A on the left"
+    assert np.abs(mixed[:, w // 2 + 6 :] - b[:, w // 2 + 6 :]).mean() < 0.5, "B on the right"
+    first = image(page, "pane-truth")
+    page.value("document.querySelector('[name=k]').focus()")
+    page.press("End")
+    wait_for("the last image", lambda: "image 3 of 3" in page.value("document.getElementById('at').textContent"))
+    assert np.abs(image(page, "pane-truth") - first).mean() > 1, "the pattern moves"
+    assert "3.00 ms" in page.value("document.getElementById('scene-scores').textContent")
+    assert "k=2" in page.value("location.hash")
+    page.value("document.querySelector('[name=crop]').click()")
+    settle(page)
+    assert "crop=1" in page.value("location.hash")
+    shape = image(page, "pane-truth").shape
+    assert shape[0] / shape[1] == pytest.approx(24 / 24, abs=0.05), "a crop of 24x24 of 40x24 pixels"
+
+
+def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
+    go(page, "t=outdoor-small&scene=van-0-small&a=tfp%2B4dgs&b=spike4dgs")
+    text = page.value("document.getElementById('scenes').textContent")
+    assert "--runs" in text and "tfp+4dgs" in text
+    assert page.value("document.querySelectorAll('.curves svg').length") == 1
+
+
+def test_plots_colour_families_and_gray_out_what_is_hidden(page: Page) -> None:
+    go(page, "t=outdoor-small&images=tfp")
+    plots = page.value("[...document.querySelectorAll('#plots figure svg')].map(s => s.getAttribute('aria-label'))")
+    assert plots == [f"PSNR against {c}" for c in ("fit, s", "images/s", "memory, MB", "model, MB")]
+    gray = "document.querySelector('#plots figure svg').querySelectorAll('g[fill=\"#999\"] circle').length"
+    assert page.value(gray) == 8
+    assert "22.23" in page.value("document.getElementById('plots').textContent"), (
+        "the floor is named, not left out silently"
+    )
+
+
+def download(page: Page, folder: Path, kind: str) -> str:
+    before = set(folder.iterdir())
+    page.value(f"document.querySelector('[data-kind={kind}]').click()")
+    done = wait_for("download", lambda: [p for p in set(folder.iterdir()) - before if p.suffix == f".{kind}"])
+    return wait_for("its text", done[0].read_text)
+
+
+def test_downloads_are_what_is_shown(page: Page, tmp_path: Path) -> None:
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    go(page, "t=outdoor-small&m=psnr_dynamic&motion=spacetime")
+    lines = [line.split(",") for line in download(page, tmp_path, "csv").splitlines()]
+    assert [line[lines[0].index("method")] for line in lines[1:]] == names(page)
+    value = float(lines[1][lines[0].index("psnr_dynamic")])
+    assert f"{value:.2f}" == column(page, "PSNR, moving")[0]
+    found = json.loads(download(page, tmp_path, "json"))
+    assert [r["method"] for r in found["rows"]] == names(page) and len(found["hidden_rows"]) == 10
+    assert found["view"] == page.value("location.hash")
+    tex = download(page, tmp_path, "tex")
+    assert tex.count("\\\\\n") == 1 + len(names(page)) and "10 rows hidden" in tex
+
+
+def test_nothing_that_an_entry_holds_runs(page: Page, tmp_path: Path) -> None:
+    go(page, "t=hostile")
+    assert HOSTILE in names(page)
+    page.value("document.querySelector('#table button.link').click()")
+    settle(page)
+    wait_for("details", lambda: page.value("document.getElementById('details').open"))
+    text = page.value("document.getElementById('details').textContent")
+    assert text.count(HOSTILE) >= 4 and "__proto__" in text
+    page.press("Escape")
+    wait_for("closed", lambda: not page.value("document.getElementById('details').open"))
+    settle(page)
+    assert page.value("window.hacked === undefined && ({}).polluted === undefined")
+    assert page.value("document.querySelectorAll('main img[src=x], main script').length") == 0
+    go(page, f"t=hostile&motion={HOSTILE.replace('<', '%3C').replace(' ', '%20')}")
+    assert page.value("window.hacked === undefined")
+
+
+def test_details_have_command_hashes_and_commit(page: Page) -> None:
+    go(page, "t=outdoor-small&row=tfp%2B4dgs")
+    wait_for("details", lambda: page.value("document.getElementById('details').open"))
+    text = page.value("document.getElementById('details').textContent")
+    entry = json.loads(next(COMMITTED.glob("entries/1-outdoor-small@*/tfp+4dgs.json")).read_text())["record"]
+    assert entry["command"] in text and entry["harness"]["commit"] in text and entry["environment"]["cpu"] in text
+    assert all(cell["predictions_sha256"] in text for cell in entry["scenes"].values())
+    go(page, "t=outdoor-small")
+    assert not page.value("document.getElementById('details').open")
+
+
+def test_a_question_is_answered_in_one_click(page: Page) -> None:
+    go(page, "t=quick-start")
+    link = "[...document.querySelectorAll('#questions a')].find(a => a.textContent.includes('noisy'))"
+    page.value(f"{link}.click()")
+    settle(page)
+    assert names(page) == ["tfp+d3dgs"] and "12 rows hidden" in page.value(
+        "document.getElementById('count').textContent"
+    )
+    assert "sensor is noisy" in page.value("document.getElementById('about').textContent")
+
+
+def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
+    go(page, "t=outdoor-small")
+    said = "e.labels?.length || e.tagName === 'BUTTON' && e.textContent.trim()"
+    labels = "e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')"
+    what = "input, select, button, [role=img], dialog, nav, section"
+    unnamed = f"[...document.querySelectorAll('{what}')].filter(e => !({said} || {labels})).map(e => e.outerHTML)"
+    assert page.value(unnamed) == []
+    page.value("document.getElementById('skip').focus()")
+    reached = set()
+    for _ in range(12):
+        page.press("Tab")
+        reached.add(
+            page.value("document.activeElement.closest('nav, form, main, body').id || document.activeElement.id")
+        )
+    assert {"questions", "tabs"} <= reached
+    for width in (390, 800, 1400):
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=False)
+        assert page.value("document.documentElement.scrollWidth") <= width, "only the table scrolls sideways"
+
+
+def test_a_thousand_rows_of_45_scenes_filter_at_once(
+    shown: Page, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the change of a filter to the laid out table, in the page's own clock."""
+    page = shown
+    write_site(tmp_path / "page", [large_board(ROWS, SCENES, 60)])
+    page.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
+    states = ["motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"]
+    times = page.call("Runtime.evaluate", expression=FILTER % states, awaitPromise=True, returnByValue=True)
+    measured = times["result"]["value"]
+    with capsys.disabled():
+        print(
+            f"\n{ROWS} rows x {SCENES} scenes, a filter: {', '.join(f'{t:.0f}' for t in measured)} ms to the new table"
+        )
+    count = page.value("document.getElementById('count').textContent")
+    assert count.startswith("167 rows, the first 100 drawn; 833 rows hidden"), (
+        "a third of the rows, every second of them"
+    )
+    assert min(measured) < 20 * FILTER_MS, "with a generous factor for busy machines"
+
+
+def test_a_screen_in_the_dark(page: Page) -> None:
+    go(page, "t=outdoor-small")
+    page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    page.value("scrollTo(0, 0)")
+    dark = page.screenshot()
+    page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+    light = page.screenshot()
+    assert np.median(dark) < 60 and np.median(light) > 200
+    assert cv2.Canny(dark, 50, 150).mean() > 0.5, "and something is on it"

@@ -1,0 +1,66 @@
+"""The page's images show what was scored, and crops hold what moves."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from spike4dgs.benchmark.reports.error_map import error_image
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard.page.pictures import SMALLEST, crops, write_pictures
+from spike4dgs.leaderboard.page.rows import gather
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path))
+
+
+def test_images_are_those_of_the_run(finished: Path, data: Path, tmp_path: Path) -> None:
+    (board,) = gather(tmp_path / "none", (finished / "out",))[0]
+    said, written = list[str](), set[Path]()
+    found = write_pictures(tmp_path, board, 0, data, written, said.append)
+    assert not said and {p for p in tmp_path.rglob("*.webp")} == written
+    assert found[0]["names"] == ["cam_03/000020", "cam_03/000040", "cam_03/000060"] and found[0]["ms"] == [1, 2, 3]
+    assert sorted(board.rows[i].name for i in found[0]["rows"]) == ["out/rough", "out/tfp+4dgs"]
+    scene = open_scene(data / "pattern-0")
+    truth = scene.ground_truth(scene.targets[1])
+    folder = tmp_path / found[0]["folder"]
+    np.testing.assert_array_equal(pixels(folder / "truth/1.webp")[..., 0], encode_srgb(truth))
+    number = next(i for i, r in enumerate(board.rows) if r.name == "out/rough")
+    image = read_exr(finished / "out/predictions/rough/pattern-0/cam_03/000040.exr")
+    np.testing.assert_array_equal(pixels(folder / f"{number}/1.webp")[..., 1], encode_srgb(image))
+    np.testing.assert_array_equal(pixels(folder / f"{number}/1-error.webp"), error_image(image, truth))
+
+
+def test_what_cannot_be_shown_is_said(finished: Path, data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished / "out", run)
+    image = run / "predictions/rough/pattern-0/cam_03/000040.exr"
+    image.write_bytes(image.read_bytes() + b"x")
+    (tmp_path / "some").mkdir()
+    (tmp_path / "some/pattern-0").symlink_to((data / "pattern-0").resolve())
+    (board,) = gather(tmp_path / "none", (run,))[0]
+    said = list[str]()
+    found = write_pictures(tmp_path / "out", board, 0, tmp_path / "some", set(), said.append)
+    assert [board.rows[i].name for i in found[0]["rows"]] == ["run/tfp+4dgs"] and found[1] is None
+    assert any("run/rough on pattern-0" in line and "sha256" in line for line in said)
+    assert any("no images of pattern-1" in line for line in said)
+
+
+def test_crops_hold_what_moves_and_have_one_size() -> None:
+    masks = [np.zeros((60, 90), bool) for _ in range(3)]
+    masks[0][5:15, 0:30] = masks[1][30:60, 70:80] = True
+    found = crops(masks)
+    assert found[2] is None
+    for mask, box in zip(masks[:2], found[:2], strict=True):
+        assert box is not None
+        x, y, w, h = box
+        assert mask[y : y + h, x : x + w].sum() == mask.sum() and x >= 0 and y >= 0 and x + w <= 90 and y + h <= 60
+        assert (w, h) == (39, 39)
+    small = np.zeros((60, 90), bool)
+    small[10, 10] = True
+    assert crops([small])[0] == (0, 0, SMALLEST, SMALLEST)

@@ -1,0 +1,53 @@
+"""The rows come from entries and runs, and a run that equals an entry is not a second row."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from submissions import enter, release_of
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.leaderboard.page.rows import OWN, Board, find_board, gather, titles
+from spike4dgs.leaderboard.tracks import ARCHIVE, PUBLIC
+
+COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
+
+
+def test_the_committed_entries_are_all_there(committed: list[Board]) -> None:
+    boards = committed
+    for folder, name in ((PUBLIC, "entries"), (ARCHIVE, "archive")):
+        rows = [r for b in boards if b.folder == folder for r in b.rows]
+        assert {path for r in rows for path in r.entries} == {
+            p.relative_to(COMMITTED).as_posix() for p in (COMMITTED / name).glob("*/*.json")
+        }
+    assert not any(r.ranked for b in boards if b.folder == ARCHIVE for r in b.rows)
+    assert len(set(titles(boards))) == len(boards)
+
+
+def test_a_run_alone_makes_a_board_of_its_own(finished: Path, tmp_path: Path) -> None:
+    (board,) = [b for b in gather(tmp_path / "none", (finished / "out",))[0] if b.rows]
+    assert board.scenes == ["pattern-0", "pattern-1"] and "no track" in board.why
+    rows = {r.name: r for r in board.rows}
+    assert {r.label for r in board.rows} == {OWN}
+    assert rows["out/tfp+4dgs"].ranked and set(rows["out/tfp+4dgs"].predictions) == set(board.scenes)
+    assert not rows["out/bad"].ranked and rows["out/bad"].why == "pattern-0 failed, pattern-1 failed"
+
+
+def test_a_run_lends_its_images_to_the_entry_that_it_became(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    release_of(done, monkeypatch)
+    enter(done)
+    boards, _ = gather(done / "board", (done / "out",))
+    rows = {r.name: r for r in find_board(boards, "patterns").rows}
+    assert sorted(rows) == ["out/bad", "out/rough", "tfp+4dgs"]
+    assert rows["tfp+4dgs"].label == "re-scored" and set(rows["tfp+4dgs"].predictions) == {"pattern-0", "pattern-1"}
+
+
+def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="results/"):
+        gather(tmp_path / "none", (tmp_path,))
+
+
+def test_an_unknown_track_is_refused(committed: list[Board]) -> None:
+    with pytest.raises(UserError, match="outdoor-small"):
+        find_board(committed, "indoor")

@@ -1,0 +1,34 @@
+"""The ranking in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from spike4dgs.benchmark.cli import main
+
+COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
+
+
+def test_the_ranking_has_intervals_ties_and_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["leaderboard", "--track", "outdoor-small", "--leaderboard", str(COMMITTED)]) == 0
+    out = capsys.readouterr().out
+    lines = [line.split() for line in out.splitlines()]
+    (first,) = (line for line in lines if "spike4dgs-x" in line[:2])
+    assert first[:3] == ["1-2", "spike4dgs-x", "39.87"], "not told apart from spike4dgs on five scenes"
+    (last,) = (line for line in lines if "dy-spikenerf" in line[:2])
+    assert last[:3] == ["13", "dy-spikenerf", "22.23"]
+
+
+def test_own_runs_stand_beside_and_failures_have_a_reason(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["leaderboard", "--leaderboard", str(tmp_path / "none"), "--runs", str(finished / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out
+
+
+def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["leaderboard", "--metric", "nothing", "--leaderboard", str(COMMITTED)]) == 2
+    assert "psnr_dynamic" in capsys.readouterr().err

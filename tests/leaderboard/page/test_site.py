@@ -1,0 +1,64 @@
+"""The files of the page: complete, small, the same each time, and of pinned libraries."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from page_boards import board, cell, row
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.leaderboard.page import site
+from spike4dgs.leaderboard.page.site import FIRST_VIEW_BYTES, script, write_site
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def small() -> list[site.Board]:
+    return [board("b", [row(n, {"s": cell({"psnr": np.arange(3) + i})}) for i, n in enumerate(("one", "two"))])]
+
+
+def test_the_committed_entries_fit_the_first_view(committed: list[site.Board], tmp_path: Path) -> None:
+    written = write_site(tmp_path / "page", committed)
+    assert written.first_view_bytes < FIRST_VIEW_BYTES and not written.left_out
+    html = (tmp_path / "page/index.html").read_text()
+    linked = re.findall(r'(?:src|href)="([^"#]+)"', html)
+    assert all((tmp_path / "page" / name).is_file() for name in linked if not name.startswith("data:,"))
+    assert not re.search(r"https?:", html.replace("http-equiv", ""))
+
+
+def test_a_page_is_replaced_and_equal_boards_give_equal_bytes(tmp_path: Path) -> None:
+    out = tmp_path / "page"
+    write_site(out, [*small(), *small()])
+    write_site(out, small())
+    write_site(tmp_path / "again", small())
+    assert files(out) == files(tmp_path / "again")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/mine.txt").touch()
+    with pytest.raises(UserError, match="an earlier page"):
+        write_site(tmp_path / "other", small())
+
+
+def test_data_are_strings_of_a_script() -> None:
+    value = {"__proto__": "</script><script>alert(1)</script>\u2028", "a": [1.5, None]}
+    text = script("boards", value)
+    found = re.fullmatch(r"Spike4DGS\.receive\((\".*?\"), (\".*\")\);\n", text)
+    assert found and json.loads(found[1]) == "boards" and json.loads(json.loads(found[2])) == value
+    assert "\u2028" not in text
+
+
+def test_a_changed_library_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vendor = tmp_path / "vendor"
+    vendor.mkdir()
+    for path in (site.STATIC / "vendor").iterdir():
+        (vendor / path.name).write_bytes(path.read_bytes() + (b" " if path.name == "d3.min.js" else b""))
+    monkeypatch.setattr(site, "STATIC", tmp_path)
+    with pytest.raises(UserError, match="d3.min.js: expected sha256 912111098ea99503"):
+        write_site(tmp_path / "page", small())
+    listed = {line.partition("  ")[2] for line in (vendor / "SHA256SUMS").read_text().splitlines()}
+    assert listed == {p.name for p in vendor.iterdir()} - {"SHA256SUMS"}
