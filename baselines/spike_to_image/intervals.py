@@ -57,8 +57,8 @@ def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None 
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
     in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, s.half, changing, rate, spans)
-    rate, spans = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
-    return (rate[::-1], spans[:, ::-1]) if stream.rows_bottom_up else (rate, spans)
+    rates, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
+    return (rates[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (rates, ends)
 
 
 @kernel
