@@ -58,13 +58,17 @@ def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDAr
 def adaptive_image(stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None) -> Float32:
     """Return spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window."""
     s = settings or AdaptiveSettings()
+    image = rates(stream, tick, s, shared_levels(stream, tick, s)).reshape(stream.height, stream.width)
+    return image[::-1] if stream.rows_bottom_up else image
+
+
+def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8) -> Float32:
+    """Return spikes per tick [H * W] over the windows of `shared_levels`, in the stored order of pixels."""
     spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
-    pixels = stream.height * stream.width
-    shared, image = shared_levels(stream, tick, s), np.empty(pixels, np.float32)
-    arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, shared, image)
-    in_threads(_estimate, pixels, *arguments, small=pixels < 1 << 12)
-    upright = image.reshape(stream.height, stream.width)
-    return upright[::-1] if stream.rows_bottom_up else upright
+    image = np.empty(len(levels), np.float32)
+    arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, levels, image)
+    in_threads(_estimate, len(levels), *arguments, small=len(levels) < 1 << 12)
+    return image
 
 
 def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings) -> UInt8:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.adaptive import (
     AdaptiveSettings,
-    adaptive_image,
     half_windows,
+    rates,
     shared_levels,
 )
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
@@ -51,14 +51,13 @@ def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None 
     """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module."""
     s = settings or IntervalSettings()
     spikes, pixels = spike_times(stream), stream.height * stream.width
-    image = adaptive_image(stream, tick, s)
-    rate = (image[::-1] if stream.rows_bottom_up else image).reshape(-1).copy()
-    changing = half_windows(stream.n_ticks, s)[shared_levels(stream, tick, s)] < s.half
+    levels = shared_levels(stream, tick, s)
+    rate, changing = rates(stream, tick, s, levels), half_windows(stream.n_ticks, s)[levels] < s.half
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
     in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, s.half, changing, rate, spans)
-    rates, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
-    return (rates[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (rates, ends)
+    image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
+    return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
 
 
 @kernel

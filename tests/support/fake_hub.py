@@ -3,36 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import ThreadingHTTPServer
+from contextlib import AbstractContextManager
 from pathlib import Path
-from threading import Thread
 from typing import Any
 from urllib.parse import unquote
 
-from range_server import Behaviour, Handler
+from range_server import Behaviour, Handler, serve
 
 REPOSITORY = "owner/name"
 _FILES, _TREE = "/resolve/main/", f"/api/datasets/{REPOSITORY}/tree/main"
 
 
-@contextmanager
-def serve_hub(root: Path) -> Iterator[tuple[str, Behaviour]]:
-    """Serve the folder as the repository REPOSITORY; yield the endpoint and the behaviour with its requests."""
-    seen = Behaviour()
-
-    class Hub(_Hub):
-        folder, behaviour = root, seen
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Hub)
-    server.daemon_threads = True
-    Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}", seen
-    finally:
-        server.shutdown()
-        server.server_close()
+def serve_hub(root: Path) -> AbstractContextManager[tuple[str, Behaviour]]:
+    """Serve the folder as the repository REPOSITORY; give the endpoint and the behaviour with its requests."""
+    return serve(root, handler=_Hub)
 
 
 class _Hub(Handler):

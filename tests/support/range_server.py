@@ -35,11 +35,13 @@ class Behaviour:
 
 
 @contextmanager
-def serve(root: Path, behaviour: Behaviour | None = None) -> Iterator[tuple[str, Behaviour]]:
+def serve(
+    root: Path, behaviour: Behaviour | None = None, handler: type[Handler] | None = None
+) -> Iterator[tuple[str, Behaviour]]:
     """Serve a folder on a free port of this machine; yield its address and the behaviour, which may be changed."""
-    chosen = behaviour or Behaviour()
+    chosen, kind = behaviour or Behaviour(), handler or Handler
 
-    class OfThisFolder(Handler):
+    class OfThisFolder(kind):  # type: ignore[misc, valid-type]
         folder, behaviour = root, chosen
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), OfThisFolder)
