@@ -124,9 +124,9 @@ _FAST: dict[str, Any] = {
 }
 
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
-# and where light changes the mean over a known span, which the render is a mean over too; corrected by the cameras'
-# calibration; what does not move is fitted first and becomes a background; what moves follows paths of its own. The
-# rows before it have a part of that each: the calibration alone, then the windows too.
+# and where light changes the mean over a known span, which the fit's own model makes an instant; corrected by the
+# cameras' calibration; what does not move is fitted first and becomes a background; what moves follows paths of its
+# own. The rows before it have a part of that each: the calibration alone, then the windows too.
 BEYOND = (
     Recipe("tfp+rig-flat+stg", "tfp", "rig", "spacetime", "pixel", _FLAT),
     Recipe("tfp+rig-flat+4dgs", "tfp", "rig", "hexplane", "pixel", _FLAT),
@@ -136,7 +136,7 @@ BEYOND = (
         "intervals",
         "rig",
         "paths",
-        "exposure",
+        "pixel",
         {
             **_FLAT,
             **_FAST,

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -21,6 +22,8 @@ from spike4dgs.method.observations.training_images import Spans, TrainingImages
 from spike4dgs.method.observations.unmeasured import bad_pixels, missing_images
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
+
+Half = NDArray[np.float16]
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,13 @@ class TunableImageMaker(ImageMaker, Protocol):
 class SpannedImageMaker(ImageMaker, Protocol):
     """An image maker whose values may be means over known spans of time."""
 
-    def measured_over(self, stream: SpikeStream, ticks: Sequence[int]) -> Float32 | None:
-        """Return the first and the last instant of each pixel's span, [n, 2, H, W] in ticks from each of `ticks`."""
+    def with_spans(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> tuple[Float32, Float32 | None]:
+        """Return the images, and the first and last instant of each pixel's span: [n, 2, H, W] in ticks from `ticks`.
+
+        None: the images show instants.
+        """
         ...
 
 
@@ -98,29 +106,15 @@ def make_training_images(
     scene: TrainingScene, cameras: Sequence[Camera], make: ImageMaker, settings: ImageSettings, device: str
 ) -> TrainingImages:
     """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
-    ticks, made = make_images(scene, make, settings, device)
-    spans = make_spans(scene, make, ticks, device)
+    ticks, made, measured = _make(scene, make, settings, device)
     images = torch.from_numpy(undistorted(scene, made)).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
+    spans = None if measured is None else _spans(scene, measured, device)
     return TrainingImages(
         Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, spans
     )
-
-
-def make_spans(scene: TrainingScene, make: ImageMaker, ticks: Sequence[int], device: str) -> Spans | None:
-    """Return the spans of time that the training images [T, C] are means over; None where they show instants."""
-    if not isinstance(make, SpannedImageMaker):
-        return None
-    own = [local_ticks(scene.state(c.id).clock, ticks, scene.n_ticks)[0] for c in scene.cameras]
-    found = [make.measured_over(s, t) for s, t in zip(scene.streams, own, strict=True)]
-    measured = [f.astype(np.float16) for f in found if f is not None]
-    if not measured:
-        return None
-    ends = np.stack(nearest_pixels(scene, measured), axis=1)
-    half = float(np.median((ends[:, :, 1] - ends[:, :, 0]).astype(np.float32))) / 2
-    return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
 
 
 def make_images(
@@ -130,16 +124,40 @@ def make_images(
 
     Ticks are the array's. A camera's image is made at its own tick then, or at the end of its clip nearest to it.
     """
+    return _make(scene, make, settings, device)[:2]
+
+
+def _make(
+    scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
+) -> tuple[tuple[int, ...], Float32, list[Half] | None]:
+    """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
     make = on_device(make, device)
-    ticks = choose_ticks(scene.n_ticks, settings)
-    gain, calibrations = scene.radiance_gain, scene.calibrations if settings.flat_field else None
-    own = [local_ticks(scene.state(c.id).clock, ticks, scene.n_ticks)[0] for c in scene.cameras]
-    if calibrations:
-        made = [make(s, t, gain, camera) for s, t, camera in zip(scene.streams, own, calibrations, strict=True)]
-    else:
-        gains = [gain * scene.state(camera.id).gain for camera in scene.cameras]
-        made = [make(s, t, g) for s, t, g in zip(scene.streams, own, gains, strict=True)]
-    return ticks, np.stack(made, axis=1)
+    ticks, images, spans = choose_ticks(scene.n_ticks, settings), [], []
+    for camera, stream in zip(scene.cameras, scene.streams, strict=True):  # one by one: a stream's spikes are kept
+        state = scene.state(camera.id)
+        own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
+        calibration = scene.calibrations[len(images)] if settings.flat_field and scene.calibrations else None
+        gain = scene.radiance_gain * (1.0 if calibration else state.gain)
+        image, over = _with_spans(make, stream, own, gain, calibration)
+        images.append(image)
+        if over is not None:
+            spans.append(over.astype(np.float16))
+    return ticks, np.stack(images, axis=1), spans or None
+
+
+def _with_spans(
+    make: ImageMaker, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None
+) -> tuple[Float32, Float32 | None]:
+    if isinstance(make, SpannedImageMaker):
+        return make.with_spans(stream, ticks, gain, camera)
+    return make(stream, ticks, gain, *((camera,) if camera else ())), None
+
+
+def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:
+    """Return the spans of time that the training images [T, C] are means over."""
+    ends = np.stack(nearest_pixels(scene, measured), axis=1)
+    half = float(np.median((ends[:, :, 1] - ends[:, :, 0]).astype(np.float32))) / 2
+    return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
 
 
 def as_measured(scene: TrainingScene, ticks: Sequence[int], images: Float32) -> Float32:

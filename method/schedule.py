@@ -12,6 +12,8 @@ from spike4dgs.method.trainer_settings import TrainerSettings
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
 
+RENEWED = (0.3, 0.5, 0.7, 0.85)  # shares of a deforming stage: first when it sees its whole span
+
 Interval = tuple[float, float]  # of the clip, which is [0, 1]
 
 
@@ -30,6 +32,11 @@ class Stage:
     def fraction(self, step: int) -> float:
         """Return the position of a step within the stage, in [0, 1)."""
         return (step - self.first) / self.steps
+
+    @property
+    def renewals(self) -> tuple[int, ...]:
+        """At which of the stage's steps means over time are corrected anew; nothing moves in a static one."""
+        return tuple(round(share * self.steps) for share in RENEWED if self.deforms)
 
     def within(self, t: float) -> float:
         """Return a time of the clip as a time of the stage's span, which is [0, 1]."""

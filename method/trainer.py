@@ -7,6 +7,7 @@ and a fit that resumes from a checkpoint gives the bits of one that never stoppe
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -26,6 +27,7 @@ from spike4dgs.method.gaussians.optimizer import (
 )
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 from spike4dgs.method.motion.base import Motion
+from spike4dgs.method.observations.instants import Corrections, RenderViews
 from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.pose_refinement import Poses
@@ -64,6 +66,8 @@ class Trainer:
         self.ended: dict[int, Gaussians] = {}  # the pieces of the clip that are fitted
         self.background = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # none yet; frozen
         self.projected: Background | None = None
+        self.snapshot: Gaussians | None = None  # the model that corrects means over time
+        self.corrections: Corrections | None = None
         self.poses = Poses(images.views, scale)
         self._begin(self.plan[0])
 
@@ -75,6 +79,7 @@ class Trainer:
     def _begin(self, stage: Stage) -> None:
         """Start a stage as 4DGS does: a fresh optimiser, and nothing gathered for densification."""
         s = self.settings
+        self.snapshot = self.corrections = None
         own = {**self.supervision.groups(), **(self.motion.groups() if stage.deforms else {})}
         if s.refine_poses:
             own["poses"] = [self.poses.xi], Decay(s.lr_poses, s.lr_poses_last)
@@ -129,24 +134,26 @@ class Trainer:
             views = order[: self.settings.views_per_step].sort().values
         tick = training.ticks[index]
         images = training.measured(index)[views]
-        spans = None if training.spans is None else training.spans.at(index).at(views)
-        return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step, spans)
+        if self.corrections:
+            images = images + self.corrections.at(index, views.tolist())
+        return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step)
 
     def train_step(self) -> Tensor:
         """Take one step; return the loss."""
-        stage, sample = self.stage, self.sample()
+        stage = self.stage
         if self.step == stage.first and self.step:
             self._continue(stage)
             self._begin(stage)
+        if self.step - stage.first in stage.renewals:
+            self._correct_by(self.gaussians.detached())
+        sample = self.sample()
         chosen = list(sample.views)
         views = self.poses.views(chosen) if self.settings.refine_poses else self._views(chosen)
         outputs: list[RenderOutput] = []
 
         def render_at(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
-            if outputs and not stage.deforms:  # at rest, one time is as good as another
-                return outputs[-1].image[..., 0]
-            outputs.append(self.projected.render(splats, chosen) if self.projected else self._render(splats, views))
+            outputs.append(self._image(splats, chosen, views))
             image = outputs[-1].image
             return self.motion.image(image, views) if stage.deforms else image[..., 0]
 
@@ -161,12 +168,34 @@ class Trainer:
         self._adapt_density(stage)
         return loss.detach()
 
-    def _render(self, splats: Splats, views: Views) -> RenderOutput:
+    def _correct_by(self, snapshot: Gaussians) -> None:
+        """Correct values that are means over spans of time by a snapshot of the stage's model from now on."""
+        stage, training = self.stage, self.training_images
+        learns = any(
+            True for _ in self.motion.parameters()
+        )  # it would go on while the snapshot's Gaussians stand still
+        if training.spans is None or not self.settings.correct_spans or learns:
+            return
+
+        def around(index: int) -> RenderViews:
+            def render_views(ticks: float, chosen: Sequence[int]) -> Tensor:
+                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), self._views(chosen)
+                return self.motion.image(self._image(self.motion.splats(snapshot, t), chosen, views).image, views)
+
+            return render_views
+
+        self.snapshot, self.corrections = snapshot, Corrections(training.spans, around)
+
+    def _image(self, splats: Splats, chosen: Sequence[int], views: Views) -> RenderOutput:
+        """Render into the chosen views, over the background where there is one."""
+        if self.projected:
+            return self.projected.render(splats, chosen)
         s = self.settings
         return render(splats, views, eps2d=s.filter_variance, antialiased=s.filter_compensated)
 
-    def _views(self, chosen: list[int]) -> Views:
-        return Views(self.training_images.views.w2c[chosen], self.training_images.views.K[chosen], *self._size())
+    def _views(self, chosen: Sequence[int]) -> Views:
+        all_views, rows = self.training_images.views, list(chosen)
+        return Views(all_views.w2c[rows], all_views.K[rows], *self._size())
 
     def _size(self) -> tuple[int, int]:
         return self.training_images.views.width, self.training_images.views.height
@@ -212,6 +241,7 @@ class Trainer:
         parts = {
             "gaussians": self.gaussians.tensors(),
             "background": self.background.tensors(),
+            "snapshot": self.snapshot.tensors() if self.snapshot else {},
             **{f"piece{i}": g.tensors() for i, g in self.ended.items()},
             "motion": self.motion.state_dict(),
             "supervision": self.supervision.state_dict(),
@@ -239,5 +269,7 @@ class Trainer:
         # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.
         stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
         self._begin(stage)
+        if snapshot := saved.part("snapshot"):
+            self._correct_by(Gaussians.from_tensors({k: v.to(device) for k, v in snapshot.items()}))
         import_state(self.adam, saved.part("adam"))
         self.statistics = GradientStatistics(on["statistics"]["gradient"], on["statistics"]["seen"])

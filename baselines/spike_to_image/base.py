@@ -63,7 +63,7 @@ class ImageMaker:
     settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
-    spans: Callable[[SpikeStream, int, Any], Float32] | None = None  # of a mean over time, [2, H, W]; None: an instant
+    rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
 
     def with_settings(self, settings: Settings) -> ImageMaker:
@@ -86,12 +86,29 @@ class ImageMaker:
         """
         images = np.empty((len(ticks), stream.height, stream.width), np.float32)
         for image, tick in zip(images, ticks, strict=True):
-            if not 0 <= tick < stream.n_ticks:
-                raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")
+            _require_tick(stream, tick)
             if self.corrected and camera:
                 image[:] = self.corrected(stream, tick, camera)
             else:
                 image[:] = self.rate(stream, tick, self.settings)
+        return self._radiance(images, gain, camera)
+
+    def with_spans(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> tuple[Float32, Float32 | None]:
+        """Return the images, and the span that each value is a mean over: [n, 2, H, W] in ticks from each of `ticks`.
+
+        None: the images show instants.
+        """
+        if self.rate_over is None:
+            return self(stream, ticks, gain, camera), None
+        for tick in ticks:
+            _require_tick(stream, tick)
+        found = [self.rate_over(stream, tick, self.settings) for tick in ticks]
+        return self._radiance(np.stack([rate for rate, _ in found]), gain, camera), np.stack([s for _, s in found])
+
+    def _radiance(self, images: Float32, gain: float, camera: Calibration | None) -> Float32:
+        """Return radiance from rates [n, H, W], which may be overwritten."""
         if camera is None:
             images /= gain
             return images
@@ -99,11 +116,7 @@ class ImageMaker:
         found[:, ~(camera.gain > 0)] = np.nan
         return found
 
-    def measured_over(self, stream: SpikeStream, ticks: Sequence[int]) -> Float32 | None:
-        """Return the span that each pixel's value is a mean over, [n, 2, H, W] in ticks from each of `ticks`.
 
-        None: the images show instants.
-        """
-        if self.spans is None:
-            return None
-        return np.stack([self.spans(stream, tick, self.settings) for tick in ticks])
+def _require_tick(stream: SpikeStream, tick: int) -> None:
+    if not 0 <= tick < stream.n_ticks:
+        raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")

@@ -42,11 +42,6 @@ def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | 
     return intervals(stream, tick, settings)[0]
 
 
-def interval_spans(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
-    """Return the spans [2, H, W] of `interval_image`: first and last instant in ticks, from `tick`."""
-    return intervals(stream, tick, settings)[1]
-
-
 def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> tuple[Float32, Float32]:
     """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module."""
     s = settings or IntervalSettings()
@@ -99,6 +94,6 @@ INTERVALS = ImageMaker(
     "changes, with its span of time; elsewhere as adaptive",
     source="this project",
     rate=interval_image,
-    spans=interval_spans,
+    rate_over=intervals,
     settings=IntervalSettings(),
 )

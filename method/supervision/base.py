@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
-from spike4dgs.method.observations.training_images import Spans, known
+from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.ssim import ssim
 
@@ -24,7 +24,6 @@ class Sample:
     views: tuple[int, ...]  # indices into the scene's training cameras
     images: Tensor  # [V, H, W] made from the spikes around the tick, 1.0 = white
     step: int  # of the fit: seeds what is random in a loss
-    spans: Spans | None = None  # of [V], that the images are means over; None: they show instants
 
 
 Render = Callable[[float], Tensor]  # t in [0, 1] -> the sample's views at that time, [V, H, W]

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
-from spike4dgs.method.supervision.exposure import Exposure
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.supervision.spike import SpikeRate, SpikeSettings
 from spike4dgs.method.supervision.spike_render import SpikeRender
@@ -64,7 +63,6 @@ class Synergy(Sum):
 
 SUPERVISIONS: dict[str, type[Supervision]] = {
     "pixel": Pixel,
-    "exposure": Exposure,
     "spike": SpikeRate,
     "spike-render": SpikeRender,
     "pixel+spike": PixelAndSpike,

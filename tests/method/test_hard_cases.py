@@ -20,6 +20,7 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images import ImageSettings, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.splat import render
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
@@ -95,7 +96,7 @@ CASES = [
     "one tick", "100,000 ticks", "NaN gain", "NaN dark rate", "dead pixels",
 ]  # fmt: skip
 FITS = [
-    ("intervals", "paths", "exposure", {"freeze_background": True}, {}),
+    ("intervals", "paths", "pixel", {"freeze_background": True}, {}),
     ("tfp", "hexplane", "spss", {}, {}),
     ("tfi", "spacetime", "pixel+spike", {}, {}),
     ("tfp", "static", "spike", {}, {"spike_ticks": 1}),
@@ -126,4 +127,4 @@ def test_losses_gradients_and_parameters_are_numbers(name, images, motion, super
     with torch.no_grad():
         fit.run(silent)
         for t in (0.0, 1.0):
-            assert fit._render(model.splats(fit.gaussians, t), training_images.views).image.isfinite().all()
+            assert render(model.splats(fit.gaussians, t), training_images.views).image.isfinite().all()

@@ -14,9 +14,12 @@ from spike4dgs.method.gaussians.density import DensitySettings, GradientStatisti
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.observations.instants import correction, node
 from spike4dgs.method.observations.lookup import variation_at
+from spike4dgs.method.observations.training_images import Spans, TrainingImages
 from spike4dgs.method.schedule import choose_time, stages
 from spike4dgs.method.settings import make_settings, override
+from spike4dgs.method.splat import render
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
@@ -44,7 +47,9 @@ def test_deformation_beats_a_static_scene_where_things_move():
     assert WORLD.psnr(fitted("hexplane"), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
 
 
-def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", **settings: Any) -> Trainer:
+def trainer(
+    steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", spans: Any = None, **settings: Any
+) -> Trainer:
     scene = WORLD.training
     s = TrainerSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, views_per_step=3, **settings)
     start = surfaces(scene, 0)
@@ -53,6 +58,8 @@ def trainer(steps: int = 12, motion: str = "hexplane", supervision: str = "pixel
     sizes = {"mlp_width": 16} if motion == "hexplane" else {}
     model = MOTIONS[motion](extent, replace(MOTIONS[motion].defaults, **sizes), seeded(0, -1))
     training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
+    if spans is not None:
+        training_images = replace(training_images, spans=spans(training_images))
     loss = SUPERVISIONS[supervision](SUPERVISIONS[supervision].defaults, scene)
     gaussians, density = model.attach(first, training_images), DensitySettings(every=2)
     return Trainer(training_images, gaussians, model, loss, s, density, scale=extent.scale, seed=3)
@@ -90,6 +97,44 @@ def test_paths_lay_nothing_down_where_the_background_is_not_rendered() -> None:
     assert (fit.gaussians.extra["times"].detach() - 0.5).abs().max() < 0.1
 
 
+def wide_spans(images: TrainingImages) -> Spans:
+    """Spans of 160 ticks, in which the board moves by pixels; another length at each pixel."""
+    times, views, height, width = images.images.shape
+    lengths = 60 + 40 * torch.rand(times, views, height, width, generator=seeded(5, 0))
+    return Spans(torch.stack([-lengths, lengths], 2).half(), 80.0, images.n_ticks)
+
+
+def test_means_over_time_are_corrected_by_snapshots_of_the_stage() -> None:
+    """From 30 % of the deforming stage on the fit compares with instants; the static stage with what was measured."""
+    fit, seen = trainer(40, motion="paths", spans=wide_spans), []
+    loss = fit.supervision.forward
+    fit.supervision.forward = lambda render, sample: (seen.append(sample), loss(render, sample))[1]
+    while fit.step < fit.total:
+        fit.train_step()
+    first = fit.plan[1].first + fit.plan[1].renewals[0]
+    for sample in seen:
+        measured = fit.training_images.measured(fit.training_images.ticks.index(sample.tick))[list(sample.views)]
+        assert torch.equal(sample.images, measured) == (sample.step < first), sample.step
+    tick, views = seen[-1].tick, seen[-1].views
+    index = fit.training_images.ticks.index(tick)
+    assert fit.corrections is not None and fit.snapshot is not None
+    spans, far = fit.training_images.spans.at(index).at(torch.tensor(views)), node(80.0)
+
+    def light(ticks: float) -> torch.Tensor:
+        splats = fit.motion.splats(fit.snapshot, (tick + ticks) / fit.training_images.n_ticks)
+        return render(splats, fit._views(views)).image[..., 0]
+
+    expected = correction(light(-far), light(0.0), light(far), spans)
+    torch.testing.assert_close(fit.corrections.at(index, views), expected, atol=1e-3, rtol=0)
+    assert expected.abs().max() > 0.01, "things move"
+
+
+def test_a_motion_with_a_network_corrects_nothing() -> None:
+    fit = trainer(12, motion="hexplane", spans=wide_spans)
+    fit.run(silent)
+    assert fit.corrections is None
+
+
 class Killed(Exception):
     pass
 
@@ -103,6 +148,7 @@ PARTS_WITH_STATE = {
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
     "paths": {"motion": "paths", "freeze_background": True, "steps": 24},  # a background from step 8 on
+    "spans": {"motion": "paths", "freeze_background": True, "steps": 24, "spans": wide_spans},  # corrected from 13 on
 }
 
 
@@ -182,7 +228,7 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
         ({"images": "none"}, "expected images among short, found 'none'"),
         ({"initialization": "colmap"}, "initialization among true"),
         ({"motion": "wobble"}, "motion among hexplane, paths, spacetime, spacetime-lite, static"),
-        ({"supervision": "spikes"}, r"supervision among exposure, pixel, pixel\+spike, spike"),
+        ({"supervision": "spikes"}, r"supervision among pixel, pixel\+spike, spike"),
     ],
 )
 def test_unknown_part_is_named(change, message):

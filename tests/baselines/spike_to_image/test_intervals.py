@@ -106,11 +106,11 @@ def test_a_longer_span_is_more_precise():
 def test_the_maker_gives_images_and_spans():
     spikes = fire(sweeping(80, 12, 16, 0.2), np.random.default_rng(1).random((12, 16)))
     maker, stream = IMAGES["intervals"], stream_of(spikes)
-    images, spans = maker(stream, [20, 40], 0.5), maker.measured_over(stream, [20, 40])
+    images, spans = maker.with_spans(stream, [20, 40], 0.5)
     rate, span = intervals(stream, 40)
     np.testing.assert_allclose(images[1], rate / 0.5, rtol=1e-6)
     np.testing.assert_array_equal(spans[1], span)
-    assert IMAGES["adaptive"].measured_over(stream, [20]) is None, "an instant"
+    assert IMAGES["adaptive"].with_spans(stream, [20], 0.5)[1] is None, "an instant"
 
 
 def test_its_windows_are_those_of_adaptive():

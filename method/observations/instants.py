@@ -1,0 +1,60 @@
+"""Images of instants from means over spans of time, by the model that is being fitted.
+
+A value that is a mean over a span [a, b] around its instant is compared with the model at that instant, once what the
+model says of the difference is added to it:
+
+    value + (model(0) - mean of model over [a, b]).
+
+Where that holds for a model, its mean over the span is what was measured. So the fit has the same optimum as one that
+renders the whole span at each step, at the cost of one render. The model that corrects is a snapshot, taken anew a few
+times in a fit; repeated, this is van Cittert's deconvolution (1931), which starts from what was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from spike4dgs.method.observations.training_images import Spans
+
+REACH = 2.0  # half spans from the instant, beyond which no span is followed
+
+RenderViews = Callable[[float, Sequence[int]], Tensor]  # ticks from the instant, views -> [V, H, W], no gradient
+
+
+def node(half: float) -> float:
+    """Return the outer node, in ticks, of three-point Gauss-Legendre over [-half, half]; the inner one is 0."""
+    return half * math.sqrt(0.6)
+
+
+def correction(before: Tensor, now: Tensor, after: Tensor, spans: Spans) -> Tensor:
+    """Return light at the instant - its mean over each span [V, H, W], from renders at -node, 0 and node.
+
+    Light is taken as quadratic in time. Over [-half, half] that is exact for light up to the fifth power.
+    """
+    far, reach = node(spans.half), REACH * spans.half
+    a, b = spans.ends.to(now).clamp(-reach, reach).unbind(1)
+    slope, bend = (after - before) / (2 * far), (before + after - 2 * now) / (2 * far * far)
+    return -(slope * (a + b) / 2 + bend * (a * a + a * b + b * b) / 3)
+
+
+class Corrections:
+    """The corrections by one snapshot of a model, made when they are first asked for and kept as half floats."""
+
+    def __init__(self, spans: Spans, render: Callable[[int], RenderViews]) -> None:
+        self.spans, self.render = spans, render
+        self._made: dict[tuple[int, int], Tensor] = {}
+
+    def at(self, index: int, views: Sequence[int]) -> Tensor:
+        """Return the corrections [V, H, W] of some views' images of one time."""
+        missing = [v for v in views if (index, v) not in self._made]
+        if missing:
+            far, render = node(self.spans.half), self.render(index)
+            with torch.no_grad():
+                before, now, after = (render(ticks, missing) for ticks in (-far, 0.0, far))
+                made = correction(before, now, after, self.spans.at(index).at(torch.tensor(missing)))
+            self._made.update(((index, v), image.half()) for v, image in zip(missing, made, strict=True))
+        return torch.stack([self._made[index, v] for v in views]).float()
