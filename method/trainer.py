@@ -171,10 +171,9 @@ class Trainer:
     def _correct_by(self, snapshot: Gaussians) -> None:
         """Correct values that are means over spans of time by a snapshot of the stage's model from now on."""
         stage, training = self.stage, self.training_images
-        learns = any(
-            True for _ in self.motion.parameters()
-        )  # it would go on while the snapshot's Gaussians stand still
-        if training.spans is None or not self.settings.correct_spans or learns:
+        if training.spans is None or not self.settings.correct_spans:
+            return
+        if any(True for _ in self.motion.parameters()):  # they would go on learning; the snapshot's Gaussians do not
             return
 
         def around(index: int) -> RenderViews:
