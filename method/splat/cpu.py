@@ -1,7 +1,7 @@
 """Back end "cpu": the numba kernels behind a torch autograd function.
 
-One view after another, each on all threads. Per view: project every Gaussian (float64), count and fill tile lists, sort
-and composite tile by tile (float32); backward replays the tiles front to back, then chains to the parameters.
+All views at once, on all threads: project every Gaussian (float64), count and fill tile lists, sort and composite tile
+by tile (float32); backward replays the tiles front to back, then chains to the parameters.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from spike4dgs.method.splat.kernels import project as project_kernels
 from spike4dgs.method.splat.kernels import project_gradient
 from spike4dgs.method.splat.kernels import tiles as tile_kernels
 from spike4dgs.method.splat.kernels.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
+from spike4dgs.method.splat.kernels.blocks import AHEAD, BATCH, MAX_BLOCKS
 from spike4dgs.method.splat.kernels.jit import announce_compilation
-from spike4dgs.method.splat.kernels.project import Geometry, Projected, View
+from spike4dgs.method.splat.kernels.project import Cameras, Geometry, Projected
 from spike4dgs.method.splat.kernels.project_gradient import Gradients, Records
-from spike4dgs.method.splat.kernels.raster import AHEAD, MAX_BLOCKS, raster_kernels, record_width
+from spike4dgs.method.splat.kernels.raster import Layer, Lists, raster_kernels, record_width
 from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
@@ -47,44 +48,53 @@ class Settings:
         """Tiles across and down the image."""
         return -(-self.width // TILE_WIDTH), -(-self.height // TILE_HEIGHT)
 
-    def view(self, camera: Array) -> View:
-        """Return the kernels' view of a camera [16], see `camera_entries`."""
-        return View(camera, self.width, self.height, self.near, self.eps2d, self.antialiased)
+    def cameras(self, entries: Array) -> Cameras:
+        """Return the kernels' cameras from their entries [V, 16], see `camera_entries`."""
+        return Cameras(entries, self.width, self.height, self.near, self.eps2d, self.antialiased)
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """One rendered view, and the arrays that its gradient needs. P: Gaussian-tile pairs; L: kernel channels in all."""
+class Projection:
+    """N Gaussians in V views: where they are rendered, and which tiles they touch. P: Gaussian-tile pairs."""
 
-    camera: Array  # [16] float64, see camera_entries
-    records: Array  # [N * 8] float64
-    keys: Array  # [N] uint32
-    tiles: Array  # [N, 4] int32
-    slots: Array  # [N + 1] int32
-    order: Array  # [P + AHEAD] int32, tile by tile, nearest first
-    offsets: Array  # [tiles + 1] int64
-    colors: Array  # [chunks, N * channels] float32
-    processed: Array  # [chunks, tiles] int64
-    image: Array  # [L, H, W] float32
-    alpha: Array  # [H, W] float32
+    cameras: Cameras
+    records: Array  # [V, N, 8] float64
+    keys: Array  # [V, N] uint32
+    depths: Array  # [V, N] float32
+    tiles: Array  # [V, N, 4] int32
+    slots: Array  # [V, N + 1] int32
+    pairs: Array  # [P] uint64
+    offsets: Array  # [V * tiles + 1] int64
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """V rendered views, and the arrays that their gradient needs. L: kernel channels in all."""
+
+    projection: Projection
+    lists: Lists
+    layer: Layer
+    processed: Array  # [chunks, V * tiles] int64
+    image: Array  # [V, L, H, W] float32
+    alpha: Array  # [V, H, W] float32
 
 
 @cache
 def _thread_memory(thread: int) -> tuple[Array, ...]:
-    """Return a thread's scratch: projection rows, lanes, tile planes, block list (starts, xis, etas, ends), digits."""
+    """Return a thread's scratch: projection rows, lanes, tile planes, block list, digits."""
     rows = max(project_kernels.ROWS, project_gradient.ROWS) * project_kernels.BLOCK
     planes = 8 * PLANE  # T, R, alpha gradient and up to 4 colours, and room for a vector that overhangs the last
     block_list = (np.empty(MAX_BLOCKS, np.int32), np.empty(MAX_BLOCKS, np.float32), np.empty(MAX_BLOCKS, np.float32))
-    ends = np.empty(256, np.int32)
+    runs = np.empty(BATCH, np.int32), np.zeros(BATCH + AHEAD, np.int32)  # the Gaussians' ends in the list, and which
     lanes = np.empty(project_kernels.BLOCK, np.int64)
     digits = np.empty(1024, np.int32)
-    return np.empty(rows), lanes, aligned((planes,), np.float32), *block_list, ends, digits
+    return np.empty(rows), lanes, aligned((planes,), np.float32), *block_list, *runs, digits
 
 
 def camera_entries(w2c: Tensor, K: Tensor) -> Array:
-    """Return a camera as the kernels take it, [16]: R row by row, t, fx, fy, cx, cy; from [4, 4] and [3, 3]."""
+    """Return cameras as the kernels take them, [V, 16]: R row by row, t, fx, fy, cx, cy; from [V, 4, 4], [V, 3, 3]."""
     pose, k = w2c.detach().double().numpy(), K.detach().double().numpy()
-    return np.concatenate([pose[:3, :3].reshape(-1), pose[:3, 3], k[[0, 1, 0, 1], [0, 1, 2, 2]]])
+    return np.concatenate([pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3], k[:, [0, 1, 0, 1], [0, 1, 2, 2]]], axis=1)
 
 
 def chunking(channels: int) -> tuple[int, int]:
@@ -94,117 +104,89 @@ def chunking(channels: int) -> tuple[int, int]:
 
 
 def pack_colors(colors: Array, depths: Array | None) -> Array:
-    """Return colours [N, F] and depths [N], if any, as [chunks, N * channels] float32, padded with zeros."""
+    """Return colours [N, F] and depths [V, N], if any, as [V or 1, chunks, N * channels] float32, padded with zeros."""
     layers = colors.shape[1] + (depths is not None)
     per_pass, passes = chunking(layers)
     if depths is None and passes == 1 and per_pass == layers and colors.dtype == np.float32:
-        return np.ascontiguousarray(colors).reshape(1, -1)
-    packed = np.zeros((passes, len(colors), per_pass), np.float32)
+        return np.ascontiguousarray(colors).reshape(1, 1, -1)
+    packed = np.zeros((1 if depths is None else len(depths), passes, len(colors), per_pass), np.float32)
     for channel in range(colors.shape[1]):
-        packed[channel // per_pass, :, channel % per_pass] = colors[:, channel]
+        packed[:, channel // per_pass, :, channel % per_pass] = colors[:, channel]
     if depths is not None:
-        packed[(layers - 1) // per_pass, :, (layers - 1) % per_pass] = depths
-    return packed.reshape(passes, -1)
+        packed[:, (layers - 1) // per_pass, :, (layers - 1) % per_pass] = depths
+    return packed.reshape(len(packed), passes, -1)
 
 
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """N Gaussians in one view: where they are rendered, and which tiles they touch. P: Gaussian-tile pairs."""
-
-    camera: Array  # [16] float64, see camera_entries
-    records: Array  # [N, 8] float64
-    keys: Array  # [N] uint32
-    depths: Array  # [N] float32
-    tiles: Array  # [N, 4] int32
-    slots: Array  # [N + 1] int32
-    pairs: Array  # [P] uint64
-    offsets: Array  # [tiles + 1] int64
+def no_layer() -> Layer:
+    """Return an empty layer."""
+    order, keys, longs = np.empty(0, np.int32), np.empty(0, np.uint32), np.empty(0, np.int64)
+    images = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0), np.float32)
+    return Layer(longs, np.empty((0, 0)), np.empty((0, 0), np.float32), order, keys, longs, *images)
 
 
-def project_view(geometry: Geometry, camera: Array, s: Settings, centers: Array, radii: Array) -> Projection:
-    """Project into one view and list the tiles; fills centers [N, 2] and radii [N]. Raises UserError for NaN."""
-    n, threads = len(geometry.means), get_threads()
+def project_views(geometry: Geometry, cameras: Cameras, s: Settings, centers: Array, radii: Array) -> Projection:
+    """Project into V views and list the tiles; fills centers [V, N, 2] and radii [V, N]. Raises UserError for NaN."""
+    views, n, threads = len(cameras.entries), len(geometry.means), get_threads()
     across, down = s.tiles
     blocks = -(-n // project_kernels.BLOCK)
-    records, keys, depths = aligned((n, 8), np.float64), np.empty(n, np.uint32), np.empty(n, np.float32)
-    tiles, slots = np.empty((n, 4), np.int32), np.zeros(n + 1, np.int32)
-    histogram, invalid = np.empty((blocks, 1 + across * down), np.int32), np.empty(blocks, np.int64)
-    offsets = np.empty(across * down + 1, np.int64)
+    records = aligned((views, n, 8), np.float64)
+    keys, depths = np.empty((views, n), np.uint32), np.empty((views, n), np.float32)
+    tiles, slots = np.empty((views, n, 4), np.int32), np.zeros((views, n + 1), np.int32)
+    histogram = np.empty((views, blocks, 1 + across * down), np.int32)
+    invalid, offsets = np.empty((views, blocks), np.int64), np.empty(views * across * down + 1, np.int64)
     out = Projected(records, keys, depths, centers, radii, tiles, histogram, invalid)
     announce_compilation(project_kernels.project_forward, "CPU splatting")
     scratch = [(_thread_memory(t)[0],) for t in range(threads)]
-    run(project_kernels.project_forward, (geometry, s.view(camera), out), scratch)
+    run(project_kernels.project_forward, (geometry, cameras, out), scratch)
     if n and invalid.max() >= 0:
         raise not_finite("geometry", int(invalid.max()))
     pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
     run(tile_kernels.fill_tiles, (keys, tiles, across, histogram, slots, pairs), [()] * threads)
-    return Projection(camera, records, keys, depths, tiles, slots, pairs, offsets)
+    return Projection(cameras, records, keys, depths, tiles, slots, pairs, offsets)
 
 
-def composite_view(p: Projection, colors: Array, channels: int, s: Settings) -> Frame:
-    """Composite one view's lists, nearest first. `colors` come from `pack_colors`; `channels` in one kernel pass."""
-    passes, tiles = len(colors), len(p.offsets) - 1
-    order = np.zeros(len(p.pairs) + AHEAD, np.int32)
-    image = np.empty((passes * channels, s.height, s.width), np.float32)
-    alpha, processed = np.empty((s.height, s.width), np.float32), np.empty((passes, tiles), np.int64)
+def composite(p: Projection, colors: Array, channels: int, layer: Layer, s: Settings) -> Frames:
+    """Composite all views, nearest first. `colors` come from `pack_colors`, for kernels of so many channels."""
+    views, passes, pairs = len(p.keys), colors.shape[1], len(p.pairs)
+    image = np.empty((views, passes * channels, s.height, s.width), np.float32)
+    alpha = np.empty((views, s.height, s.width), np.float32)
+    items = len(p.offsets) - 1
+    processed = np.empty((passes, items), np.int64)
+    lists = Lists(p.records.reshape(views, -1), p.keys, colors, np.empty(pairs, np.int32), p.offsets)
     forward, _ = raster_kernels(host_lanes(), channels)
     longest = int(np.diff(p.offsets).max())
-    records = p.records.reshape(-1)
-    arguments = (records, colors, p.pairs, order, p.offsets, s.width, s.height, image, alpha, processed)
-    memory = [_thread_memory(t)[2:8] for t in range(get_threads())]
+    arguments = (lists, p.pairs, layer, s.width, s.height, image, alpha, processed)
+    memory = [_thread_memory(t)[2:9] for t in range(get_threads())]
     run(forward, arguments, [(*m, np.empty(longest, np.uint64)) for m in memory])
-    lists = (p.camera, records, p.keys, p.tiles, p.slots, order, p.offsets)
-    return Frame(*lists, colors, processed, image, alpha)
+    return Frames(p, lists, layer, processed, image, alpha)
 
 
-def record_sums(frame: Frame, s: Settings, d_image: Array, d_alpha: Array, channels: int, count: int) -> Array:
-    """Return the gradient records [passes, count, record width] of a frame's Gaussian-tile pairs."""
-    sums = aligned((len(frame.colors), count * record_width(channels)), np.float32)
+def record_sums(frames: Frames, s: Settings, d_image: Array, d_alpha: Array, channels: int) -> Array:
+    """Return the gradient records [passes, P, record width] of the Gaussian-tile pairs."""
+    p, width = frames.projection, record_width(channels)
+    passes, pairs = len(frames.processed), len(p.pairs)
+    sums = aligned((passes, pairs * width), np.float32)
     _, backward = raster_kernels(host_lanes(), channels)
-    lists = (frame.records, frame.colors, frame.order, frame.slots, frame.tiles, frame.offsets, frame.processed)
-    images = (s.width, s.height, frame.image, frame.alpha, d_image, d_alpha)
-    run(backward, (*lists, *images, sums), [_thread_memory(t)[2:7] for t in range(get_threads())])
-    return sums.reshape(len(frame.colors), count, record_width(channels))
+    images = (s.width, s.height, frames.image, frames.alpha, frames.processed, d_image, d_alpha)
+    arguments = (frames.lists, p.slots, p.tiles, frames.layer, *images, sums)
+    run(backward, arguments, [_thread_memory(t)[2:8] for t in range(get_threads())])
+    return sums.reshape(passes, pairs, width)
 
 
-def zero_gradients(geometry: Geometry, channels: int, views: int) -> Gradients:
-    """Return zeros to add the gradients of some views to; `centers` [views, N, 2] has a part for each view."""
-    dtype, n = geometry.means.dtype, len(geometry.means)
+def differentiate(
+    frames: Frames, geometry: Geometry, channels: int, s: Settings, d_image: Array, d_alpha: Array, posed: bool
+) -> Gradients:
+    """Return the gradients of the views' images [V, L, H, W] and alphas [V, H, W]; `posed`: of the cameras too."""
+    p, dtype, (views, n) = frames.projection, geometry.means.dtype, frames.projection.keys.shape
+    sums = record_sums(frames, s, d_image, d_alpha, chunking(channels + s.depth)[0])
     means, quats, scales, opacities = (np.zeros(a.shape, dtype) for a in geometry)
-    colors, centers = np.zeros((n, channels), np.float32), np.zeros((views, n, 2), dtype)
-    return Gradients(means, quats, scales, opacities, colors, centers)
-
-
-def chain(
-    frame: Frame | Projection, geometry: Geometry, s: Settings, sums: Array, gradients: Gradients, d_pose: Array
-) -> None:
-    """Chain the records to the parameters and add them to the gradients; d_pose [4, 4] is set, unless it is empty."""
-    blocks = -(-len(frame.keys) // project_kernels.BLOCK) if d_pose.size else 0
-    block_pose = np.empty((blocks, 12))
-    records = Records(frame.keys, frame.slots, sums, gradients.colors.shape[1] if s.depth else -1)
-    run(
-        project_gradient.project_backward,
-        (geometry, s.view(frame.camera), records, gradients, block_pose),
-        [_thread_memory(t)[:2] for t in range(get_threads())],
-    )
-    if d_pose.size:
-        d_pose[:3] = block_pose.sum(0).reshape(3, 4)
-
-
-def _render_view(geometry: Geometry, colors: Array, camera: Array, s: Settings, centers: Array, radii: Array) -> Frame:
-    """Render one view; fills centers [N, 2] and radii [N]."""
-    projection = project_view(geometry, camera, s, centers, radii)
-    packed = pack_colors(colors, projection.depths if s.depth else None)
-    return composite_view(projection, packed, chunking(colors.shape[1] + s.depth)[0], s)
-
-
-def _differentiate_view(
-    frame: Frame, geometry: Geometry, s: Settings, d_image: Array, d_alpha: Array, gradients: Gradients, d_pose: Array
-) -> None:
-    """Add one view's gradients; d_pose [4, 4] is set, unless it is empty."""
-    channels = chunking(gradients.colors.shape[1] + s.depth)[0]
-    sums = record_sums(frame, s, d_image, d_alpha, channels, int(frame.slots[len(frame.keys)]))
-    chain(frame, geometry, s, sums, gradients, d_pose)
+    colors, centers = np.zeros((n, channels), np.float32), np.empty((views, n, 2), dtype)
+    poses = np.empty((views, -(-n // project_kernels.BLOCK) if posed else 0, 12))
+    gradients = Gradients(means, quats, scales, opacities, colors, centers, poses)
+    records = Records(p.keys, p.slots, sums, channels if s.depth else -1)
+    scratch = [_thread_memory(t)[:2] for t in range(get_threads())]
+    run(project_gradient.project_backward, (geometry, p.cameras, records, gradients), scratch)
+    return gradients
 
 
 class _Rasterize(torch.autograd.Function):
@@ -213,55 +195,58 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, w2c: Tensor,
-        probe: Tensor, K: Tensor, settings: Settings, radii: Tensor,
+        probe: Tensor, K: Tensor, settings: Settings, layer: Layer, radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         geometry = Geometry(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities)))
-        frames = []
+        cameras, layers = settings.cameras(camera_entries(w2c, K)), colors.shape[1] + settings.depth
         with busy:
-            for c in range(len(w2c)):
-                camera = camera_entries(w2c[c], K[c])
-                centers, reach = probe.detach()[c].numpy(), radii[c].numpy()
-                frames.append(_render_view(geometry, colors.detach().numpy(), camera, settings, centers, reach))
+            p = project_views(geometry, cameras, settings, probe.detach().numpy(), radii.numpy())
+            packed = pack_colors(colors.detach().numpy(), p.depths if settings.depth else None)
+            frames = composite(p, packed, chunking(layers)[0], layer, settings)
         ctx.frames, ctx.geometry, ctx.settings = frames, geometry, settings
         ctx.pose_dtype, ctx.colors_dtype, ctx.channels = w2c.dtype, colors.dtype, colors.shape[1]
-        layers = colors.shape[1] + settings.depth
-        image = np.stack([f.image[:layers] for f in frames]) if len(frames) > 1 else frames[0].image[None, :layers]
-        alpha = np.stack([f.alpha for f in frames]) if len(frames) > 1 else frames[0].alpha[None]
-        return torch.from_numpy(image), torch.from_numpy(alpha)
+        return torch.from_numpy(frames.image[:, :layers]), torch.from_numpy(frames.alpha)
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        total = zero_gradients(ctx.geometry, ctx.channels, len(ctx.frames))
-        d_w2c = np.zeros((len(ctx.frames), 4, 4) if ctx.needs_input_grad[5] else (len(ctx.frames), 0))
+        frames, posed = ctx.frames, ctx.needs_input_grad[5]
+        layers = d_image.numpy()
+        if layers.shape != frames.image.shape:
+            layers = np.zeros(frames.image.shape, np.float32)
+            layers[:, : d_image.shape[1]] = d_image.numpy()
+        images = np.ascontiguousarray(layers), np.ascontiguousarray(d_alpha.numpy())
         with busy:
-            for c, frame in enumerate(ctx.frames):
-                layers = np.zeros(frame.image.shape, np.float32)
-                layers[: d_image.shape[1]] = d_image[c].numpy()
-                own = np.ascontiguousarray(d_alpha[c].numpy())
-                gradients = total._replace(centers=total.centers[c])
-                _differentiate_view(frame, ctx.geometry, ctx.settings, layers, own, gradients, d_w2c[c])
-        *grads, centers = (torch.from_numpy(a) for a in total)
-        grads[4] = grads[4].to(ctx.colors_dtype)
-        pose = torch.from_numpy(d_w2c).to(ctx.pose_dtype) if ctx.needs_input_grad[5] else None
-        return (*grads, pose, centers, None, None, None)
+            total = differentiate(frames, ctx.geometry, ctx.channels, ctx.settings, *images, posed)
+        means, quats, scales, opacities, colors, centers, poses = (torch.from_numpy(a) for a in total)
+        d_w2c = None
+        if posed:
+            d_w2c = torch.zeros(len(poses), 4, 4, dtype=ctx.pose_dtype)
+            d_w2c[:, :3] = torch.from_numpy(np.stack([pose.sum(0) for pose in total.poses])).reshape(-1, 3, 4)
+        own = (means, quats, scales, opacities, colors.to(ctx.colors_dtype), d_w2c, centers)
+        return (*own, None, None, None, None)
 
 
 def render_cpu(
     splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
 ) -> RenderOutput:
     """Render with the back end "cpu": see `render` for the arguments."""
-    if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
-        require_finite(splats)
     dtype = torch.float32
     if any(t.dtype == torch.float64 for t in splats.geometry):
         dtype = torch.float64
+    settings = Settings(views.width, views.height, near, eps2d, antialiased, depth)
+    return rasterize(splats, views, settings, dtype, no_layer())
+
+
+def rasterize(splats: Splats, views: Views, settings: Settings, dtype: torch.dtype, layer: Layer) -> RenderOutput:
+    """Render splats, whose geometry is taken as `dtype`, together with a layer in the same views."""
+    if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
+        require_finite(splats)
     geometry = [t.to(dtype) for t in splats.geometry]
     inputs = (*splats.geometry, splats.colors, views.w2c)
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     means2d = torch.zeros(len(views), len(splats), 2, dtype=dtype, requires_grad=wanted)
     radii = torch.zeros(len(views), len(splats))
-    settings = Settings(views.width, views.height, near, eps2d, antialiased, depth)
-    layers, alpha = _Rasterize.apply(*geometry, splats.colors, views.w2c, means2d, views.K, settings, radii)
+    layers, alpha = _Rasterize.apply(*geometry, splats.colors, views.w2c, means2d, views.K, settings, layer, radii)
     layers = layers.permute(0, 2, 3, 1)
-    image, far = (layers[..., :-1], layers[..., -1]) if depth else (layers, None)
+    image, far = (layers[..., :-1], layers[..., -1]) if settings.depth else (layers, None)
     return RenderOutput(image, alpha, far, radii, means2d)

@@ -22,7 +22,6 @@ from numba.extending import intrinsic
 
 from spike4dgs.method.splat.kernels.vector_ir import (
     BLOCK_WIDTH,
-    I32,
     I64,
     Lanes,
     array_data,
@@ -130,8 +129,20 @@ class BlockLoop:
         stored = b.select(live, after, v.minus_abs(T))
         return alpha, before, b.select(live, weight, v.const(0)), stored, b.and_(hit, live)
 
+    def pass_on(self, pixel: Any, stored: Any, weight: Any) -> tuple[list[Any], Any, Any]:
+        """Store T and R behind the Gaussian; return dL/dC_f, cg (see `differentiate_blocks`), and that R."""
+        b, v = self.b, self.v
+        v.store(stored, pixel)
+        rest = offset(b, pixel, int64(PLANE))
+        *grads, own = (v.load(offset(b, pixel, int64(PLANE * (2 + f)))) for f in range(len(self.color) + 1))
+        for value, grad in zip(self.color, grads, strict=True):
+            own = v.fma(value, grad, own)
+        behind = v.sub(v.load(rest), v.mul(weight, own))
+        v.store(behind, rest)
+        return grads, own, behind
 
-def _pointers(context: Any, builder: Any, sig: Any, args: Any, names: str) -> dict[str, Any]:
+
+def pointers_of(context: Any, builder: Any, sig: Any, args: Any, names: str) -> dict[str, Any]:
     """Return the data pointers of the array arguments 1, 2, ... (argument 0 is the variant)."""
     return {n: array_data(context, builder, sig.args[i], args[i]) for i, n in enumerate(names.split(), start=1)}
 
@@ -147,7 +158,7 @@ def composite_blocks(
     chosen = Variant.unpack(variant.literal_value)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointers = _pointers(context, builder, sig, args, "tile records colors starts xis etas")
+        pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas")
         loop = BlockLoop(builder, chosen, pointers, args[9])
         v = loop.v
         loop.open(args[7], args[8], 0)
@@ -180,20 +191,13 @@ def differentiate_blocks(
     chosen = Variant.unpack(variant.literal_value)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointers = _pointers(context, builder, sig, args, "tile records colors starts xis etas sums")
+        pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas sums")
         loop = BlockLoop(builder, chosen, pointers, args[10])
         v, b = loop.v, builder
         total = loop.open(args[8], args[9], MOMENTS + chosen.channels)
         pixel, xi, eta, raw = loop.block()
         alpha, before, weight, stored, composited = loop.blend(raw, v.load(pixel))
-        v.store(stored, pixel)
-        rest = offset(b, pixel, int64(PLANE))
-        planes = [offset(b, pixel, int64(PLANE * (2 + f))) for f in range(chosen.channels + 1)]
-        *grads, own = (v.load(plane) for plane in planes)
-        for value, grad in zip(loop.color, grads, strict=True):
-            own = v.fma(value, grad, own)
-        behind = v.sub(v.load(rest), v.mul(weight, own))
-        v.store(behind, rest)
+        grads, own, behind = loop.pass_on(pixel, stored, weight)
         dalpha = v.sub(v.mul(before, own), v.div(behind, v.sub(v.const(1.0), alpha)))
         moves = b.and_(composited, b.fcmp_ordered("<=", raw, v.const(ALPHA_MAX)))  # a clamped alpha does not
         s = b.select(moves, v.mul(dalpha, raw), v.const(0))
@@ -205,6 +209,29 @@ def differentiate_blocks(
         for first in range(0, len(final), 8):
             out = offset(b, pointers["sums"], b.add(args[11], int64(first)))
             Lanes(b, 8).store(_sum_across(v, final[first : first + 8]), out)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+def replay_blocks(
+    typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
+    begin: Any, end: Any, gaussian: Any,
+) -> Generated:  # fmt: skip
+    """Bring T and R behind a Gaussian that wants no gradients, as `differentiate_blocks` does."""
+    integer = types.int64
+    signature = types.void(variant, tile, records, colors, starts, xis, etas, integer, integer, integer)
+    chosen = Variant.unpack(variant.literal_value)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas")
+        loop = BlockLoop(builder, chosen, pointers, args[9])
+        loop.open(args[7], args[8], 0)
+        pixel, _, _, raw = loop.block()
+        _, _, weight, stored, _ = loop.blend(raw, loop.v.load(pixel))
+        loop.pass_on(pixel, stored, weight)
+        loop.close([])
         return context.get_dummy_value()
 
     return signature, generate
@@ -226,30 +253,6 @@ def _sum_across(v: Lanes, vectors: list[Any]) -> Any:
     first, second = add_neighbours(pairs[0], pairs[1]), add_neighbours(pairs[2], pairs[3])
     low = half.shuffle(first, second, [0, 1, 2, 3, 8, 9, 10, 11])
     return half.add(low, half.shuffle(first, second, [4, 5, 6, 7, 12, 13, 14, 15]))
-
-
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
-def emit_blocks(
-    typing_context: Any, variant: Any, starts: Any, xis: Any, etas: Any, at: Any, start: Any, xi: Any, eta: Any,
-    eta_step: Any,
-) -> Generated:  # fmt: skip
-    """Append a column of blocks, top to bottom, to the list: always a tile's full height; the caller counts."""
-    signature = types.void(
-        variant, starts, xis, etas, types.int64, types.int64, types.float64, types.float64, types.float64
-    )  # fmt: skip
-    rows = Variant.unpack(variant.literal_value).block_rows
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        count = TILE_HEIGHT // rows
-        v, steps = Lanes(builder, count), list(range(count))
-        out = [offset(builder, p, args[4]) for p in _pointers(context, builder, sig, args, "starts xis etas").values()]
-        down = ir.Constant(v.int_type, [ir.Constant(I32, k * ROW_WIDTH * rows) for k in steps])
-        v.store(builder.add(v.splat(builder.trunc(args[5], I32)), down), out[0])
-        v.store(v.splat(args[6]), out[1])
-        v.store(v.fma(v.splat(args[8]), v.of([float(k) for k in steps]), v.splat(args[7])), out[2])
-        return context.get_dummy_value()
-
-    return signature, generate
 
 
 @intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]

@@ -1,4 +1,4 @@
-"""Projection of Gaussians into one view, in float64. Its gradient is in project_gradient.py.
+"""Projection of Gaussians into views, in float64. Its gradient is in project_gradient.py.
 
 A few Gaussians' arithmetic is cheap beside the pixels', and needles, huge pancakes and worlds whose origin is far away
 lose what float32 has. Blocks of Gaussians are copied into rows of a scratch array (structure of arrays) so that LLVM
@@ -39,10 +39,13 @@ class Geometry(NamedTuple):
     opacities: np.ndarray  # [N]
 
 
-class View(NamedTuple):
-    """A camera, its image, and how Gaussians are projected into it."""
+class Cameras(NamedTuple):
+    """V cameras of one image size, and how Gaussians are projected into their images.
 
-    camera: np.ndarray  # [16] float64: R row by row (9), t (3), fx, fy, cx, cy
+    `entries` has a row for each.
+    """
+
+    entries: np.ndarray  # [V, 16] float64: R row by row (9), t (3), fx, fy, cx, cy
     width: int
     height: int
     near: float
@@ -51,16 +54,16 @@ class View(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """The outputs of `project_forward`: per Gaussian, and in the last two per block."""
+    """The outputs of `project_forward`: per view and Gaussian, and in the last two per view and block."""
 
-    records: np.ndarray  # [N, 8] float64, see blend_ir.py
-    keys: np.ndarray  # [N] uint32: depth bits or CULLED
-    depths: np.ndarray  # [N] float32
-    centers: np.ndarray  # [N, 2] px, 0 where culled
-    radii: np.ndarray  # [N] px, 0 where culled
-    tiles: np.ndarray  # [N, 4] int32: first and last + 1 tile in x, in y
-    histogram: np.ndarray  # [blocks, 1 + tiles] int32: total and per-tile count of Gaussian-tile pairs
-    invalid: np.ndarray  # [blocks] int64: a Gaussian with a parameter that is not finite, or -1
+    records: np.ndarray  # [V, N, 8] float64, see blend_ir.py
+    keys: np.ndarray  # [V, N] uint32: depth bits or CULLED
+    depths: np.ndarray  # [V, N] float32
+    centers: np.ndarray  # [V, N, 2] px, 0 where culled
+    radii: np.ndarray  # [V, N] px, 0 where culled
+    tiles: np.ndarray  # [V, N, 4] int32: first and last + 1 tile in x, in y
+    histogram: np.ndarray  # [V, blocks, 1 + tiles] int32: total and per-tile count of Gaussian-tile pairs
+    invalid: np.ndarray  # [V, blocks] int64: a Gaussian with a parameter that is not finite, or -1
 
 
 @helper
@@ -105,9 +108,9 @@ def rotation(w: float, x: float, y: float, z: float) -> Any:
 
 
 @helper
-def camera_constants(view: Any) -> Any:
+def camera_constants(cameras: Any, view: int) -> Any:
     """Return R, t and (fx, fy, cx, cy) of a view as scalars, and the limits of x/z and y/z."""
-    camera, width, height = view.camera, view.width, view.height
+    camera, width, height = cameras.entries[view], cameras.width, cameras.height
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     mx, my = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     limits = (-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my)
@@ -163,17 +166,20 @@ def gather_parameters(s: np.ndarray, l: int, i: int, geometry: Any) -> None:  # 
 
 
 @kernel
-def project_forward(geometry: Any, view: Any, out: Any, counter: Any, s: Any) -> None:
-    """Project all Gaussians (a `Geometry`) into one `View` and fill `out` (a `Projected`)."""
-    _, width, height, near, eps2d, antialiased = view
-    records, keys, depths, centers, radii, tiles, histogram, invalid = out
+def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any) -> None:
+    """Project all Gaussians (a `Geometry`) into all `Cameras` and fill `out` (a `Projected`)."""
+    views, (_, width, height, near, eps2d, antialiased) = len(cameras.entries), cameras
     n_all, across = len(geometry.means), (width + TILE_WIDTH - 1) // TILE_WIDTH
-    R, t, f, limits = camera_constants(view)
+    blocks = (n_all + BLOCK - 1) // BLOCK
     while True:
-        block = fetch_add(counter, 0, 1)
-        first = block * BLOCK
-        if first >= n_all:
+        item = fetch_add(counter, 0, 1)
+        if item >= views * blocks:
             break
+        view, block = item // blocks, item % blocks
+        R, t, f, limits = camera_constants(cameras, view)
+        records, keys, depths, centers = out.records[view], out.keys[view], out.depths[view], out.centers[view]
+        radii, tiles, histogram, invalid = out.radii[view], out.tiles[view], out.histogram[view], out.invalid[view]
+        first = block * BLOCK
         n = min(BLOCK, n_all - first)
         for l in range(n):  # noqa: E741
             gather_parameters(s, l, first + l, geometry)

@@ -53,93 +53,105 @@ P_PER_XI = math.sqrt(2 * math.log(2.0))  # p = xi sqrt(2 ln 2), likewise q and e
 class Records(NamedTuple):
     """The gradient records that the rasteriser wrote, one per Gaussian-tile pair."""
 
-    keys: np.ndarray  # [N] uint32: depth bits or CULLED
-    slots: np.ndarray  # [N + 1] int32: Gaussian i owns the pairs slots[i]:slots[i + 1]
+    keys: np.ndarray  # [V, N] uint32: depth bits or CULLED
+    slots: np.ndarray  # [V, N + 1] int32: Gaussian i of view v owns the pairs slots[v, i]:slots[v, i + 1]
     sums: np.ndarray  # [chunks, pairs, 8 or 16] float32: six moments and the colour gradients
     depth_channel: int  # the channel that holds the depth, or -1
 
 
 class Gradients(NamedTuple):
-    """dLoss of a view's Gaussians: `centers` is written, the others are added to."""
+    """dLoss of the Gaussians: `centers` and `poses` are written, the others are added to."""
 
     means: np.ndarray  # [N, 3]
     quats: np.ndarray  # [N, 4]
     scales: np.ndarray  # [N, 3]
     opacities: np.ndarray  # [N]
     colors: np.ndarray  # [N, F] float32
-    centers: np.ndarray  # [N, 2] px
+    centers: np.ndarray  # [V, N, 2] px
+    poses: np.ndarray  # [V, blocks, 12], or empty: dL/d[R | t], row by row, summed over each block
 
 
 @kernel
 def project_backward(
-    geometry: Any, view: Any, records: Any, gradients: Any, d_pose: Any, counter: Any, s: Any, lanes: Any
+    geometry: Any, cameras: Any, records: Any, gradients: Any, counter: Any, s: Any, lanes: Any
 ) -> None:
     """Sum each Gaussian's `Records` over its tiles and chain them to the parameters: `Gradients`.
 
-    d_pose [blocks, 12] or [0, 12] gets dL/d[R | t] of each block. s and lanes are scratch.
+    A block of Gaussians is one work item with all its views, in their order: so the sums are the same bits on any
+    number of threads, and no thread needs gradients of its own. s and lanes are scratch.
     """
-    keys, _, sums, depth_channel = records
-    d_means, d_quats, d_scales, d_opacities, d_colors, d_centers = gradients
-    n_all, chunks, n_colors = len(geometry.means), sums.shape[0], d_colors.shape[1]
-    per_chunk = (n_colors + (depth_channel >= 0) + chunks - 1) // chunks
-    R, t, f, limits = camera_constants(view)
-    eps2d, antialiased = view.eps2d, view.antialiased
+    keys, chunks, n_colors = records.keys, records.sums.shape[0], gradients.colors.shape[1]
+    n_all, views = len(geometry.means), len(cameras.entries)
+    per_chunk = (n_colors + (records.depth_channel >= 0) + chunks - 1) // chunks
     while True:
         block = fetch_add(counter, 0, 1)
         first = block * BLOCK
         if first >= n_all:
             break
-        n = 0
-        for i in range(first, min(first + BLOCK, n_all)):
-            d_centers[i, 0], d_centers[i, 1] = 0, 0
-            if keys[i] == CULLED:
-                continue
-            gather_parameters(s, n, i, geometry)
-            gather_gradients(s, n, i, records, d_colors, per_chunk)
-            lanes[n] = i
-            n += 1
-        if d_pose.shape[0] > 0:
-            d_pose[block, :] = 0
-        if n == 0:
-            continue
-        rounded = (n + 7) // 8 * 8
-        for l in range(n, rounded):  # noqa: E741
-            gather_parameters(s, l, lanes[0], geometry)
-            for row in range(MOMENTS + 1):
-                s[M0 + row * BLOCK + l] = 0.0
-        for l in range(rounded):  # noqa: E741
-            differentiate_lane(s, l, R, t, f, limits, eps2d, antialiased)
-        for l in range(n):  # noqa: E741
-            i = lanes[l]
-            for k in range(3):
-                d_means[i, k] += s[GX + k * BLOCK + l]
-                d_scales[i, k] += s[GSX + k * BLOCK + l]
-            for k in range(4):
-                d_quats[i, k] += s[GQW + k * BLOCK + l]
-            d_opacities[i] += s[GOP + l]
-            d_centers[i, 0], d_centers[i, 1] = s[GCX + l], s[GCY + l]
-        if d_pose.shape[0] > 0:
-            for k in range(12):
-                total = 0.0
-                for l in range(n):  # noqa: E741
-                    total += s[POSE + k * BLOCK + l]
-                d_pose[block, k] = total
+        for view in range(views):
+            n = 0
+            for i in range(first, min(first + BLOCK, n_all)):
+                gradients.centers[view, i, 0], gradients.centers[view, i, 1] = 0, 0
+                if keys[view, i] == CULLED:
+                    continue
+                gather_parameters(s, n, i, geometry)
+                gather_gradients(s, n, view, i, records, gradients.colors, per_chunk)
+                lanes[n] = i
+                n += 1
+            if n:
+                differentiate_lanes(s, n, lanes[0], geometry, cameras, view)
+            for l in range(n):  # noqa: E741
+                add_gradients(s, l, view, lanes[l], gradients)
+            if gradients.poses.size:
+                for k in range(12):
+                    total = 0.0
+                    for l in range(n):  # noqa: E741
+                        total += s[POSE + k * BLOCK + l]
+                    gradients.poses[view, block, k] = total
 
 
 @helper
-def gather_gradients(s: np.ndarray, l: int, i: int, records: Any, d_colors: Any, per_chunk: int) -> None:  # noqa: E741
+def differentiate_lanes(s: np.ndarray, n: int, some: int, geometry: Any, cameras: Any, view: int) -> None:
+    """Chain the moments of the first n lanes; those that fill the last vector hold Gaussian `some`."""
+    R, t, f, limits = camera_constants(cameras, view)
+    rounded = (n + 7) // 8 * 8
+    for l in range(n, rounded):  # noqa: E741
+        gather_parameters(s, l, some, geometry)
+        for row in range(MOMENTS + 1):
+            s[M0 + row * BLOCK + l] = 0.0
+    for l in range(rounded):  # noqa: E741
+        differentiate_lane(s, l, R, t, f, limits, cameras.eps2d, cameras.antialiased)
+
+
+@helper
+def add_gradients(s: np.ndarray, l: int, view: int, i: int, gradients: Any) -> None:  # noqa: E741
+    """Add lane l to the gradients of Gaussian i."""
+    for k in range(3):
+        gradients.means[i, k] += s[GX + k * BLOCK + l]
+        gradients.scales[i, k] += s[GSX + k * BLOCK + l]
+    for k in range(4):
+        gradients.quats[i, k] += s[GQW + k * BLOCK + l]
+    gradients.opacities[i] += s[GOP + l]
+    gradients.centers[view, i, 0], gradients.centers[view, i, 1] = s[GCX + l], s[GCY + l]
+
+
+@helper
+def gather_gradients(
+    s: np.ndarray, l: int, view: int, i: int, records: Any, d_colors: Any, per_chunk: int  # noqa: E741
+) -> None:  # fmt: skip
     """Add up Gaussian i's records over its tiles, in their order, into lane l and d_colors[i]."""
-    _, slots, sums, depth_channel = records
+    _, _, sums, depth_channel = records
+    begin, end = records.slots[view, i], records.slots[view, i + 1]
     m0, mp, mq, mpp, mpq, mqq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for chunk in range(sums.shape[0]):
-        for slot in range(slots[i], slots[i + 1]):
+        for slot in range(begin, end):
             m0, mp, mq = m0 + sums[chunk, slot, 0], mp + sums[chunk, slot, 1], mq + sums[chunk, slot, 2]
             mpp, mpq, mqq = mpp + sums[chunk, slot, 3], mpq + sums[chunk, slot, 4], mqq + sums[chunk, slot, 5]
     s[M0 + l], s[MP + l], s[MQ + l], s[MPP + l], s[MPQ + l], s[MQQ + l] = m0, mp, mq, mpp, mpq, mqq
     s[GDEPTH + l] = 0.0
     for channel in range(d_colors.shape[1] + (depth_channel >= 0)):
         chunk, row, total = channel // per_chunk, MOMENTS + channel % per_chunk, 0.0
-        for slot in range(slots[i], slots[i + 1]):
+        for slot in range(begin, end):
             total += sums[chunk, slot, row]
         if channel == depth_channel:
             s[GDEPTH + l] = total

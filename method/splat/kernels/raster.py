@@ -1,19 +1,17 @@
 """The tile jobs: sort a tile's Gaussians, list the blocks each meets, and composite or differentiate them.
 
-Large tiles keep sorting cheap; inside a tile a Gaussian visits only the blocks (8 pixels wide) of the rows that its
-opacity-aware ellipse meets: 1.6 to 2 lanes are computed per useful pixel, against 6 to 13 for whole 16 x 16 tiles.
+Large tiles keep sorting cheap, as Gaussians visit only the blocks that they meet (blocks.py). Behind and between the
+Gaussians there may be a `Layer` of others that never change: their sorted lists are merged on the way.
 """
 
 from __future__ import annotations
 
-import math
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from spike4dgs.method.splat.kernels.blend_ir import (
-    BLOCK_WIDTH,
     MOMENTS,
     PLANE,
     ROW_WIDTH,
@@ -23,17 +21,35 @@ from spike4dgs.method.splat.kernels.blend_ir import (
     any_unfinished,
     composite_blocks,
     differentiate_blocks,
-    emit_blocks,
+    replay_blocks,
 )
-from spike4dgs.method.splat.kernels.jit import helper, kernel, source_digest, template
-from spike4dgs.method.splat.kernels.project import ceil_int, floor_int
+from spike4dgs.method.splat.kernels.blocks import BATCH, list_blocks
+from spike4dgs.method.splat.kernels.jit import helper, kernel, source_digest
 from spike4dgs.method.splat.kernels.tiles import sort_tile
-from spike4dgs.method.splat.kernels.vector_ir import fetch_add, prefetch
+from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
-BATCH = 128  # Gaussians whose blocks are listed at a time
-AHEAD = 6  # Gaussians between prefetch and use; `order` is padded by as many
-SLACK = 0.501  # half a pixel, and a margin for the rounding of the row bounds
-MAX_BLOCKS = BATCH * TILE_HEIGHT * (TILE_WIDTH // BLOCK_WIDTH + 1) + 2 * TILE_HEIGHT  # longest list of one batch
+
+class Lists(NamedTuple):
+    """N Gaussians in V views, and their P Gaussian-tile pairs: tile by tile, nearest first once they are composited."""
+
+    records: np.ndarray  # [V, N * 8] float64
+    keys: np.ndarray  # [V, N] uint32: depth bits
+    colors: np.ndarray  # [V or 1, chunks, N * channels] float32
+    order: np.ndarray  # [P + AHEAD] int32, the Gaussians' indices
+    offsets: np.ndarray  # [V * tiles + 1] int64, of each tile's pairs
+
+
+class Layer(NamedTuple):
+    """M Gaussians that never change, in all views, or empty arrays. B: their Gaussian-tile pairs, nearest first."""
+
+    chosen: np.ndarray  # [V] int64: the rendered views among those of the layer
+    records: np.ndarray  # [views, M * 8] float64
+    colors: np.ndarray  # [chunks, M * channels] float32
+    order: np.ndarray  # [B] int32
+    keys: np.ndarray  # [B] uint32: depth bits
+    offsets: np.ndarray  # [views * tiles + 1] int64
+    image: np.ndarray  # [views, layers, H, W] float32
+    alpha: np.ndarray  # [views, H, W] float32
 
 
 def record_width(channels: int) -> int:
@@ -42,70 +58,61 @@ def record_width(channels: int) -> int:
 
 
 @helper
-def load_record(records: Any, r: int) -> Any:
-    """Return the record at records[r:] as scalars, which the compiler can keep while the lists are written."""
-    return (
-        records[r], records[r + 1], records[r + 2], records[r + 3],
-        records[r + 4], records[r + 5], records[r + 6], records[r + 7],
-    )  # fmt: skip
-
-
-@helper
-def rows_met(g: Any, dx: float, box: Any, rows: int) -> Any:
-    """Return the first and last + 1 block row, from the tile's top, where the ellipse meets columns dx .. dx + 7.
-
-    dx: offset from the Gaussian's centre. The ellipse's upper and lower edge are the ridge line plus and minus
-    ratio * sqrt(hx^2 - dx^2); their extremes in the columns lie at the topmost point or at the nearest column.
-    """
-    _, y, slope, hx, top_at, _, _, ratio = g
-    left, right = max(dx, -hx), min(dx + (BLOCK_WIDTH - 1), hx)
-    high, low = min(max(top_at, left), right), min(max(-top_at, left), right)
-    far = y - box[2] + slope * high + ratio * math.sqrt(max(hx * hx - high * high, 0.0)) + SLACK
-    near = y - box[2] + slope * low - ratio * math.sqrt(max(hx * hx - low * low, 0.0)) - SLACK
-    height = float(box[3] - box[2])
-    first = ceil_int(min(max(near, 0.0), height)) // rows
-    return first, (floor_int(min(max(far, 0.0), height)) + rows - 1) // rows
-
-
-@template
-def list_column(variant: Any, g: Any, x: int, x_end: int, box: Any, rows: int, lists: Any, at: int) -> int:
-    """Append the blocks of pixel columns x .. x + 7 and return the new length of the list. No branches."""
-    dx = x + 0.5 - g[0]
-    first, last = rows_met(g, dx, box, rows)
-    eta = g[6] * (box[2] + first * rows + 0.5 - g[1] - g[2] * dx)
-    start = (first * ROW_WIDTH + x - box[0]) * rows
-    emit_blocks(variant, lists[0], lists[1], lists[2], at, start, g[5] * dx, eta, g[6] * rows)
-    return at + (max(last - first, 0) if x < x_end else 0)
-
-
-@template
-def list_blocks(variant: Any, records: Any, order: Any, begin: int, end: int, box: Any, rows: int, lists: Any) -> None:
-    """List the blocks of the Gaussians order[begin:end] in the tile box (x0, x1, y0, y1).
-
-    lists: starts, xis, etas of the blocks, and ends, where the k-th Gaussian's run ends.
-    """
-    at = 0
-    for m in range(begin, end):
-        prefetch(records, np.int64(order[m + AHEAD]) * 8)
-        g = load_record(records, np.int64(order[m]) * 8)
-        x = max(ceil_int(max(g[0] - g[3] - 0.5, 0.0)), box[0])
-        x_end = min(floor_int(min(g[0] + g[3] + 0.5, float(box[1]))), box[1])
-        at = list_column(variant, g, x, x_end, box, rows, lists, at)
-        # Usually empty, but computing it costs less than a mispredicted branch.
-        at = list_column(variant, g, x + BLOCK_WIDTH, x_end, box, rows, lists, at)
-        x += 2 * BLOCK_WIDTH
-        while x < x_end:
-            at = list_column(variant, g, x, x_end, box, rows, lists, at)
-            x += BLOCK_WIDTH
-        lists[3][m - begin] = at
-
-
-@helper
 def tile_box(tile: int, width: int, height: int) -> Any:
     """Return the pixel bounds x0, x1, y0, y1 of a tile."""
     across = (width + TILE_WIDTH - 1) // TILE_WIDTH
     x0, y0 = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
     return x0, min(x0 + TILE_WIDTH, width), y0, min(y0 + TILE_HEIGHT, height)
+
+
+@helper
+def tile_count(width: int, height: int) -> int:
+    """Return the number of tiles of an image."""
+    return (width + TILE_WIDTH - 1) // TILE_WIDTH * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+
+
+@helper
+def layer_pairs(layer: Any, view: int, tile: int, tiles: int) -> Any:
+    """Return where a tile's pairs begin and end in a layer, which may be empty."""
+    if len(layer.offsets) < 2:
+        return np.int64(0), np.int64(0)
+    item = layer.chosen[view] * tiles + tile
+    return layer.offsets[item], layer.offsets[item + 1]
+
+
+@helper
+def copy_tile(layer: Any, view: int, box: Any, image: Any, alpha: Any) -> None:
+    """Copy a tile of a layer's image and alpha [H, W] into those of a view."""
+    x0, x1, y0, y1 = box
+    source = layer.chosen[view]
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            alpha[view, y, x] = layer.alpha[source, y, x]
+        for c in range(image.shape[1]):
+            for x in range(x0, x1):
+                image[view, c, y, x] = layer.image[source, c, y, x]
+
+
+@helper
+def merge_batch(
+    order: Any, keys: Any, at: int, end: int, layer: Any, other: int, last: int, mixed: Any, all_: bool
+) -> Any:
+    """Merge up to BATCH of the pairs at .. end with a layer's other .. last, nearest first.
+
+    mixed gets the index i of a Gaussian, or -1 - i of one of the layer. Returns how many there are, and the first pair
+    of each side that is left. Without `all_`, what follows the last of the first side is left out.
+    """
+    count = 0
+    while count < BATCH and (at < end or (all_ and other < last)):
+        nearer = other < last and (at == end or layer.keys[other] <= keys[order[at]])
+        if nearer:
+            mixed[count] = -1 - layer.order[other]
+            other += 1
+        else:
+            mixed[count] = order[at]
+            at += 1
+        count += 1
+    return count, at, other
 
 
 @cache
@@ -120,26 +127,34 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
 
     @kernel
     def raster_forward(
-        records: Any, colors: Any, pairs: Any, order: Any, offsets: Any, width: int, height: int, image: Any,
-        alpha: Any, processed: Any, counter: Any, buffer: Any, starts: Any, xis: Any, etas: Any, ends: Any,
-        digits: Any, spare: Any,
+        lists: Any, pairs: Any, layer: Any, width: int, height: int, image: Any, alpha: Any, processed: Any,
+        counter: Any, buffer: Any, starts: Any, xis: Any, etas: Any, ends: Any, mixed: Any, digits: Any, spare: Any,
     ) -> None:  # fmt: skip
-        """Composite all tiles.
+        """Composite all tiles of all views.
 
-        records [N * 8]; colors [chunks, N * channels]; image [chunks * channels, H, W] and alpha [H, W] are written;
-        processed [chunks, tiles]: number of a tile's Gaussians that were visited before every pixel was finished.
+        pairs [P] are sorted into `lists.order`; image [V, chunks * channels, H, W] and alpha [V, H, W] are written;
+        processed [chunks, V * tiles]: number of a tile's Gaussians that were visited before every pixel was finished.
         """
+        tiles = tile_count(width, height)
         while True:
-            tile = fetch_add(counter, 0, 1)
-            if tile >= offsets.shape[0] - 1:
+            item = fetch_add(counter, 0, 1)
+            if item >= len(lists.offsets) - 1:
                 break
+            view, tile = item // tiles, item % tiles
             box = tile_box(tile, width, height)
             x0, x1, y0, y1 = box
-            begin, end = offsets[tile], offsets[tile + 1]
+            begin, end = lists.offsets[item], lists.offsets[item + 1]
+            if end == begin and len(layer.offsets) > 1:
+                processed[:, item] = 0
+                copy_tile(layer, view, box, image, alpha)
+                continue
+            records, keys, order = lists.records[view], lists.keys[view], lists.order
             sort_tile(pairs, spare, order, begin, end - begin, digits)
+            layer_records = layer.records[layer.chosen[view]] if len(layer.offsets) > 1 else records
             vectors = (y1 - y0 + rows - 1) // rows * ROW_WIDTH * rows // lanes
-            for chunk in range(colors.shape[0]):
-                chunk_colors = colors[chunk]
+            for chunk in range(lists.colors.shape[1]):
+                colors = lists.colors[view if lists.colors.shape[0] > 1 else 0, chunk]
+                layer_colors = layer.colors[chunk] if len(layer.offsets) > 1 else colors
                 buffer[:PLANE] = -1.0  # what lies outside the image counts as finished
                 buffer[PLANE : PLANE * (1 + channels)] = 0.0
                 for y in range(y1 - y0):
@@ -147,81 +162,102 @@ def raster_kernels(lanes: int, channels: int) -> tuple[Any, Any]:
                     for x in range(x1 - x0):
                         buffer[row + x * rows] = 1.0
                 at = begin
-                while at < end and any_unfinished(variant, buffer, vectors):
-                    stop = min(end, at + BATCH)
-                    list_blocks(variant, records, order, at, stop, box, rows, (starts, xis, etas, ends))
+                other, last_other = layer_pairs(layer, view, tile, tiles)
+                while (at < end or other < last_other) and any_unfinished(variant, buffer, vectors):
+                    count, at, other = merge_batch(order, keys, at, end, layer, other, last_other, mixed, True)
+                    blocks = (starts, xis, etas, ends)
+                    list_blocks(variant, records, layer_records, mixed, count, box, rows, blocks)
                     first = 0
-                    for k in range(stop - at):
-                        last, i = np.int64(ends[k]), np.int64(order[at + k])
-                        composite_blocks(variant, buffer, records, chunk_colors, starts, xis, etas, first, last, i)
+                    for k in range(count):
+                        last, i = np.int64(ends[k]), np.int64(mixed[k])
+                        own_records, own_colors = (records, colors) if i >= 0 else (layer_records, layer_colors)
+                        i = max(i, -1 - i)
+                        composite_blocks(variant, buffer, own_records, own_colors, starts, xis, etas, first, last, i)
                         first = last
-                    at = stop
-                processed[chunk, tile] = at - begin
+                processed[chunk, item] = at - begin
                 for y in range(y1 - y0):
                     row = y // rows * ROW_WIDTH * rows + y % rows
                     for x in range(x1 - x0):
-                        alpha[y0 + y, x0 + x] = np.float32(1.0) - abs(buffer[row + x * rows])
+                        alpha[view, y0 + y, x0 + x] = np.float32(1.0) - abs(buffer[row + x * rows])
                     for c in range(channels):
                         for x in range(x1 - x0):
                             value = buffer[PLANE * (1 + c) + row + x * rows]
-                            image[chunk * channels + c, y0 + y, x0 + x] = value
+                            image[view, chunk * channels + c, y0 + y, x0 + x] = value
 
     @kernel
     def raster_backward(
-        records: Any, colors: Any, order: Any, slots: Any, tiles: Any, offsets: Any, processed: Any, width: int,
-        height: int, image: Any, alpha: Any, d_image: Any, d_alpha: Any, sums: Any, counter: Any, buffer: Any,
-        starts: Any, xis: Any, etas: Any, ends: Any,
+        lists: Any, slots: Any, boxes: Any, layer: Any, width: int, height: int, image: Any, alpha: Any, processed: Any,
+        d_image: Any, d_alpha: Any, sums: Any, counter: Any, buffer: Any, starts: Any, xis: Any, etas: Any, ends: Any,
+        mixed: Any,
     ) -> None:  # fmt: skip
-        """Write the gradients of all tiles to sums [chunks, pairs * record width], see project_gradient.py."""
+        """Write the gradients of all tiles to sums [chunks, pairs * record width], see project_gradient.py.
+
+        A tile is done with its last Gaussian that has gradients, as R there comes from the image. slots [V, N + 1] and
+        boxes [V, N, 4] are the projection's.
+        """
         width_of_record = (MOMENTS + channels + 7) // 8 * 8
+        tiles = tile_count(width, height)
         while True:
-            tile = fetch_add(counter, 0, 1)
-            if tile >= offsets.shape[0] - 1:
+            item = fetch_add(counter, 0, 1)
+            if item >= len(lists.offsets) - 1:
                 break
+            begin = lists.offsets[item]
+            if begin == lists.offsets[item + 1]:
+                continue
+            view, tile = item // tiles, item % tiles
             box = tile_box(tile, width, height)
             x0, x1, y0, y1 = box
             tx, ty = x0 // TILE_WIDTH, y0 // TILE_HEIGHT
-            for chunk in range(colors.shape[0]):
-                chunk_colors = colors[chunk]
+            records, keys, order = lists.records[view], lists.keys[view], lists.order
+            slots_here, boxes_here = slots[view], boxes[view]
+            layer_records = layer.records[layer.chosen[view]] if len(layer.offsets) > 1 else records
+            for chunk in range(lists.colors.shape[1]):
+                colors = lists.colors[view if lists.colors.shape[0] > 1 else 0, chunk]
+                layer_colors = layer.colors[chunk] if len(layer.offsets) > 1 else colors
+                chunk_sums = sums[chunk]
                 buffer[:PLANE] = -1.0
                 buffer[PLANE : PLANE * (3 + channels)] = 0.0
                 for y in range(y1 - y0):
                     row = y // rows * ROW_WIDTH * rows + y % rows
                     for x in range(x1 - x0):
-                        at = row + x * rows
+                        pixel = row + x * rows
                         # the alpha image belongs to the first chunk
-                        own = d_alpha[y0 + y, x0 + x] if chunk == 0 else np.float32(0.0)
-                        rest = own * alpha[y0 + y, x0 + x]
+                        own = d_alpha[view, y0 + y, x0 + x] if chunk == 0 else np.float32(0.0)
+                        rest = own * alpha[view, y0 + y, x0 + x]
                         for c in range(channels):
-                            d = d_image[chunk * channels + c, y0 + y, x0 + x]
-                            buffer[PLANE * (2 + c) + at] = d
-                            rest += d * image[chunk * channels + c, y0 + y, x0 + x]
-                        buffer[at] = 1.0
-                        buffer[PLANE + at] = rest
-                        buffer[PLANE * (2 + channels) + at] = own
-                begin = offsets[tile]
-                end = begin + processed[chunk, tile]
-                at = begin
+                            d = d_image[view, chunk * channels + c, y0 + y, x0 + x]
+                            buffer[PLANE * (2 + c) + pixel] = d
+                            rest += d * image[view, chunk * channels + c, y0 + y, x0 + x]
+                        buffer[pixel] = 1.0
+                        buffer[PLANE + pixel] = rest
+                        buffer[PLANE * (2 + channels) + pixel] = own
+                other, last_other = layer_pairs(layer, view, tile, tiles)
+                at, end = begin, begin + processed[chunk, item]
                 while at < end:
-                    stop = min(end, at + BATCH)
-                    list_blocks(variant, records, order, at, stop, box, rows, (starts, xis, etas, ends))
+                    count, at, other = merge_batch(order, keys, at, end, layer, other, last_other, mixed, False)
+                    blocks = (starts, xis, etas, ends)
+                    list_blocks(variant, records, layer_records, mixed, count, box, rows, blocks)
                     first = 0
-                    for k in range(stop - at):
-                        last, i = np.int64(ends[k]), np.int64(order[at + k])
-                        row = np.int64(slot_of(slots, tiles, i, tx, ty)) * width_of_record
-                        differentiate_blocks(
-                            variant, buffer, records, chunk_colors, starts, xis, etas, sums[chunk], first, last, i, row
-                        )  # fmt: skip
+                    for k in range(count):
+                        last, i = np.int64(ends[k]), np.int64(mixed[k])
+                        if i < 0:
+                            replay_blocks(
+                                variant, buffer, layer_records, layer_colors, starts, xis, etas, first, last, -1 - i
+                            )
+                        else:
+                            row = np.int64(slot_of(slots_here, boxes_here, i, tx, ty)) * width_of_record
+                            differentiate_blocks(
+                                variant, buffer, records, colors, starts, xis, etas, chunk_sums, first, last, i, row
+                            )
                         first = last
-                    at = stop
-                for m in range(end, offsets[tile + 1]):
-                    row = np.int64(slot_of(slots, tiles, order[m], tx, ty)) * width_of_record
+                for m in range(end, lists.offsets[item + 1]):
+                    row = np.int64(slot_of(slots_here, boxes_here, order[m], tx, ty)) * width_of_record
                     sums[chunk, row : row + width_of_record] = 0.0
 
     return raster_forward, raster_backward
 
 
 @helper
-def slot_of(slots: Any, tiles: Any, i: int, tx: int, ty: int) -> int:
+def slot_of(slots: Any, boxes: Any, i: int, tx: int, ty: int) -> int:
     """Return the gradient record of Gaussian i in tile (tx, ty)."""
-    return slots[i] + (ty - tiles[i, 2]) * (tiles[i, 1] - tiles[i, 0]) + tx - tiles[i, 0]
+    return slots[i] + (ty - boxes[i, 2]) * (boxes[i, 1] - boxes[i, 0]) + tx - boxes[i, 0]

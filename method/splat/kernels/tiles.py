@@ -15,23 +15,23 @@ from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 def tile_offsets(histogram: Any, offsets: Any) -> int:
     """Turn the counts of `project_forward` into write positions, in place; return the number of pairs.
 
-    histogram [blocks, 1 + tiles]: afterwards column 0 is each block's first pair (in Gaussian order), the others its
-    first position in each tile's list; offsets [tiles + 1] bound the tiles' lists.
+    histogram [V, blocks, 1 + tiles]: afterwards column 0 is each block's first pair (in Gaussian order), the others
+    its first position in each tile's list; offsets [V * tiles + 1] bound the tiles' lists.
     """
-    blocks, tiles = histogram.shape[0], offsets.shape[0] - 1
-    total = 0
-    for b in range(blocks):
-        count = histogram[b, 0]
-        histogram[b, 0] = total
-        total += count
-    position = 0
-    for tile in range(tiles):
-        offsets[tile] = position
+    views, blocks, tiles = histogram.shape[0], histogram.shape[1], histogram.shape[2] - 1
+    total, position = 0, 0
+    for view in range(views):
         for b in range(blocks):
-            count = histogram[b, 1 + tile]
-            histogram[b, 1 + tile] = position
-            position += count
-    offsets[tiles] = position
+            count = histogram[view, b, 0]
+            histogram[view, b, 0] = total
+            total += count
+        for tile in range(tiles):
+            offsets[view * tiles + tile] = position
+            for b in range(blocks):
+                count = histogram[view, b, 1 + tile]
+                histogram[view, b, 1 + tile] = position
+                position += count
+    offsets[views * tiles] = position
     return position
 
 
@@ -39,27 +39,30 @@ def tile_offsets(histogram: Any, offsets: Any) -> int:
 def fill_tiles(keys: Any, tiles: Any, across: int, histogram: Any, slots: Any, pairs: Any, counter: Any) -> None:
     """Write each visible Gaussian into its tiles' lists, in index order: pairs [P] uint64 = depth bits << 32 | index.
 
-    slots [N + 1]: Gaussian i owns the gradient records slots[i]:slots[i + 1], one per tile it touches.
+    slots [V, N + 1]: Gaussian i of view v owns the gradient records slots[v, i]:slots[v, i + 1], one per tile it
+    touches. The other arrays are as in `Projected`.
     """
-    n, blocks = keys.shape[0], histogram.shape[0]
+    views, blocks, n = histogram.shape[0], histogram.shape[1], keys.shape[1]
     while True:
-        block = fetch_add(counter, 0, 1)
-        if block >= blocks:
+        item = fetch_add(counter, 0, 1)
+        if item >= views * blocks:
             break
-        slot = histogram[block, 0]
+        v, block = item // blocks, item % blocks
+        slot = histogram[v, block, 0]
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-            slots[i] = slot
-            if keys[i] == CULLED:
+            slots[v, i] = slot
+            if keys[v, i] == CULLED:
                 continue
-            pair = (np.uint64(keys[i]) << np.uint64(32)) | np.uint64(i)
-            slot += (tiles[i, 1] - tiles[i, 0]) * (tiles[i, 3] - tiles[i, 2])
-            for ty in range(tiles[i, 2], tiles[i, 3]):
-                for tx in range(tiles[i, 0], tiles[i, 1]):
+            pair = (np.uint64(keys[v, i]) << np.uint64(32)) | np.uint64(i)
+            box = tiles[v, i]
+            slot += (box[1] - box[0]) * (box[3] - box[2])
+            for ty in range(box[2], box[3]):
+                for tx in range(box[0], box[1]):
                     column = 1 + ty * across + tx
-                    pairs[histogram[block, column]] = pair
-                    histogram[block, column] += 1
+                    pairs[histogram[v, block, column]] = pair
+                    histogram[v, block, column] += 1
         if block == blocks - 1:
-            slots[n] = slot
+            slots[v, n] = slot
 
 
 @helper
