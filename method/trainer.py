@@ -18,6 +18,7 @@ from spike4dgs.benchmark.method import Progress
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import (
+    Averages,
     Decay,
     apply_edit,
     export_state,
@@ -57,6 +58,9 @@ class Trainer:
         if settings.refine_poses and settings.freeze_background:
             fix = "choose one of them: a background is projected once"
             raise problem("settings", "trainer.refine_poses or trainer.freeze_background", "both", fix)
+        if settings.average > 1 - density.until:
+            expected = f"trainer.average of at most {1 - density.until:g}, as density.until is {density.until:g}"
+            raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")
         self.training_images, self.motion, self.supervision = images, motion, supervision
         self.settings, self.density, self.scale, self.seed = settings, density, scale, seed
         self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
@@ -95,6 +99,7 @@ class Trainer:
         groups = {name: [leaf] for name, leaf in self.gaussians.tensors().items()}
         self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
         self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)
+        self.averages = Averages()
 
     def _continue(self, stage: Stage) -> None:
         """Go over to a stage: static Gaussians become a background, or a piece of the clip ends and another begins."""
@@ -166,7 +171,17 @@ class Trainer:
             self.statistics.add(out)
         self.step += 1
         self._adapt_density(stage)
+        self._average(stage)
         return loss.detach()
+
+    def _average(self, stage: Stage) -> None:
+        """Take the last steps of a stage into the mean of the parameters, which is what the stage ends with."""
+        averaged = round(self.settings.average * stage.steps)
+        left = stage.first + stage.steps - self.step
+        if left < averaged:
+            self.averages.add(self.adam, averaged - left)
+            if not left:
+                self.averages.apply(self.adam)
 
     def _correct_by(self, snapshot: Gaussians) -> None:
         """Correct values that are means over spans of time by a snapshot of the stage's model from now on."""
@@ -246,6 +261,7 @@ class Trainer:
             "supervision": self.supervision.state_dict(),
             "poses": self.poses.state_dict(),
             "adam": export_state(self.adam),
+            "average": self.averages.means,
             "statistics": {"gradient": self.statistics.gradient, "seen": self.statistics.seen},
         }
         return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
@@ -271,4 +287,5 @@ class Trainer:
         if snapshot := saved.part("snapshot"):
             self._correct_by(Gaussians.from_tensors({k: v.to(device) for k, v in snapshot.items()}))
         import_state(self.adam, saved.part("adam"))
+        self.averages.means = {k: v.to(device) for k, v in saved.part("average").items()}
         self.statistics = GradientStatistics(on["statistics"]["gradient"], on["statistics"]["seen"])

@@ -48,6 +48,7 @@ class TrainerSettings(Settings):
     lr_opacities: float = 0.05  # of their logits
     lr_colors: float = 5e-3
     lr_last: float = 1.0  # of scales, rotations, opacities and colours at a stage's end, x their first
+    average: float = 0.0  # share of a stage's steps, its last ones, whose parameters are averaged
     beta1: float = 0.9
     beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -78,6 +79,35 @@ def apply_edit(adam: torch.optim.Adam, edit: Edit) -> Gaussians:
         if state:
             adam.state[leaf] = state
     return new
+
+
+class Averages:
+    """Running means of all of an optimiser's parameters (Polyak and Ruppert's averaging), as `GROUP.INDEX` -> tensor.
+
+    Steps of a few views each leave the parameters jittering around the optimum at the size of the learning rate; their
+    mean does not.
+    """
+
+    def __init__(self) -> None:
+        self.means: dict[str, Tensor] = {}
+
+    def add(self, adam: torch.optim.Adam, count: int) -> None:
+        """Take in the parameters of the `count`-th step that is averaged, from 1 on."""
+        for name, p in _parameters(adam):
+            value = p.detach()
+            self.means[name] = value.clone() if count == 1 else self.means[name].lerp_(value, 1 / count)
+
+    def apply(self, adam: torch.optim.Adam) -> None:
+        """Replace the parameters by their means."""
+        with torch.no_grad():
+            for name, p in _parameters(adam):
+                p.copy_(self.means[name])
+
+
+def _parameters(adam: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:
+    for group in adam.param_groups:
+        for i, p in enumerate(group["params"]):
+            yield f"{group['name']}.{i}", p
 
 
 def export_state(adam: torch.optim.Adam) -> dict[str, Tensor]:

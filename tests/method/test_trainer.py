@@ -17,7 +17,7 @@ from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.observations.instants import correction, node
 from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.training_images import Spans, TrainingImages
-from spike4dgs.method.schedule import choose_time, stages
+from spike4dgs.method.schedule import Stage, choose_time, stages
 from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.splat import render
 from spike4dgs.method.supervision.table import SUPERVISIONS
@@ -135,6 +135,27 @@ def test_a_motion_with_a_network_corrects_nothing() -> None:
     assert fit.corrections is None
 
 
+def test_a_stage_ends_with_the_mean_of_its_last_steps() -> None:
+    fit, values = trainer(30, motion="paths", average=0.25), []
+    average = fit._average
+
+    def recorded(stage: Stage) -> None:
+        values.append(fit.gaussians.means.detach().clone())
+        average(stage)
+
+    fit._average = recorded
+    while fit.step < fit.total:
+        fit.train_step()
+    assert round(0.25 * fit.plan[1].steps) == 5
+    torch.testing.assert_close(fit.gaussians.means.detach(), torch.stack(values[-5:]).mean(0), atol=1e-6, rtol=0)
+    assert not torch.equal(fit.gaussians.means.detach(), values[-1])
+
+
+def test_nothing_is_averaged_before_the_number_of_gaussians_is_settled() -> None:
+    with pytest.raises(UserError, match=r"trainer.average of at most 0.4, as density.until is 0.6"):
+        trainer(average=0.5)
+
+
 class Killed(Exception):
     pass
 
@@ -148,6 +169,7 @@ PARTS_WITH_STATE = {
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
     "paths": {"motion": "paths", "freeze_background": True, "steps": 24},  # a background from step 8 on
+    "average": {"motion": "hexplane", "average": 0.3},  # from steps 3 and 10 on, networks too
     "spans": {"motion": "paths", "freeze_background": True, "steps": 24, "spans": wide_spans},  # corrected from 13 on
 }
 
@@ -165,6 +187,8 @@ def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
         *(("hexplane", s) for s in range(1, 12)),
         *((p, s) for p in ("spacetime", "spike-render") for s in (3, 6, 9)),
         *(("paths", s) for s in (7, 8, 9, 15)),
+        *(("average", s) for s in (2, 3, 4, 5, 10, 11)),
+        *(("spans", s) for s in (8, 12, 13, 14, 16, 17, 20)),
     ],
 )
 def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path):
