@@ -5,6 +5,7 @@ OpenMP (numba's prange, torch) makes waiting threads spin: on a busy machine tha
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Sequence
@@ -46,9 +47,9 @@ def work_counter() -> np.ndarray:
 
 def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
     """Return an uninitialised array that begins on a cache line."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.empty(size + 64, np.uint8)
-    start = -raw.ctypes.data % 64
+    start = -raw.__array_interface__["data"][0] % 64  # ctypes.data takes 30 times as long
     return raw[start : start + size].view(dtype).reshape(shape)
 
 
