@@ -32,13 +32,17 @@ def at_time_cpu(tensors: tuple[Tensor, ...], t: float) -> Four:
     return out
 
 
+def _scratch(n: int) -> list[tuple[()]]:
+    return [()] * threads.useful_threads(n, 4 * ITEM)
+
+
 class _AtTime(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, t: float, *tensors: Tensor) -> Four:
         ctx.t, ctx.arrays = np.float32(t), tuple(x.detach().contiguous().numpy() for x in tensors)
         means, log_scales, quats, logits = ctx.arrays[:4]
         out = np.empty_like(means), np.empty_like(quats), np.empty_like(log_scales), np.empty_like(logits)
-        threads.run(_forward, (ctx.t, *ctx.arrays, *out), [()] * threads.get_threads())
+        threads.run(_forward, (ctx.t, *ctx.arrays, *out), _scratch(len(means)))
         ctx.scales = out[2]
         at_t = tuple(torch.from_numpy(x) for x in out)
         return at_t[0], at_t[1], at_t[2], at_t[3]
@@ -50,7 +54,7 @@ class _AtTime(torch.autograd.Function):
         own = tuple(np.empty_like(x) for x in (log_scales, logits, times, durations, coefficients, turning))
         given = (x.numpy() for x in (d_means, d_quats, d_scales, d_opacities))
         arguments = (ctx.t, logits, times, durations, ctx.scales, *given, *own)
-        threads.run(_backward, arguments, [()] * threads.get_threads())
+        threads.run(_backward, arguments, _scratch(len(times)))
         d_log_scales, *rest = (torch.from_numpy(x) for x in own)
         return None, d_means, d_log_scales, d_quats, *rest
 

@@ -40,6 +40,11 @@ def get_threads() -> int:
     return _threads
 
 
+def useful_threads(items: int, each: int) -> int:
+    """Return how many threads to use for `items` small pieces of work: one for every `each`, which pay its start."""
+    return max(1, min(_threads, items // each))
+
+
 def work_counter() -> np.ndarray:
     """Return a fresh counter [1] int64 for one `run`, on a cache line of its own."""
     return np.zeros(8, np.int64)
