@@ -55,9 +55,9 @@ class GradientStatistics:
         if grad is None:
             return
         views, height, width = out.alpha.shape
-        half = torch.tensor([width / 2, height / 2], dtype=grad.dtype, device=grad.device) * views
         visible = out.visible
-        self.gradient += torch.where(visible, (grad * half).norm(dim=-1), 0.0).sum(0).float()
+        length = torch.hypot(grad[..., 0] * (width / 2 * views), grad[..., 1] * (height / 2 * views))
+        self.gradient += torch.where(visible, length, 0.0).sum(0).float()
         self.seen += visible.sum(0)
 
     def mean(self) -> Tensor:

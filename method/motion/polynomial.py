@@ -20,6 +20,7 @@ from torch import Tensor
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.motion.polynomial_cpu import at_time_cpu
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats
 
@@ -75,6 +76,15 @@ class PolynomialMotion(Motion):
 
 def at_time(gaussians: Gaussians, t: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return means, quaternions, scales and opacities at t, as `Splats` takes them."""
+    g, extra = gaussians, gaussians.extra
+    if g.means.device.type != "cpu" or g.means.dtype != torch.float32:
+        return at_time_reference(g, t)
+    own = ("times", "log_temporal_scales", "coefficients", "angular_velocities")
+    return at_time_cpu((g.means, g.log_scales, g.quats, g.logits, *(extra[name] for name in own)), t)
+
+
+def at_time_reference(gaussians: Gaussians, t: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the same by plain torch: the twin of the kernels, and what runs on other devices."""
     extra = gaussians.extra
     d = t - extra["times"]  # [N]
     fade = torch.exp(-(d * torch.exp(-extra["log_temporal_scales"])).square())

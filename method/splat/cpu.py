@@ -24,7 +24,7 @@ from spike4dgs.method.splat.kernels.jit import announce_compilation
 from spike4dgs.method.splat.kernels.project import Cameras, Geometry, Projected
 from spike4dgs.method.splat.kernels.project_gradient import Gradients, Records
 from spike4dgs.method.splat.kernels.raster import Layer, Lists, raster_kernels, record_width
-from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run
+from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run, useful_threads
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
 
@@ -126,7 +126,7 @@ def no_layer() -> Layer:
 
 def project_views(geometry: Geometry, cameras: Cameras, s: Settings, centers: Array, radii: Array) -> Projection:
     """Project into V views and list the tiles; fills centers [V, N, 2] and radii [V, N]. Raises UserError for NaN."""
-    views, n, threads = len(cameras.entries), len(geometry.means), get_threads()
+    views, n = len(cameras.entries), len(geometry.means)
     across, down = s.tiles
     blocks = -(-n // project_kernels.BLOCK)
     records = aligned((views, n, 8), np.float64)
@@ -136,12 +136,16 @@ def project_views(geometry: Geometry, cameras: Cameras, s: Settings, centers: Ar
     invalid, offsets = np.empty((views, blocks), np.int64), np.empty(views * across * down + 1, np.int64)
     out = Projected(records, keys, depths, centers, radii, tiles, histogram, invalid)
     announce_compilation(project_kernels.project_forward, "CPU splatting")
-    scratch = [(_thread_memory(t)[0],) for t in range(threads)]
+    scratch = [(_thread_memory(t)[0],) for t in range(useful_threads(views * blocks, 16))]
     run(project_kernels.project_forward, (geometry, cameras, out), scratch)
     if n and invalid.max() >= 0:
         raise not_finite("geometry", int(invalid.max()))
     pairs = np.empty(tile_kernels.tile_offsets(histogram, offsets), np.uint64)
-    run(tile_kernels.fill_tiles, (keys, tiles, across, histogram, slots, pairs), [()] * threads)
+    run(
+        tile_kernels.fill_tiles,
+        (keys, tiles, across, histogram, slots, pairs),
+        [()] * useful_threads(views * blocks, 64),
+    )
     return Projection(cameras, records, keys, depths, tiles, slots, pairs, offsets)
 
 
@@ -181,10 +185,11 @@ def differentiate(
     sums = record_sums(frames, s, d_image, d_alpha, chunking(channels + s.depth)[0])
     means, quats, scales, opacities = (np.zeros(a.shape, dtype) for a in geometry)
     colors, centers = np.zeros((n, channels), np.float32), np.empty((views, n, 2), dtype)
-    poses = np.empty((views, -(-n // project_kernels.BLOCK) if posed else 0, 12))
+    blocks = -(-n // project_kernels.BLOCK)
+    poses = np.empty((views, blocks if posed else 0, 12))
     gradients = Gradients(means, quats, scales, opacities, colors, centers, poses)
     records = Records(p.keys, p.slots, sums, channels if s.depth else -1)
-    scratch = [_thread_memory(t)[:2] for t in range(get_threads())]
+    scratch = [_thread_memory(t)[:2] for t in range(useful_threads(views * blocks, 16))]
     run(project_gradient.project_backward, (geometry, p.cameras, records, gradients), scratch)
     return gradients
 

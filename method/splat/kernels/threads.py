@@ -5,6 +5,7 @@ OpenMP (numba's prange, torch) makes waiting threads spin: on a busy machine tha
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Sequence
@@ -39,6 +40,11 @@ def get_threads() -> int:
     return _threads
 
 
+def useful_threads(items: int, each: int) -> int:
+    """Return how many threads to use for `items` small pieces of work: one for every `each`, which pay its start."""
+    return max(1, min(_threads, items // each))
+
+
 def work_counter() -> np.ndarray:
     """Return a fresh counter [1] int64 for one `run`, on a cache line of its own."""
     return np.zeros(8, np.int64)
@@ -46,9 +52,9 @@ def work_counter() -> np.ndarray:
 
 def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
     """Return an uninitialised array that begins on a cache line."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.empty(size + 64, np.uint8)
-    start = -raw.ctypes.data % 64
+    start = -raw.__array_interface__["data"][0] % 64  # ctypes.data takes 30 times as long
     return raw[start : start + size].view(dtype).reshape(shape)
 
 
