@@ -146,6 +146,8 @@ BEYOND = (
             "trainer.moving_change": 0.012,
             "trainer.initial_scale": 0.5,
             "trainer.coarse_steps": 600,
+            "trainer.views_per_step": 2,
+            "trainer.average": 0.2,
             "density.max_gaussians": 36_000,
         },
     ),

@@ -186,7 +186,7 @@ class Trainer:
     def _correct_by(self, snapshot: Gaussians) -> None:
         """Correct values that are means over spans of time by a snapshot of the stage's model from now on."""
         stage, training = self.stage, self.training_images
-        if training.spans is None or not self.settings.correct_spans:
+        if training.spans is None:
             return
         if any(True for _ in self.motion.parameters()):  # they would go on learning; the snapshot's Gaussians do not
             return

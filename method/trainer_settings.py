@@ -35,9 +35,6 @@ class TrainerSettings(Settings):
     freeze_background: bool = False  # after the static stage, Gaussians where nothing changes become a background
     moving_change: float = POINTS.limit  # standard deviation over time, in white, above which points move
 
-    # Images whose values are means over known spans of time.
-    correct_spans: bool = True  # make them instants by what the model says of the difference
-
     # Gaussians.
     initial_opacity: float = 0.5  # points from a plane sweep lie on surfaces; 0.1 suits sparse clouds
     initial_scale: float = 1.0  # x the mean distance of a point's 3 nearest ones, 3DGS's

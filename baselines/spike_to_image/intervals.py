@@ -34,7 +34,7 @@ from spike4dgs.benchmark.spikes.times import spike_times
 class IntervalSettings(AdaptiveSettings):
     """The windows of `adaptive`, and the span where light changes."""
 
-    half: float = 5.0  # ticks on either side: two renders follow what moves about a pixel in twice that
+    half: float = 10.0  # ticks on either side: a fit follows what moves about two pixels in twice that
 
 
 def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
