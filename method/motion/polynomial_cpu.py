@@ -67,7 +67,7 @@ def _forward(
     """Fill the last four arrays before `counter`."""
     one = np.float32(1)
     while True:
-        first = fetch_add(counter, 0, 1) * ITEM
+        first = fetch_add(counter, 0, 1) * ITEM  # type: ignore[call-arg]
         if first >= len(times):
             break
         for i in range(first, min(first + ITEM, len(times))):
@@ -91,7 +91,7 @@ def _backward(
     """Fill the last six arrays before `counter`. No gradient goes through d = t - times in paths and rotations."""
     one, two = np.float32(1), np.float32(2)
     while True:
-        first = fetch_add(counter, 0, 1) * ITEM
+        first = fetch_add(counter, 0, 1) * ITEM  # type: ignore[call-arg]
         if first >= len(times):
             break
         for i in range(first, min(first + ITEM, len(times))):
