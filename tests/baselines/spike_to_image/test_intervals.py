@@ -65,7 +65,8 @@ def test_constant_light_keeps_the_long_windows_of_adaptive():
     spikes = fire(np.full((200, 6, 7), 0.3) * np.linspace(0.2, 2, 42).reshape(6, 7), np.full((6, 7), 0.4))
     rate, spans = intervals(stream_of(spikes), 100)
     np.testing.assert_array_equal(rate, adaptive_image(stream_of(spikes), 100))
-    assert (spans[0] == -5).all() and (spans[1] == 5).all()
+    half = IntervalSettings().half
+    assert (spans[0] == -half).all() and (spans[1] == half).all()
 
 
 def errors(n=160, half=10.0, seed=0):
