@@ -7,7 +7,8 @@ coarse sweep from infinity to the parallax at which the views would hardly overl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.splat.kernels.threads import get_threads
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -72,7 +74,7 @@ def find_range(cameras: Sequence[Camera], images: Float32, settings: SweepSettin
     planes, step = full_range(cameras, settings), inverse_depth_step(cameras, settings.parallax_step_px)
     half = [half_size(c) for c in cameras]
     small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in images])
-    maps = [sweep(half, small, i, planes[::2], settings=settings) for i in range(len(cameras))]
+    maps = sweep_all(half, small, planes[::2], settings=settings)
     found = np.concatenate([m.inverse[agreed(half, maps, i, settings)] for i, m in enumerate(maps)])
     if not len(found):
         return planes
@@ -87,15 +89,32 @@ def half_size(camera: Camera) -> Camera:
     return Camera(c.id, width, height, c.fx * x, c.fy * y, c.cx * x, c.cy * y, c.R, c.t)
 
 
-def plane_homography(reference: Camera, other: Camera, inverse_depth: float) -> Float64:
-    """Return the homography [3, 3] from `reference` to `other` over the plane z = 1 / inverse_depth of its frame.
+def plane_homographies(reference: Camera, other: Camera, inverse_depths: Sequence[float]) -> Iterator[Float64]:
+    """Yield the homographies [3, 3] from `reference` to `other` over planes z = 1 / inverse_depth of its frame.
 
     x' ~ K' (R + t w n^T) K^-1 x with the relative pose (R, t), w the inverse depth and n the optical axis.
     Coordinates have pixel centres at +0.5.
     """
     R = other.R @ reference.R.T
     t = other.t - R @ reference.t
-    return np.asarray(other.K @ (R + np.outer(t, [0.0, 0.0, inverse_depth])) @ np.linalg.inv(reference.K))
+    intrinsic, back = other.K, np.linalg.inv(reference.K)
+    yield from (intrinsic @ (R + np.outer(t, [0.0, 0.0, w])) @ back for w in inverse_depths)
+
+
+def sweep_all(
+    cameras: Sequence[Camera],
+    images: Float32,
+    planes: Float64,
+    pixels: Sequence[Mask] | None = None,
+    settings: SweepSettings = DEFAULTS,
+) -> list[DepthMap]:
+    """Return `sweep` of every view, with `pixels` a mask for each; views are shared out among threads."""
+
+    def one(index: int) -> DepthMap:
+        return sweep(cameras, images, index, planes, pixels[index] if pixels is not None else None, settings)
+
+    with ThreadPoolExecutor(get_threads()) as pool:
+        return list(pool.map(one, range(len(cameras))))
 
 
 def sweep(
@@ -120,12 +139,12 @@ def sweep(
     here = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5], [0, 0, 1.0]])  # array index to pixel coordinate
     there = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # and back
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for plane, w in enumerate(planes):
+    others = [i for i in range(len(cameras)) if i != index]
+    maps = [plane_homographies(cameras[index], cameras[other], planes.tolist()) for other in others]
+    for plane, homographies in enumerate(zip(*maps, strict=True)):
         total, seen = scores[plane], np.zeros((height, width), np.float32)
-        for other in range(len(cameras)):
-            if other == index:
-                continue
-            H = there @ plane_homography(cameras[index], cameras[other], float(w)) @ here
+        for other, homography in zip(others, homographies, strict=True):
+            H = there @ homography @ here
             warped = cv2.warpPerspective(
                 images[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
             )

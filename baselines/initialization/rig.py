@@ -26,7 +26,7 @@ from spike4dgs.baselines.initialization.plane_sweep import (
     find_range,
     inverse_depth_step,
     lift,
-    sweep,
+    sweep_all,
     widest_baseline,
 )
 from spike4dgs.benchmark.array.camera_state import Clock
@@ -104,7 +104,7 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
     ]
     moving = _moving_pixels(scene, [np.stack(c) for c in counts])
     planes = find_range(scene.cameras, mean, settings)
-    maps = [sweep(scene.cameras, mean, i, planes, settings=settings) for i in range(len(scene.cameras))]
+    maps = sweep_all(scene.cameras, mean, planes, settings=settings)
     seen = seen_pixels(scene)
     static = [~m & s for m, s in zip(moving, seen, strict=True)] if seen else [~m for m in moving]
     clouds = [_points(scene.cameras, maps, mean, static, settings)]
@@ -114,7 +114,7 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
         images = _marked(scene, window_means(scene, start, stop, flat_field))
         near = slice(max(0, at - 1), at + 2)
         quiet = [~m | (at == middle) for m in _moving_pixels(scene, [np.stack(c[near]) for c in counts])]
-        short = [sweep(scene.cameras, images, i, planes, m, settings) for i, m in enumerate(moving)]
+        short = sweep_all(scene.cameras, images, planes, moving, settings)
         pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
         clouds.append(_points(scene.cameras, short, images, pixels, settings))
     points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))

@@ -11,7 +11,7 @@ from spike4dgs.baselines.initialization.plane_sweep import (
     full_range,
     half_size,
     lift,
-    plane_homography,
+    plane_homographies,
     sweep,
 )
 from spike4dgs.baselines.initialization.rig import RigSettings, middle_camera, rig
@@ -37,7 +37,7 @@ def test_homography_maps_pixels_as_projecting_through_the_plane_does():
     uv = np.random.default_rng(0).uniform(0, 60, (20, 2))
     for inverse in (0.1, 0.4):
         points = a.unproject(uv, np.full(20, 1 / inverse))
-        mapped = np.column_stack([uv, np.ones(20)]) @ plane_homography(a, b, inverse).T
+        mapped = np.column_stack([uv, np.ones(20)]) @ next(plane_homographies(a, b, [inverse])).T
         assert np.allclose(mapped[:, :2] / mapped[:, 2:], b.project(points)[0], atol=1e-9)
 
 
