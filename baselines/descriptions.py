@@ -26,7 +26,6 @@ _IMAGES = {
 }
 _SUPERVISION = {
     "pixel": "",
-    "exposure": "means over time",
     "spike": "SpikeNeRF's loss",
     "spike-render": "SpikeGS's loss",
     "pixel+spike": "pixel loss and SpikeNeRF's",
