@@ -42,7 +42,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing.camera_paths import orbit, resized
 from spike4dgs.method.viewing.render_video import frame_times, render_frames
-from spike4dgs.method.viewing.video import video_writer
+from spike4dgs.benchmark.reports.sheets.video import video_writer
 
 MODEL, SHEET, VIDEO, REPORT = "model.safetensors", "sheet.png", "video.mp4", "report.html"
 PREDICTIONS = "predictions"

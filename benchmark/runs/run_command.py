@@ -32,7 +32,7 @@ from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
 from spike4dgs.benchmark.reports.scatter import write_scatter
-from spike4dgs.benchmark.reports.sheet import write_sheet
+from spike4dgs.benchmark.reports.sheets.sheet import write_sheet
 from spike4dgs.benchmark.results.record import Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results

@@ -21,7 +21,7 @@ from spike4dgs.method.splat import render as rasterise
 from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
 from spike4dgs.method.viewing.render_video import frame_times
 from spike4dgs.method.viewing.speed_render import exact_patch
-from spike4dgs.method.viewing.video import video_writer
+from spike4dgs.benchmark.reports.sheets.video import video_writer
 
 S = np.linspace(0, 1, 33)
 UP = np.array([0.0, 0.0, 1.0])
