@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 Value = TypeVar("Value", bound=np.generic)
 MARGIN = 0.15  # around what moves, of its size
 SMALLEST = 24  # pixels of a crop's side: smaller ones show no context
-STILL = 1.5  # a box that holds all of the motion stays where it is if its area is at most so many times a following one's
+STILL = (
+    1.5  # a box that holds all of the motion stays where it is if its area is at most so many times a following one's
+)
 
 
 class Box(NamedTuple):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spike4dgs.benchmark.reports.error_map import ERROR_MAX, scale_name
+from spike4dgs.benchmark.reports.error_map import scale_name
 from spike4dgs.benchmark.reports.figure import wrap_name
 from spike4dgs.benchmark.reports.sheets.panels import Panels, make_panels
 from spike4dgs.benchmark.reports.sheets.video import video_writer
@@ -27,16 +27,17 @@ FPS = 8  # images a second, so that each can be looked at
 WIDEST = 1700  # pixels of a frame
 PANEL = 230  # about the width of a panel in pixels; images are enlarged by whole numbers, so that pixels stay pixels
 TALLEST = 330
-GAP, LINE = 6, 18  # pixels
+GAP, LINE, FONT = 6, 18, 12  # pixels
 GROUND, TEXT = 18, 235  # gray values
 OUTLINE = (23, 190, 207)  # that of the sheet
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the panels are: pixels. A cell has two lines of a name, a line for its scale, an image, and its errors."""
+    """Where the panels are: pixels. A cell has the lines of a name, a line for its scale, an image, and its errors."""
 
     panel: tuple[int, int]  # width and height
+    head: int  # lines of the longest name
     zoom: int
     columns: int
     cells: int
@@ -51,7 +52,7 @@ class Layout:
     @property
     def cell_height(self) -> int:
         """Pixels from one row of cells to the next."""
-        return 3 * LINE + 2 * (self.panel[1] + GAP)
+        return (self.head + 1) * LINE + 2 * (self.panel[1] + GAP)
 
     def corner(self, cell: int) -> tuple[int, int]:
         """Return the upper left corner (x, y) of a cell."""
@@ -60,7 +61,8 @@ class Layout:
     def image(self, cell: int) -> tuple[slice, slice]:
         """Return the rows and columns of a cell's image."""
         x, y = self.corner(cell)
-        return slice(y + 3 * LINE, y + 3 * LINE + self.panel[1]), slice(x, x + self.panel[0])
+        top = y + (self.head + 1) * LINE
+        return slice(top, top + self.panel[1]), slice(x, x + self.panel[0])
 
     def errors(self, cell: int) -> tuple[slice, slice]:
         """Return the rows and columns of a cell's error map."""
@@ -88,7 +90,14 @@ def make_layout(panels: Panels) -> Layout:
     zoom = max(1, min(round(PANEL / w), TALLEST // h))
     cells = 1 + len(panels.scored)
     most = max(1, (WIDEST - GAP) // (w * zoom + GAP))
-    return Layout((w * zoom, h * zoom), zoom, math.ceil(cells / math.ceil(cells / most)), cells)
+    head = max(len(_name(name, w * zoom)) for name in ("ground truth", *panels.scored))
+    return Layout((w * zoom, h * zoom), head, zoom, math.ceil(cells / math.ceil(cells / most)), cells)
+
+
+def _name(name: str, width: int) -> list[str]:
+    """Return the lines of a name that fit into `width` pixels."""
+    characters = int(width / _font(FONT).getlength("n"))
+    return wrap_name(name, max(8, characters))
 
 
 def _frame(panels: Panels, layout: Layout, ground: UInt8, k: int) -> UInt8:
@@ -100,7 +109,9 @@ def _frame(panels: Panels, layout: Layout, ground: UInt8, k: int) -> UInt8:
             _whole(panels, layout, k) if name is None else _enlarged(panels.errors(name, k), layout.zoom)
         )
     x, y = layout.corner(0)
-    return _with_text(frame, [(x, y + LINE, f"{panels.scene.t_us(panels.targets[k].tick) / 1000:.2f} ms")], LINE)
+    return _with_text(
+        frame, [(x, y + layout.head * LINE, f"{panels.scene.t_us(panels.targets[k].tick) / 1000:.2f} ms")]
+    )
 
 
 def _enlarged(image: UInt8, zoom: int) -> UInt8:
@@ -130,15 +141,16 @@ def _ground(panels: Panels, layout: Layout) -> UInt8:
     lines = []
     for cell, name in enumerate([None, *panels.scored]):
         x, y = layout.corner(cell)
-        wrapped = ["ground truth"] if name is None else wrap_name(name, max(12, layout.panel[0] // 9))
-        lines += [(x, y + n * LINE, line) for n, line in enumerate(wrapped[:2])]
+        lines += [(x, y + n * LINE, line) for n, line in enumerate(_name(name or "ground truth", layout.panel[0]))]
         if name is not None:
-            lines.append((x, y + 2 * LINE, f"{scale_name(panels.scales[name])}: 0 to {panels.scales[name]:g}"))
+            lines.append(
+                (x, y + layout.head * LINE, f"{scale_name(panels.scales[name])}: 0 to {panels.scales[name]:g}")
+            )
     width, height = layout.size
-    legend = f"{_speed(panels)}Errors: |render - truth| of linear radiance, black 0; \N{MULTIPLICATION SIGN}1: white {ERROR_MAX:g}"
-    for n, line in enumerate(textwrap.wrap(legend, width // 7)[:2]):
+    legend = f"{_speed(panels)}Errors: |render - truth| of linear radiance, black is 0, 1 is white in the image."
+    for n, line in enumerate(textwrap.wrap(legend, int(width / _font(FONT).getlength("n")))[:2]):
         lines.append((GAP, height - GAP - (2 - n) * LINE, line))
-    return _with_text(np.full((height, width, 3), GROUND, np.uint8), lines, LINE)
+    return _with_text(np.full((height, width, 3), GROUND, np.uint8), lines)
 
 
 def _speed(panels: Panels) -> str:
@@ -150,14 +162,14 @@ def _speed(panels: Panels) -> str:
     return f"{panels.scene.id}, {panels.targets[0].camera}: slowed down {1e6 / FPS / step_us:.0f} times. "
 
 
-def _with_text(frame: UInt8, lines: Sequence[tuple[int, int, str]], height: int) -> UInt8:
+def _with_text(frame: UInt8, lines: Sequence[tuple[int, int, str]]) -> UInt8:
     """Return a frame with lines of text, each from its upper left corner (x, y)."""
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(frame)
     draw = ImageDraw.Draw(image)
     for x, y, text in lines:
-        draw.text((x, y), text, fill=(TEXT, TEXT, TEXT), font=_font(height * 2 // 3))
+        draw.text((x, y), text, fill=(TEXT, TEXT, TEXT), font=_font(FONT))
     return np.asarray(image).copy()
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.leaderboard.page.pictures import SMALLEST, crops, write_pictures
+from spike4dgs.leaderboard.page.pictures import write_pictures
 from spike4dgs.leaderboard.page.rows import gather
 
 
@@ -49,18 +49,3 @@ def test_what_cannot_be_shown_is_said(finished: Path, data: Path, tmp_path: Path
     assert [board.rows[i].name for i in found[0]["rows"]] == ["run/tfp+4dgs"] and found[1] is None
     assert any("run/rough on pattern-0" in line and "sha256" in line for line in said)
     assert any("no images of pattern-1" in line for line in said)
-
-
-def test_crops_hold_what_moves_and_have_one_size() -> None:
-    masks = [np.zeros((60, 90), bool) for _ in range(3)]
-    masks[0][5:15, 0:30] = masks[1][30:60, 70:80] = True
-    found = crops(masks)
-    assert found[2] is None
-    for mask, box in zip(masks[:2], found[:2], strict=True):
-        assert box is not None
-        x, y, w, h = box
-        assert mask[y : y + h, x : x + w].sum() == mask.sum() and x >= 0 and y >= 0 and x + w <= 90 and y + h <= 60
-        assert (w, h) == (39, 39)
-    small = np.zeros((60, 90), bool)
-    small[10, 10] = True
-    assert crops([small])[0] == (0, 0, SMALLEST, SMALLEST)
