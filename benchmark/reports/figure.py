@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 110
-TEXT_AS_TEXT = {"pdf.fonttype": 42}  # TrueType: can be searched and copied, and journals take it
+TRUETYPE = 42  # text that can be searched and copied, in a kind of font that journals take
 NO_HISTORY = {"Creator": None, "Producer": None, "CreationDate": None}  # the same figure gives the same bytes
 
 
 def new_figure(
-    size: tuple[float, float], layout: Literal["constrained", "compressed", "none"] = "constrained", dpi: int = DPI
+    size: tuple[float, float], layout: Literal["constrained", "compressed"] | None = "constrained", dpi: int = DPI
 ) -> Figure:
-    """Return a figure of `size` inches, independent of pyplot's state and of a display."""
+    """Return a figure of `size` inches, independent of pyplot's state and of a display; without layout where None."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -39,7 +39,7 @@ def save_with_pdf(figure: Figure, path: Path) -> None:
     from matplotlib import rc_context
 
     save_figure(figure, path)
-    with rc_context(TEXT_AS_TEXT), atomic_path(path.with_suffix(".pdf")) as part:
+    with rc_context({"pdf.fonttype": TRUETYPE}), atomic_path(path.with_suffix(".pdf")) as part:
         figure.savefig(part, metadata=NO_HISTORY)
 
 

@@ -75,7 +75,7 @@ def _cost(axes: Axes, label: Any, place: tuple[float, float], placed: Sequence[B
 def _overlap(a: Bbox, b: Bbox) -> float:
     """Return the area that two boxes share."""
     width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
-    return max(width, 0.0) * max(height, 0.0)
+    return float(max(width, 0.0) * max(height, 0.0))
 
 
 def log_ticks(low: float, high: float) -> list[float]:

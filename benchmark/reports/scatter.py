@@ -61,7 +61,7 @@ def write_scatter(path: Path, records: Sequence[Record]) -> None:
 
 def make_scatter(records: Sequence[Record]) -> Figure:
     """Return the scatter as a figure."""
-    figure = new_figure((11, 4.6), "none", dpi=160)
+    figure = new_figure((11, 4.6), None, dpi=160)
     markers = dict(
         zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle("osD^vP*X"), strict=False)
     )

@@ -23,7 +23,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Method, find_methods, make_budget
 from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
 from spike4dgs.benchmark.release.download.download_command import From
@@ -31,14 +31,12 @@ from spike4dgs.benchmark.release.download.track import track_folders
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
-from spike4dgs.benchmark.reports.scatter import write_scatter
-from spike4dgs.benchmark.reports.sheets.sheet import write_sheet
-from spike4dgs.benchmark.reports.sheets.sheet_video import write_sheet_video
 from spike4dgs.benchmark.results.record import Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
-from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results
+from spike4dgs.benchmark.runs.earlier import earlier_records, of_one_seed, write_results
+from spike4dgs.benchmark.runs.images import write_images
 from spike4dgs.benchmark.runs.oracle.ladder import SAMPLES, FindTruth, MakeLadders, climb
-from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
+from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 
 
@@ -240,24 +238,6 @@ def make_run_benchmark(
 ) -> Callable[..., int]:
     """Return the command `run-benchmark`, which calls these functions of other rooms."""
     return RunBenchmark(submit, measure_images, track_scenes, make_ladders, find_truth).run_benchmark
-
-
-def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> list[str]:
-    """Write sheet_SCENE and its video for each scene, and scatter; return which videos were not written, and why.
-
-    A method without its predictions is in no sheet.
-    """
-    left_out = []
-    for scene in scenes:
-        of_all = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
-        folders = {name: of_all[name] for r in records if is_shown(r, scene, of_all[name := r["method"]["name"]])}
-        write_sheet(out / f"sheet_{scene.id}.png", scene, folders, records)
-        try:
-            write_sheet_video(out / f"sheet_{scene.id}.mp4", scene, folders, records)
-        except UserError as e:  # the numbers of a long run are worth more than its video
-            left_out.append(f"no video: {e}")
-    write_scatter(out / "scatter.png", records)
-    return left_out
 
 
 def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> list[Method]:

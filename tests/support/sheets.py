@@ -1,4 +1,4 @@
-"""A small scene with the images of some methods: the truth with a known error each, and records that have their scores."""
+"""A small scene with the images of some methods, the truth with a known error each, and records of their scores."""
 
 from __future__ import annotations
 

@@ -105,11 +105,11 @@ def make_sheet(panels: Panels) -> Figure:
 
 def _lay_out(panels: Panels, panel: tuple[float, float], height: float) -> _Page:
     """Return an empty page, with room for the widest name."""
-    scratch = new_figure((1, 1), "none")
+    scratch = new_figure((1, 1), None)
     lines = [line for name in ("ground truth", *panels.folders) for line in wrap_name(name, NAME)]
     widths = [text_width(scratch, line, fontsize=LARGE, weight="bold") for line in lines]
     page = _Page(scratch, MARGIN + max(widths) + MARGIN, panel, len(panels.shown))
-    figure = new_figure((page.right + SCALE + MARGIN, height), "none", dpi=200)
+    figure = new_figure((page.right + SCALE + MARGIN, height), None, dpi=200)
     return _Page(figure, page.left, panel, page.instants)
 
 
@@ -134,7 +134,7 @@ def _truth(page: _Page, panels: Panels, y: float) -> None:
             page.text(x, y + height + 0.02, "moving region")
         if panels.is_cropped:
             _whole(page.axes(x + width + GAP, y, width, height), panels, k)
-            page.text(x + width + GAP, y + height + 0.02, "whole image, crop")
+            page.text(x + width + GAP, y + height + 0.02, "whole image and crop")
 
 
 def _whole(axes: Axes, panels: Panels, k: int) -> None:
@@ -163,8 +163,8 @@ def _method(page: _Page, panels: Panels, name: str, y: float) -> None:
     bar.imshow(np.linspace(1, 0, 256)[:, None], cmap=COLORS, aspect="auto", extent=(0, 1, 0, scale))
     bar.yaxis.tick_right()
     bottom, top = bar.set_yticks([0, scale], labels=["0", f"{scale:g}"], fontsize=SMALL)
-    bottom.label2.set_va("bottom")
-    top.label2.set_va("top")
+    bottom.label2.set_verticalalignment("bottom")
+    top.label2.set_verticalalignment("top")
     bar.tick_params(length=2, pad=1)
     page.text(page.right + 0.06, y + height + 0.02, scale_name(scale))
 
