@@ -1,7 +1,7 @@
 """The error map: absolute error of linear radiance in one colour map, on a scale that is shown with it.
 
-A scale is one of `SCALES`, so that maps of methods of about the same quality can be compared. The page and the viewer
-always use the widest.
+A scale is one of `SCALES`, so that maps of methods of about the same quality can be compared. The viewer
+always uses the widest.
 """
 
 from __future__ import annotations
@@ -44,6 +44,15 @@ def error_image(image: Float32, truth: Float32, scale: float = ERROR_MAX) -> UIn
     """Return the error map as RGB [H, W, 3]; `scale` is the error of the brightest colour."""
     error = absolute_error(image, truth).clip(max=scale)
     return error_colors()[np.rint(error * (255 / scale)).astype(np.uint8)]
+
+
+def error_levels(image: Float32, truth: Float32) -> UInt8:
+    """Return the error map as gray levels [H, W] for programs that choose scale and colours: 255 sqrt(e / ERROR_MAX).
+
+    The root gives small errors many levels: a level is less than 0.0003 for errors below 0.01.
+    """
+    share = absolute_error(image, truth).clip(max=ERROR_MAX) / ERROR_MAX
+    return np.rint(255 * np.sqrt(share)).astype(np.uint8)
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_bytes
-from spike4dgs.benchmark.reports.error_map import error_image
+from spike4dgs.benchmark.reports.error_map import absolute_error, choose_scale, error_levels
 from spike4dgs.benchmark.reports.sheets.crop import crops
 from spike4dgs.benchmark.results.predictions import open_predictions
 from spike4dgs.benchmark.results.targets import has_truth
@@ -56,6 +56,8 @@ def _write_scene(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     truths = [scene.ground_truth(t) for t in scene.targets]
+    boxes = crops([scene.moving(t) for t in scene.targets])
+    scales = dict[int, float]()
 
     def write(name: str, image: UInt8) -> None:
         path = out / below / name
@@ -71,10 +73,14 @@ def _write_scene(
             if predictions.sha256 != board.rows[i].first["scenes"][scene.id]["predictions_sha256"]:
                 say(f"no images of {board.rows[i].name} on {scene.id}: {folder} has others than were scored")
                 continue
+            errors = []
             for k, (target, truth) in enumerate(zip(scene.targets, truths, strict=True)):
                 image = predictions.read(target, truth.shape)
                 write(f"{i}/{k}.webp", encode_srgb(image))
-                write(f"{i}/{k}-error.webp", error_image(image, truth))
+                write(f"{i}/{k}-error.webp", error_levels(image, truth))
+                error, box = absolute_error(image, truth), boxes[k]
+                errors.append(box.of(error) if box else error)
+            scales[i] = choose_scale(errors)
             rows.append(i)
         except UserError as e:
             say(f"no images of {board.rows[i].name} on {scene.id}: {e}")
@@ -85,7 +91,8 @@ def _write_scene(
         "height": height,
         "names": [t.name for t in scene.targets],
         "ms": [scene.t_us(t.tick) / 1000 for t in scene.targets],
-        "crops": crops([scene.moving(t) for t in scene.targets]),
+        "crops": boxes,
+        "scales": scales,  # of error maps, by row: what the page starts with
         "rows": rows,
     }
 

@@ -2,9 +2,9 @@
 /* The ranking: a real table, with what is hidden counted above it. */
 Spike4DGS.table = (() => {
   const { el, byId, fill, format, heading, plural } = Spike4DGS.dom;
-  const MOST = 100; // rows that are drawn at once, for speed; a button shows the others
+  const MOST = 50; // rows that are drawn at once, for speed; a button shows the others
 
-  /* `ranks`: row number -> {best, worst, ties}; null while they are computed. `leftOut`: why others have none. */
+  /* `ranks`: row number -> {best, worst, ties()}; null while they are computed. `leftOut`: why others have none. */
   function draw(page, state, view, ranks, leftOut, act) {
     const rows = state.all ? view.shown : view.shown.slice(0, MOST);
     const metric = page.index.get(view.metric);
@@ -33,9 +33,9 @@ Spike4DGS.table = (() => {
         el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
       el("td", { class: "nowrap" }, item.row.label))));
-    const caption = el("caption", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
+    const caption = el("caption", {}, el("div", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
       `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold together; `,
-      "methods that cannot be told apart tie (=).");
+      "methods that cannot be told apart tie (=)."));
     fill(byId("table"), caption, head, body);
     fill(byId("below"),
       view.shown.length > rows.length && el("button", { type: "button", id: "more", onclick: () => act.change({ all: true }) },
@@ -61,7 +61,7 @@ Spike4DGS.table = (() => {
       return el("td", { class: "number rank", title: why }, "–", el("span", { class: "hidden-text" }, ` no rank: ${why}`));
     }
     const text = rank.best === rank.worst ? String(rank.best) : `${rank.best}–${rank.worst}`;
-    const tied = rank.ties.map((i) => view.board.rows[i].name);
+    const tied = rank.ties().map((i) => view.board.rows[i].name);
     const said = tied.length ? `cannot be told apart from ${tied.join(", ")}` : "told apart from every other row";
     return el("td", { class: "number rank", title: said }, tied.length ? "= " : "", text, el("span", { class: "hidden-text" }, `, ${said}`));
   }
