@@ -70,7 +70,7 @@ Spike4DGS.plots = (() => {
   /* Return 1, 2 and 5 of the decades, or even steps where a domain has less than three of them. */
   function ticksOf(domain) {
     const ticks = logTicks(domain);
-    return ticks.length < 3 ? d3.ticks(...domain, 4) : ticks;
+    return ticks.length < 3 ? d3.ticks(...domain, 6) : ticks;
   }
 
   /* Return the names that have room beside their points, with their places: clear of other names, of the points and of
