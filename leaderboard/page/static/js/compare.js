@@ -114,7 +114,7 @@ Spike4DGS.compare = (() => {
           el("input", { type: "range", name: "split", min: "0", max: "100", value: String(split),
             oninput: (e) => place(node, Number(e.target.value)), onchange: (e) => change({ split: Number(e.target.value) }, true) })),
         el("label", {}, el("span", {}, "Time: ", el("output", { id: "at" })),
-          el("input", { type: "range", name: "k", min: "0", max: String(names.length - 1), value: String(k),
+          el("input", { type: "range", name: "k", "aria-label": "Time", min: "0", max: String(names.length - 1), value: String(k),
             oninput: (e) => update(context, Number(e.target.value), text, figure),
             onchange: (e) => change({ k: Number(e.target.value) }, true) }))),
       el("div", { class: "grid" },
