@@ -74,9 +74,10 @@ Spike4DGS.app = (() => {
     Spike4DGS.download.buttons(page, view, state, ranks);
     await Spike4DGS.details.draw(page, state, view, () => change({ row: "" }));
     document.body.dataset.ready = location.hash || "#";
-    // What lies below the table may wait for the next frame.
+    // What lies below the first screen may wait for the next frame.
     await painted();
     if (turn !== drawing) return;
+    Spike4DGS.table.finish();
     await Spike4DGS.plots.draw(page, state, view, change, () => turn === drawing);
     if (turn !== drawing) return;
     await Spike4DGS.compare.draw(page, state, view, change);
