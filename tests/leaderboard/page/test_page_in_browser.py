@@ -424,12 +424,13 @@ def test_from_the_readme_to_the_answer_in_four_clicks(shown: Page, folder: Path,
 
 
 def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
-    go(page, "t=outdoor-small")
     said = "e.labels?.length || e.tagName === 'BUTTON' && e.textContent.trim()"
     labels = "e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')"
     what = "input, select, button, [role=img], dialog, nav, section"
     unnamed = f"[...document.querySelectorAll('{what}')].filter(e => !({said} || {labels})).map(e => e.outerHTML)"
-    assert page.value(unnamed) == []
+    for state in ("t=pattern-0%2B1", "t=outdoor-small"):  # with images and without
+        go(page, state)
+        assert page.value(unnamed) == []
     page.value("document.getElementById('skip').focus()")
     reached = set()
     for _ in range(12):
