@@ -402,10 +402,6 @@ def test_from_the_readme_to_the_answer_in_four_clicks(shown: Page, folder: Path,
         target = (tmp_path / path).with_suffix(".html")
         target.parent.mkdir(exist_ok=True)
         target.write_text(as_html((root / path).read_text(encoding="utf-8")), encoding="utf-8")
-    # The documentation's site gives a page the folder of its name, so the docs' link goes up one folder more.
-    (tmp_path / "docs/leaderboard").mkdir()
-    (tmp_path / "docs/leaderboard.html").rename(tmp_path / "docs/leaderboard/index.html")
-    (tmp_path / "docs/leaderboard.html").symlink_to("leaderboard/index.html")
     shutil.copytree(folder, tmp_path / "leaderboard_page")
     shown.show((tmp_path / "README.html").as_uri(), "document.readyState === 'complete'", 1400, 900)
     clicks = ("leaderboard's page", "The page of the committed entries", "and on a noisy sensor")
