@@ -271,7 +271,9 @@ def test_error_maps_are_coloured_on_the_scale_that_is_said(page: Page, data: Pat
         expected = cv2.cvtColor(error_image(rendered, truth, scale), cv2.COLOR_RGB2GRAY)
         large = cv2.resize(expected, shown.shape[::-1], interpolation=cv2.INTER_NEAREST)
         same = (slice(None), slice(None, -8))  # without the slider's bar at the right
-        assert np.corrcoef(shown[same].ravel(), large[same].ravel())[0, 1] > 0.95
+        assert (
+            np.corrcoef(shown[same].ravel(), large[same].ravel())[0, 1] > 0.9
+        )  # the browser rounds the edges of enlarged pixels otherwise
         assert np.median(np.abs(shown[same] - large[same])) < 4
         seen.append(shown.mean())
     assert seen[0] < seen[1] < seen[2], "a smaller scale is brighter"
