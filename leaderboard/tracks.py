@@ -21,6 +21,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.results.sensors import NOISY
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
@@ -53,8 +54,17 @@ class Release:
 
     def ceiling_db(self, scene: str, revision: str) -> float | None:
         """Return a scene's noise ceiling; None where it is not known, or where the revision is not the release's."""
-        known = any(track.scenes.get(scene) == revision for track in self.tracks)
-        return self.ceilings_db.get(scene) if known else None
+        return self.ceilings_db.get(scene) if self._has(scene, revision) else None
+
+    def sensor(self, scene: str, revision: str) -> str | None:
+        """Return the sensor of a scene (`results.sensors.SENSORS`); None where the revision is not the release's.
+
+        `make-dataset` made all scenes of the releases so far with every term of the noise, which is its default.
+        """
+        return NOISY if self._has(scene, revision) else None
+
+    def _has(self, scene: str, revision: str) -> bool:
+        return any(track.scenes.get(scene) == revision for track in self.tracks)
 
 
 @dataclass(frozen=True)

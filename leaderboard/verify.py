@@ -15,6 +15,7 @@ from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.record import COSTS, Cell, Record, same_value
 from spike4dgs.benchmark.results.score import open_for, prediction_folders, score_scene
+from spike4dgs.benchmark.results.sensors import sensor_of
 from spike4dgs.benchmark.results.targets import has_truth
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings
@@ -49,6 +50,9 @@ def verify_record(
         if scene.revision != revision:
             fix = "give the scene that was scored, or score again"
             raise problem(scene.root, f"scene revision {revision[:16]}...", f"{scene.revision[:16]}...", fix)
+        sensor = sensor_of(scene.meta)
+        if (claimed := record.get("sensors", {}).get(scene.id, sensor)) != sensor:
+            raise problem(f"{where}, scene {scene.id}", f"sensor {sensor or 'not stated'}", claimed, "score again")
     folders = prediction_folders(predictions, used)
     available, unverified, truth = select_metrics(), set[str](), dict[str, TruthCheck]()
     for scene in used:

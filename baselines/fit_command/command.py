@@ -34,6 +34,7 @@ from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.method import FitRequest, Method, get_method, make_budget
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.reports.sheets.video import video_writer
 from spike4dgs.benchmark.results.predictions import MethodInfo
 from spike4dgs.benchmark.results.provenance import Provenance, Savable
 from spike4dgs.benchmark.runs.cell import timed_fit
@@ -42,7 +43,6 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing.camera_paths import orbit, resized
 from spike4dgs.method.viewing.render_video import frame_times, render_frames
-from spike4dgs.method.viewing.video import video_writer
 
 MODEL, SHEET, VIDEO, REPORT = "model.safetensors", "sheet.png", "video.mp4", "report.html"
 PREDICTIONS = "predictions"

@@ -3,47 +3,173 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
+from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_with_pdf
+from spike4dgs.benchmark.reports.labels import label_points, log_ticks
 from spike4dgs.benchmark.results.record import Record
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN = ("psnr", "psnr_dynamic")
+LEAST_SECONDS = 1e-3  # a logarithm needs more than zero
+CROWD = 30  # markers of scenes; more of them are paler
+FAR = 0.75  # a gap of so much of the range of those above it makes those below it a floor...
+FAR_DB, FAR_TIME = 3.0, math.log(10)  # ... if it is also as large as this
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method in the scatter: seconds and values of its scored scenes, and of them the means."""
+
+    name: str
+    color: Any
+    scenes: dict[str, tuple[float, float]]
+    of: int  # scenes of the record
+
+    @property
+    def x(self) -> float:
+        """Mean of seconds, as the axis has it: geometric."""
+        return math.exp(math.fsum(math.log(x) for x, _ in self.scenes.values()) / len(self.scenes))
+
+    @property
+    def y(self) -> float:
+        """Mean of the metric."""
+        return math.fsum(y for _, y in self.scenes.values()) / len(self.scenes)
+
+    @property
+    def label(self) -> str:
+        """The name, and of how many scenes the means are where some are missing."""
+        return self.name if len(self.scenes) == self.of else f"{self.name} ({len(self.scenes)} of {self.of} scenes)"
 
 
 def write_scatter(path: Path, records: Sequence[Record]) -> None:
-    """Write a PNG: PSNR of the whole image and of the moving region against fit time, a point per method and scene.
+    """Write a PNG and a PDF: PSNR of the whole image and of the moving region against fit time.
 
-    A colour is a method, a marker a scene.
+    A colour is a method: a named dot is its mean over scenes, small markers are the scenes. A floor, methods far below
+    all others, does not stretch the axes: it is on the edge, with an arrow and its values.
     """
-    figure = new_figure((10.5, 4.4))
+    save_with_pdf(make_scatter(records), path)
+
+
+def make_scatter(records: Sequence[Record]) -> Figure:
+    """Return the scatter as a figure."""
+    figure = new_figure((11, 4.6), None, dpi=160)
     markers = dict(
         zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle("osD^vP*X"), strict=False)
     )
-    shown: set[str] = set()
-    for ax, metric in zip(figure.subplots(1, 2), ("psnr", "psnr_dynamic"), strict=True):
-        for i, record in enumerate(records):
-            for scene, marker in markers.items():
-                cell = record["scenes"].get(scene)
-                if cell and cell["metrics"][metric] is not None and cell["fit_seconds"] is not None:
-                    seconds = max(cell["fit_seconds"], 1e-3)  # a logarithm needs more than zero
-                    ax.scatter(seconds, cell["metrics"][metric], color=method_color(i), marker=marker, s=60)
-                    shown |= {record["method"]["name"], scene}
-        ax.set_xscale("log")
-        ax.set_xlabel("fit time, s")
-        ax.set_ylabel(f"{METRICS[metric].title}, {METRICS[metric].unit}")
-        ax.grid(alpha=0.3)
-    if shown:
-        keys = {r["method"]["name"]: ("o", method_color(i)) for i, r in enumerate(records)}
-        keys |= {scene: (marker, "gray") for scene, marker in markers.items()}
-        lines = {n: ax.plot([], [], marker, color=c)[0] for n, (marker, c) in keys.items() if n in shown}
-        figure.legend(lines.values(), lines.keys(), loc="outside right upper", fontsize=8)
-    save_figure(figure, path)
+    for n, metric in enumerate(SHOWN):
+        axes = figure.add_axes((0.06 + 0.5 * n, 0.2, 0.425, 0.77))
+        _panel(axes, metric, points_of(records, metric), markers)
+    if len(markers) > 1:
+        keys = [figure.axes[0].plot([], [], marker, color="0.45", ms=4, ls="")[0] for marker in markers.values()]
+        keys.append(figure.axes[0].plot([], [], "o", color="0.45", ms=8, ls="")[0])
+        names = [*markers, "mean over scenes"]
+        columns = max(1, min(len(names), int(150 / max(len(name) + 6 for name in names))))
+        figure.legend(keys, names, loc="lower center", ncols=columns, fontsize=7.5, frameon=False)
+    return figure
+
+
+def points_of(records: Sequence[Record], metric: str) -> list[Point]:
+    """Return the methods that have a value and a fit time of any scene."""
+    found = []
+    for i, record in enumerate(records):
+        known = {
+            scene: (max(cell["fit_seconds"], LEAST_SECONDS), cell["metrics"][metric])
+            for scene, cell in record["scenes"].items()
+            if cell["metrics"][metric] is not None and cell["fit_seconds"] is not None
+        }
+        if known:
+            found.append(Point(record["method"]["name"], method_color(i), known, len(record["scenes"])))
+    return found
+
+
+def floor_of(values: Sequence[float], least: float) -> float | None:
+    """Return the largest of those values that lie far below all others; None where there are none.
+
+    Far is a gap of `least`, and of `FAR` times the range of those above it, who must be the most.
+
+    >>> floor_of([12.1, 16.4, 28.7, 29.5, 30.9, 36.0], 3)
+    16.4
+    >>> floor_of([28.7, 29.5, 30.9, 36.0], 3) is None
+    True
+    """
+    ordered = sorted(values)
+    found = None
+    for k in range(1, (len(ordered) + 1) // 2):
+        if ordered[k] - ordered[k - 1] >= max(least, FAR * (ordered[-1] - ordered[k])):
+            found = ordered[k - 1]
+    return found
+
+
+def _panel(axes: Axes, metric: str, points: Sequence[Point], markers: Mapping[str, str]) -> None:
+    """Draw one metric."""
+    title, unit = METRICS[metric].title, METRICS[metric].unit
+    axes.set(xscale="log", xlabel="fit time, s a scene", ylabel=f"{title}, {unit}")
+    axes.grid(alpha=0.3)
+    if not points:
+        return
+    low = floor_of([p.y for p in points], FAR_DB)
+    early = floor_of([math.log(p.x) for p in points], FAR_TIME)
+    far = [p for p in points if (low is not None and p.y <= low) or (early is not None and math.log(p.x) <= early)]
+    inside = [p for p in points if p not in far]
+    # A method below the floor still sets the axis of time, if its time is like those of others.
+    timed = [p for p in points if early is None or math.log(p.x) > early]
+    _limits(axes, inside, timed, bool(far))
+    strength = 0.75 if sum(len(p.scenes) for p in inside) <= CROWD else 0.4
+    for point in inside:
+        for scene, (x, y) in point.scenes.items():
+            axes.plot(x, y, markers[scene], color=point.color, ms=4, alpha=strength, mew=0)
+        axes.plot(point.x, point.y, "o", color=point.color, ms=9, mec="white", mew=0.7)
+    labels = [(p.x, p.y, p.label) for p in inside]
+    for point in far:
+        labels.append((*_edge(axes, point), _far_label(point, metric)))
+        axes.plot(*labels[-1][:2], "o", color=point.color, ms=6, mec="white", mew=0.7, clip_on=False)
+        _arrow(axes, point)
+    label_points(axes, labels, [xy for p in inside for xy in p.scenes.values()])
+
+
+def _limits(axes: Axes, inside: Sequence[Point], timed: Sequence[Point], room: bool) -> None:
+    """Set the axes' ends by the points inside; `room` leaves some for the floor at the lower edge."""
+    xs = [x for p in inside for x, _ in p.scenes.values()] + [p.x for p in timed]
+    ys = [y for p in inside for _, y in p.scenes.values()]
+    wide, high = max(max(xs) / min(xs), 1.5), max(max(ys) - min(ys), 1.0)
+    axes.set_xlim(min(xs) / wide**0.13, max(xs) * wide**0.13)
+    axes.set_ylim(min(ys) - (0.22 if room else 0.08) * high, max(ys) + 0.1 * high)
+    ticks = log_ticks(*axes.get_xlim())
+    axes.set_xticks(ticks, labels=[f"{t:g}" for t in ticks])
+    axes.set_xticks([], minor=True)
+
+
+def _edge(axes: Axes, point: Point) -> tuple[float, float]:
+    """Return where a point beyond the axes is shown: inside their edge."""
+    x, y = axes.transAxes.inverted().transform(axes.transData.transform((point.x, point.y)))
+    return tuple(axes.transData.inverted().transform(axes.transAxes.transform((max(x, 0.045), max(y, 0.06)))))
+
+
+def _arrow(axes: Axes, point: Point) -> None:
+    """Draw an arrow from a shown point towards where it is."""
+    x, y = axes.transAxes.inverted().transform(axes.transData.transform((point.x, point.y)))
+    start = (max(x, 0.045), max(y, 0.06))
+    to = (start[0] - 0.04 * (x < start[0]), start[1] - 0.055 * (y < start[1]))
+    style = {"arrowstyle": "-|>", "color": point.color, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9}
+    axes.annotate("", to, xytext=start, xycoords="axes fraction", textcoords="axes fraction", arrowprops=style)
+
+
+def _far_label(point: Point, metric: str) -> str:
+    seconds = f"{point.x:.3g}" if point.x > LEAST_SECONDS else f"<{LEAST_SECONDS:g}"
+    return f"{point.label}: {METRICS[metric].format(point.y)} {METRICS[metric].unit}, {seconds} s"
 
 
 def write_views(path: Path, table: Mapping[str, Any]) -> None:
-    """Write a PNG of a table whose columns are splits `views-N`: each metric against N, measured above published."""
+    """Write a PNG and a PDF of a table whose columns are splits `views-N`: each metric against N, measured above."""
     metrics, scenes = [m["id"] for m in table["metrics"]], table["scenes"]
     figure = new_figure((3.4 * len(metrics), 6.4))
     axes = figure.subplots(2, len(metrics), squeeze=False)
@@ -60,4 +186,4 @@ def write_views(path: Path, table: Mapping[str, Any]) -> None:
     handles = {label: h for ax in axes.flat for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside right upper", fontsize=8)
-    save_figure(figure, path)
+    save_with_pdf(figure, path)

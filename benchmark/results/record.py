@@ -18,6 +18,7 @@ from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.metrics.measure import Values, scene_means
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.results.predictions import MethodInfo
+from spike4dgs.benchmark.results.sensors import sensor_of
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
@@ -62,6 +63,7 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
             "scenes": {s.id: s.revision for s in scenes},
             "split": splits.pop(),
         },
+        "sensors": {s.id: sensor for s in scenes if (sensor := sensor_of(s.meta))},
         "protocol": PROTOCOL,
         "scenes": dict(cells),
         "mean": dataset_means(cells),
@@ -96,6 +98,8 @@ def check_record(record: Record, where: str | Path) -> None:
     if set(record["scenes"]) != set(record["dataset"]["scenes"]):
         found = ", ".join(sorted(record["scenes"]))
         raise problem(where, f"cells for {', '.join(sorted(record['dataset']['scenes']))}", found, _AGAIN)
+    if unknown := sorted(record.get("sensors", {}).keys() - record["scenes"].keys()):
+        raise problem(where, "sensors of its scenes", ", ".join(unknown)[:200], _AGAIN)
     for scene, cell in record["scenes"].items():
         for name, values in (("metrics", cell["metrics"]), *cell["per_image"].items()):
             _check_metric_names(values, f"{where}, scene {scene}, {name}")

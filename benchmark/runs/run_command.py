@@ -1,7 +1,7 @@
 """`run-benchmark`: run methods on scenes, then write the table, the sheets and the leaderboard's entries.
 
-Besides what `run` keeps, OUT has results.csv, sheet_SCENE.png, scatter.png, leaderboard/ and, for a table of the paper,
-table.*. Records that earlier runs left in OUT on the same scenes are in all of these. Images and tables of the paper
+Besides what `run` keeps, OUT has results.csv, sheet_SCENE.{png,pdf,mp4}, scatter.{png,pdf}, leaderboard/ and, for a
+table of the paper, table.*. Records that earlier runs left in OUT on the same scenes are in all of these. Images and tables of the paper
 show the first seed; results.csv and the leaderboard have all of them.
 A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 
@@ -31,13 +31,12 @@ from spike4dgs.benchmark.release.download.track import track_folders
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
-from spike4dgs.benchmark.reports.scatter import write_scatter
-from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.results.record import Record
 from spike4dgs.benchmark.results.refinement import SUFFIX
-from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results
+from spike4dgs.benchmark.runs.earlier import earlier_records, of_one_seed, write_results
+from spike4dgs.benchmark.runs.images import write_images
 from spike4dgs.benchmark.runs.oracle.ladder import SAMPLES, FindTruth, MakeLadders, climb
-from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
+from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 
 
@@ -161,9 +160,11 @@ class RunBenchmark:
             for line in left_out:
                 _say(console, f"not in the table: {line}")
             console.print(results_table([*earlier, *records]))
-            write_images(opened, of_one_seed([*earlier, *records]), folder)
+            for line in write_images(opened, of_one_seed([*earlier, *records]), folder):
+                _say(console, line)
             write_results(folder / "results.csv", [*earlier, *records])
             _say(console, f"images: {folder}/sheet_*.png and {folder}/scatter.png; values: {folder}/results.csv")
+            _say(console, f"for papers and slides: the same as .pdf, and {folder}/sheet_*.mp4")
             submissions.append((records, settings))
             rows = paper.rows if paper else ()
             runs.append((opened, of_one_seed([*(r for r in earlier if plain_name(r) in rows), *records])))
@@ -237,15 +238,6 @@ def make_run_benchmark(
 ) -> Callable[..., int]:
     """Return the command `run-benchmark`, which calls these functions of other rooms."""
     return RunBenchmark(submit, measure_images, track_scenes, make_ladders, find_truth).run_benchmark
-
-
-def write_images(scenes: Sequence[Scene], records: Sequence[Record], out: Path) -> None:
-    """Write sheet_SCENE.png for each scene, and scatter.png. A method without its predictions is in no sheet."""
-    for scene in scenes:
-        of_all = {r["method"]["name"]: predictions_folder(out, r["method"]["name"], scene.id) for r in records}
-        folders = {name: of_all[name] for r in records if is_shown(r, scene, of_all[name := r["method"]["name"]])}
-        write_sheet(out / f"sheet_{scene.id}.png", scene, folders, records)
-    write_scatter(out / "scatter.png", records)
 
 
 def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> list[Method]:

@@ -15,11 +15,9 @@ from spike4dgs.benchmark.results.record import COSTS
 from spike4dgs.leaderboard.page.intervals import Comparison
 from spike4dgs.leaderboard.page.rows import Board, Row
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded
-from spike4dgs.leaderboard.tracks import PUBLIC, current_release
+from spike4dgs.leaderboard.tracks import current_release
 
 PARTS = ("images", "initialization", "motion", "supervision")
-# Of the scenes of a track, which make-dataset made with every term of the noise: see docs/sensor.md.
-SENSOR = "The sensor is noisy: gains that differ from pixel to pixel, dark current with hot pixels, shot noise."
 PAPER_TABLES = (1, 2)  # those of whole methods by scene
 
 
@@ -55,14 +53,23 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
         "why": board.why,
         "withheld": list(board.withheld),
         "split": board.dataset["split"],
-        "sensor": SENSOR if board.folder == PUBLIC else "",
         "scenes": [
-            {"id": s, "revision": (revision := board.dataset["scenes"][s]), "ceiling": release.ceiling_db(s, revision)}
+            {
+                "id": s,
+                "revision": (revision := board.dataset["scenes"][s]),
+                "ceiling": release.ceiling_db(s, revision),
+                "sensor": release.sensor(s, revision) or _stated_sensor(board, s),
+            }
             for s in board.scenes
         ],
         "published": published_values(board),
         "rows": [_row(row, board.scenes) for row in board.rows],
     }
+
+
+def _stated_sensor(board: Board, scene: str) -> str:
+    """Return what the records say of a scene's sensor."""
+    return _distinct(r["sensors"][scene] for row in board.rows for r in row.records if scene in r.get("sensors", {}))
 
 
 def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:

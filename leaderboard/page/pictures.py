@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_bytes
-from spike4dgs.benchmark.reports.error_map import error_image
+from spike4dgs.benchmark.reports.error_map import absolute_error, choose_scale, error_levels
+from spike4dgs.benchmark.reports.sheets.crop import crops
 from spike4dgs.benchmark.results.predictions import open_predictions
 from spike4dgs.benchmark.results.targets import has_truth
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
@@ -20,10 +18,6 @@ from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.page.rows import Board
 
 FOLDER = "pictures"
-MARGIN = 0.15  # around what moves, of its size
-SMALLEST = 24  # pixels of a crop's side: smaller ones show no context
-
-Box = tuple[int, int, int, int]  # x, y, width, height in pixels
 
 
 def write_pictures(
@@ -62,6 +56,8 @@ def _write_scene(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     truths = [scene.ground_truth(t) for t in scene.targets]
+    boxes = crops([scene.moving(t) for t in scene.targets])
+    scales = dict[int, float]()
 
     def write(name: str, image: UInt8) -> None:
         path = out / below / name
@@ -77,10 +73,14 @@ def _write_scene(
             if predictions.sha256 != board.rows[i].first["scenes"][scene.id]["predictions_sha256"]:
                 say(f"no images of {board.rows[i].name} on {scene.id}: {folder} has others than were scored")
                 continue
+            errors = []
             for k, (target, truth) in enumerate(zip(scene.targets, truths, strict=True)):
                 image = predictions.read(target, truth.shape)
                 write(f"{i}/{k}.webp", encode_srgb(image))
-                write(f"{i}/{k}-error.webp", error_image(image, truth))
+                write(f"{i}/{k}-error.webp", error_levels(image, truth))
+                error, box = absolute_error(image, truth), boxes[k]
+                errors.append(box.of(error) if box else error)
+            scales[i] = choose_scale(errors)
             rows.append(i)
         except UserError as e:
             say(f"no images of {board.rows[i].name} on {scene.id}: {e}")
@@ -91,34 +91,10 @@ def _write_scene(
         "height": height,
         "names": [t.name for t in scene.targets],
         "ms": [scene.t_us(t.tick) / 1000 for t in scene.targets],
-        "crops": crops([scene.moving(t) for t in scene.targets]),
+        "crops": boxes,
+        "scales": scales,  # of error maps, by row: what the page starts with
         "rows": rows,
     }
-
-
-def crops(moving: Sequence[NDArray[np.bool_]]) -> list[Box | None]:
-    """Return a box around what moves in each image, all of one size; None where nothing does."""
-    tight = [_bounds(mask) for mask in moving]
-    height, width = moving[0].shape
-    known = [box for box in tight if box]
-    if not known:
-        return [None] * len(tight)
-    w = min(width, max(SMALLEST, *(round(b[2] * (1 + 2 * MARGIN)) for b in known)))
-    h = min(height, max(SMALLEST, *(round(b[3] * (1 + 2 * MARGIN)) for b in known)))
-
-    def centred(box: Box) -> Box:
-        x, y = box[0] + box[2] // 2 - w // 2, box[1] + box[3] // 2 - h // 2
-        return min(max(x, 0), width - w), min(max(y, 0), height - h), w, h
-
-    return [centred(box) if box else None for box in tight]
-
-
-def _bounds(mask: NDArray[np.bool_]) -> Box | None:
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return None
-    x, y = int(columns[0]), int(rows[0])
-    return x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y
 
 
 def webp(image: UInt8) -> bytes:

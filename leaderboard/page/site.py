@@ -24,6 +24,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_bytes, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.reports.error_map import ERROR_MAX, SCALES, error_colors
 from spike4dgs.benchmark.runs.earlier import write_results
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics, score_content
 from spike4dgs.leaderboard.page.intervals import (
@@ -122,6 +123,7 @@ def facts(boards: Sequence[Board]) -> dict[str, Any]:
             "grid": [round(float(v), 9) for v in GRID],
             "widened": [None, None, *(widened_values(n).tolist() for n in range(2, MOST_UNITS + 1))],
         },
+        "errors": {"max": ERROR_MAX, "scales": SCALES, "colors": error_colors().tolist()},
         "empty": [
             {"name": t.name, "title": t.title, "announced": t.announced} for t in release.tracks if t.name not in shown
         ],

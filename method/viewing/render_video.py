@@ -12,11 +12,11 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.inputs.numbers import MAX_SIDE
+from spike4dgs.benchmark.reports.sheets.video import Write, check_video, video_writer
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb, write_png
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing import camera_paths
 from spike4dgs.method.viewing.camera_paths import PathName, make_path, resized
-from spike4dgs.method.viewing.video import Write, check_video, video_writer
 
 _MOST_FRAMES = 1_000_000
 

@@ -44,6 +44,13 @@ def test_the_shipped_release_has_the_tracks_and_its_frozen_bytes() -> None:
     assert announced == {"outdoor-paper", "objects-paper"}
 
 
+def test_the_sensor_of_a_releases_scene_is_known_for_its_revision_alone() -> None:
+    release = current_release()
+    scenes = release.tracks[0].scenes
+    assert all(release.sensor(scene, str(revision)) == "noisy" for scene, revision in scenes.items())
+    assert release.sensor("car-0-small", "0" * 64) is None
+
+
 def test_a_release_that_was_edited_is_refused(tmp_path: Path) -> None:
     folder = write_release(tmp_path, {"a": track({"s": "0" * 64})})
     assert tracks.read_release(folder, "1").tracks[0].scenes == {"s": "0" * 64}

@@ -57,6 +57,7 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
             "expected predictions 00000000",
         ),
         (lambda r: r["scenes"]["pattern-1"].update(fit_seconds=1e-3), "expected fit_seconds"),
+        (lambda r: r["sensors"].update({"pattern-1": "noisy"}), "pattern-1: expected sensor not stated, found noisy"),
         (lambda r: r["scenes"]["pattern-1"].update(gain_aligned=7.0), "expected gain_aligned"),
         (lambda r: r["method"].update(params={"steps": 1}), "as in the record"),
         (lambda r: r["dataset"]["scenes"].update({"pattern-0": "1" * 64}), "expected scene revision 1111111111111111"),

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod
@@ -42,9 +43,11 @@ def test_run_benchmark_leaves_results_images_and_entries(
     assert code == 0
     text = capsys.readouterr().out
     assert "quick+counts" in text and "Results" in text and "re-scored, rank 1 of" in text
-    for name in ("sheet_pattern-0.png", "scatter.png"):
-        with Image.open(out / name) as image:
+    for name in ("sheet_pattern-0", "scatter"):
+        with Image.open(out / f"{name}.png") as image:
             assert min(image.size) > 300
+        assert (out / f"{name}.pdf").read_bytes().startswith(b"%PDF-")
+    assert cv2.VideoCapture(str(out / "sheet_pattern-0.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3, "one for each target"
     rows = json.loads((out / "leaderboard/local.json").read_text())["boards"][0]["rows"]
     assert [(r["rank"], r["label"]) for r in rows] == [(1, "re-scored"), (2, "re-scored")]
     assert text.count("local board, in") == 1, "one line says that no track has this scene"
@@ -78,16 +81,16 @@ def test_a_run_with_another_method_adds_to_what_is_there(
     def rows() -> list[dict[str, str]]:
         return list(csv.DictReader((out / "results.csv").read_text().splitlines()))
 
-    def width() -> int:
+    def height() -> int:
         with Image.open(out / "sheet_pattern-0.png") as image:
-            return image.width
+            return image.height
 
     go("counts")
-    alone, one = rows(), width()
+    alone, one = rows(), height()
     assert [r["method"] for r in alone] == ["counts"]
     text = go("quick+counts")
     assert [r["method"] for r in rows()] == ["counts", "quick+counts"] and rows()[0] == alone[0]
-    assert width() > 1.2 * one
+    assert height() > 1.2 * one
     table = text.partition("Results")[2].partition("images:")[0]
     assert {"counts", "quick+counts"} <= set(table.split())
     for row in rows():
@@ -144,11 +147,11 @@ def test_a_method_without_its_predictions_is_in_the_table_and_not_in_the_sheet(
     for method in ("counts", "quick+counts"):
         assert run_benchmark((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",)) == 0
         with Image.open(out / "sheet_pattern-0.png") as image:
-            width = image.width
+            height = image.height
         shutil.rmtree(out / "predictions/counts", ignore_errors=True)
     assert run_benchmark((small_scene,), methods=("quick+counts",), out=out, device="cpu", metrics=("psnr",)) == 0
     with Image.open(out / "sheet_pattern-0.png") as image:
-        assert image.width == width
+        assert image.height == height
     assert len((out / "results.csv").read_text().splitlines()) == 3
 
 

@@ -43,3 +43,14 @@ def test_a_failed_cell_has_no_value_and_a_reason() -> None:
     assert set(content["rows"][0]["cells"][1]["v"]) == {None}
     assert content["rows"][0]["parts"]["images"] == "tfp" and content["rows"][0]["budget"] == "1 x quick"
     assert content["published"] is None
+
+
+def test_sensors_are_the_releases_or_what_records_state(committed: list[Board]) -> None:
+    public = board_content(find_board(committed, "outdoor-small"), "o")
+    assert [scene["sensor"] for scene in public["scenes"]] == ["noisy"] * 5
+    other = board_content(find_board(committed, "car-0-paper"), "c")
+    assert [scene["sensor"] for scene in other["scenes"]] == ["not stated"], "an older record, not of the release"
+    made = [row(name, {"s": cell({"psnr": np.ones(2)}), "t": cell({"psnr": np.ones(2)})}) for name in "ab"]
+    made[0].first["sensors"] = {"s": "ideal", "t": "noisy"}
+    made[1].first["sensors"] = {"s": "ideal"}
+    assert [scene["sensor"] for scene in board_content(board("b", made), "b")["scenes"]] == ["ideal", "noisy"]

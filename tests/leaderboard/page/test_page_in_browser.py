@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,9 @@ import pytest
 from devtools import Page, browser, wait_for
 from page_boards import board, cell, failed, large_board, row
 
+from spike4dgs.benchmark.reports.error_map import error_image
+from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard.page.intervals import compare
 from spike4dgs.leaderboard.page.rows import Board, find_board, gather
 from spike4dgs.leaderboard.page.scores import image_scores
@@ -51,6 +56,18 @@ def hostile_board() -> Board:
     return replace(board("hostile", [first, second], title=HOSTILE), why=HOSTILE)
 
 
+def sensors_board() -> Board:
+    """Two methods on an ideal and a noisy scene, as the records say."""
+    values = {"clean": (40.0, 20.0), "other": (30.0, 25.0)}
+    made = [
+        row(name, {scene: cell({"psnr": np.full(3, v)}) for scene, v in zip(("i", "n"), of, strict=True)})
+        for name, of in values.items()
+    ]
+    for one in made:
+        one.first["sensors"] = {"i": "ideal", "n": "noisy"}
+    return board("sensors", made)
+
+
 def seeds_board() -> Board:
     """Two methods on four scenes: one with three seeds."""
     rng = np.random.default_rng(5)
@@ -74,7 +91,7 @@ def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory)
     """The committed entries, a run with images, and boards made for the tests, as one page."""
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
-    made = [seeds_board(), hostile_board()]
+    made = [seeds_board(), sensors_board(), hostile_board()]
     write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
     return out
 
@@ -239,6 +256,39 @@ def test_slider_scrubber_and_crop(page: Page, data: Path) -> None:
     assert shape[0] / shape[1] == pytest.approx(24 / 24, abs=0.05), "a crop of 24x24 of 40x24 pixels"
 
 
+def test_error_maps_are_coloured_on_the_scale_that_is_said(page: Page, data: Path, finished: Path) -> None:
+    """The browser's colours are those of the reports, made from the same files."""
+    scene = open_scene(data / "pattern-1")
+    truth = scene.ground_truth(scene.targets[0])
+    rendered = read_exr(finished / f"out/predictions/rough/{scene.id}/{scene.targets[0].name}.exr")
+    own = "t=pattern-0%2B1&a=out%2Frough&b=out%2Ftfp%2B4dgs&scene=pattern-1&k=0&split=100"
+    seen = []
+    for choice, scale in (("1", 0.3), ("3", 0.1), ("30", 0.01)):
+        go(page, f"{own}&e={choice}")
+        caption = page.value("document.querySelector('#pane-errors figcaption').textContent")
+        assert f"\N{MULTIPLICATION SIGN}{choice}: 0" in caption and f"{scale:g}, where 1 is white" in caption
+        shown = image(page, "pane-errors")
+        expected = cv2.cvtColor(error_image(rendered, truth, scale), cv2.COLOR_RGB2GRAY)
+        large = cv2.resize(expected, shown.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        same = (slice(None), slice(None, -8))  # without the slider's bar at the right
+        assert (
+            np.corrcoef(shown[same].ravel(), large[same].ravel())[0, 1] > 0.9
+        )  # the browser rounds the edges of enlarged pixels otherwise
+        assert np.median(np.abs(shown[same] - large[same])) < 4
+        seen.append(shown.mean())
+    assert seen[0] < seen[1] < seen[2], "a smaller scale is brighter"
+    go(page, own)
+    pictures = loaded(page, "pictures")
+    widest = max(pictures[1]["scales"][str(r)] for r in pictures[1]["rows"])
+    assert f"{widest:g}, where" in page.value("document.querySelector('#pane-errors figcaption').textContent")
+
+
+def loaded(page: Page, kind: str) -> Any:
+    """The data of the shown board, of that kind, as the page has them."""
+    of = "Spike4DGS.app.current(); const n = c.page.boards.indexOf(c.view.board)"
+    return page.value(f"(() => {{ const c = {of}; return Spike4DGS.ready(`{kind}-${{n}}`) }})()")
+
+
 def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
     go(page, "t=outdoor-small&scene=van-0-small&a=tfp%2B4dgs&b=spike4dgs")
     text = page.value("document.getElementById('scenes').textContent")
@@ -306,24 +356,79 @@ def test_details_have_command_hashes_and_commit(page: Page) -> None:
     assert not page.value("document.getElementById('details').open")
 
 
-def test_a_question_is_answered_in_one_click(page: Page) -> None:
-    go(page, "t=quick-start")
-    link = "[...document.querySelectorAll('#questions a')].find(a => a.textContent.includes('noisy'))"
-    page.value(f"{link}.click()")
+def test_questions_are_answered_in_one_click(page: Page) -> None:
+    record = {
+        path.stem: json.loads(path.read_text())["record"] for path in COMMITTED.glob("entries/1-outdoor-small@*/*.json")
+    }
+    fit = {name: np.mean([c["fit_seconds"] for c in r["scenes"].values()]) for name, r in record.items()}
+    quick = sorted((n for n in fit if fit[n] <= 60), key=lambda n: -record[n]["mean"]["psnr_dynamic"])
+    uncalibrated = [n for n in quick if "flat-field" not in record[n]["method"].get("given", ["flat-field"])]
+    for text, expected in (("on a noisy sensor", quick), ("not calibrated", uncalibrated)):
+        go(page, "t=quick-start")
+        link = f"[...document.querySelectorAll('#questions a')].find(a => a.textContent.includes('{text}'))"
+        page.value(f"{link}.click()")
+        settle(page)
+        assert names(page) == expected and expected
+        hidden = f"{len(record) - len(expected)} rows hidden"
+        assert hidden in page.value("document.getElementById('count').textContent")
+        assert page.value("document.querySelector('[name=sensor]').value") == "noisy"
+        assert "sensor is noisy" in page.value("document.getElementById('about').textContent")
+
+
+def test_the_sensor_filters_scenes_and_hides_all_rows_where_no_scene_has_it(page: Page) -> None:
+    go(page, "t=sensors&sensor=ideal")
+    assert column(page, "PSNR, dB") == ["40.00", "30.00"] and names(page) == ["clean", "other"]
+    assert "(1 of 2)" in page.value("document.querySelector('#controls legend').textContent")
+    choose(page, "sensor", "noisy")
+    assert column(page, "PSNR, dB") == ["25.00", "20.00"] and names(page) == ["other", "clean"]
+    choose(page, "sensor", "")
+    assert column(page, "PSNR, dB") == ["30.00", "27.50"]
+    go(page, "t=outdoor-small&sensor=recorded")
+    assert names(page) == [] and "13 rows hidden" in page.value("document.getElementById('count').textContent")
+    page.value("document.querySelector('#count button').click()")
     settle(page)
-    assert names(page) == ["tfp+d3dgs"] and "12 rows hidden" in page.value(
-        "document.getElementById('count').textContent"
-    )
-    assert "sensor is noisy" in page.value("document.getElementById('about').textContent")
+    assert len(names(page)) == 13
+
+
+def as_html(markdown: str) -> str:
+    """A page of documentation with its links, as far as a browser needs it."""
+    linked = re.sub(r"\[([^\]]+)\]\(([^)]+?)\)", r'<a href="\2">\1</a>', markdown)
+    pages = re.sub(r'(href="(?!http)[^"#]*)\.md', r"\1.html", linked)
+    return f"<meta charset=utf-8><body>{pages}"
+
+
+def test_from_the_readme_to_the_answer_in_four_clicks(shown: Page, folder: Path, tmp_path: Path) -> None:
+    """Which method is best where things move, within a minute of fit, on a noisy sensor? Click after click."""
+    root = COMMITTED.parent
+    for path in ("README.md", "docs/leaderboard.md"):
+        target = (tmp_path / path).with_suffix(".html")
+        target.parent.mkdir(exist_ok=True)
+        target.write_text(as_html((root / path).read_text(encoding="utf-8")), encoding="utf-8")
+    shutil.copytree(folder, tmp_path / "leaderboard_page")
+    shown.show((tmp_path / "README.html").as_uri(), "document.readyState === 'complete'", 1400, 900)
+    clicks = ("leaderboard's page", "The page of the committed entries", "and on a noisy sensor")
+    for text in clicks:
+        link = f"[...document.querySelectorAll('a')].find(a => a.textContent.includes({json.dumps(text)}))"
+        before = shown.value("location.href")
+        wait_for(text, lambda link=link: shown.value(f"Boolean({link})"))
+        shown.value(f"{link}.click()")
+        wait_for("the next page", lambda before=before: shown.value("location.href") != before)
+    assert len(clicks) <= 4
+    wait_for("the page", lambda: shown.value("Boolean(document.body?.dataset.whole)"))
+    settle(shown)
+    first = "[...document.querySelectorAll('#table tbody tr')][0].dataset.row"
+    assert shown.value(first) == "spike4dgs-x"
+    assert shown.value("document.querySelector('#table th[aria-sort]').innerText").startswith("PSNR, moving")
 
 
 def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
-    go(page, "t=outdoor-small")
     said = "e.labels?.length || e.tagName === 'BUTTON' && e.textContent.trim()"
     labels = "e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')"
     what = "input, select, button, [role=img], dialog, nav, section"
     unnamed = f"[...document.querySelectorAll('{what}')].filter(e => !({said} || {labels})).map(e => e.outerHTML)"
-    assert page.value(unnamed) == []
+    for state in ("t=pattern-0%2B1", "t=outdoor-small"):  # with images and without
+        go(page, state)
+        assert page.value(unnamed) == []
     page.value("document.getElementById('skip').focus()")
     reached = set()
     for _ in range(12):
@@ -344,18 +449,19 @@ def test_a_thousand_rows_of_45_scenes_filter_at_once(
     page = shown
     write_site(tmp_path / "page", [large_board(ROWS, SCENES, 60)])
     page.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
-    states = ["motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"]
+    states = ["motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"] * 4
     times = page.call("Runtime.evaluate", expression=FILTER % states, awaitPromise=True, returnByValue=True)
     measured = times["result"]["value"]
     with capsys.disabled():
-        print(
-            f"\n{ROWS} rows x {SCENES} scenes, a filter: {', '.join(f'{t:.0f}' for t in measured)} ms to the new table"
-        )
+        median, worst = np.median(measured), max(measured)
+        print(f"\n{ROWS} rows x {SCENES} scenes, {len(measured)} filters: ", end="")
+        print(f"median {median:.0f} ms, worst {worst:.0f} ms to the new table")
     count = page.value("document.getElementById('count').textContent")
-    assert count.startswith("167 rows, the first 100 drawn; 833 rows hidden"), (
+    assert count.startswith("167 rows, the first 50 drawn; 833 rows hidden"), (
         "a third of the rows, every second of them"
     )
-    assert min(measured) < 20 * FILTER_MS, "with a generous factor for busy machines"
+    assert min(measured) < FILTER_MS, "the least disturbed one: other programs only add to it"
+    assert median < 5 * FILTER_MS, "on a machine whose processors all do something else"
 
 
 def test_a_screen_in_the_dark(page: Page) -> None:

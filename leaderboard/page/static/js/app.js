@@ -44,9 +44,6 @@ Spike4DGS.app = (() => {
     return { ...scores, better: found.better };
   }
 
-  /* The page comes with lines of 0 and 1. */
-  const lit = (better) => better.map((line) => (typeof line === "string" ? Array.from(line, (c) => c === "1") : line));
-
   let drawing = 0;
 
   async function draw() {
@@ -59,7 +56,7 @@ Spike4DGS.app = (() => {
     const act = { change, unfilter: () => { location.hash = serialize(unfiltered(parse(location.hash))); } };
     document.title = `${board.name}: Spike4DGS leaderboard`;
     Spike4DGS.controls.tabs(page, board, link);
-    Spike4DGS.controls.about(page, board);
+    Spike4DGS.controls.about(board);
     Spike4DGS.controls.form(page, board, state, view, change);
     const shown = view.shown.map((item) => item.index);
     let found = comparison(view, state, false);
@@ -71,16 +68,18 @@ Spike4DGS.app = (() => {
       if (turn !== drawing) return;
       found = comparison(view, state, true);
     }
-    const ranks = Spike4DGS.intervals.ranks(found.rows, lit(found.better), shown);
+    const ranks = Spike4DGS.intervals.ranks(found.rows, found.better, shown);
     Spike4DGS.table.draw(page, state, view, ranks, found.leftOut, act);
     document.body.dataset.drawn = location.hash || "#";
     Spike4DGS.download.buttons(page, view, state, ranks);
     await Spike4DGS.details.draw(page, state, view, () => change({ row: "" }));
     document.body.dataset.ready = location.hash || "#";
-    // What lies below the table may wait for the next frame.
+    // What lies below the first screen may wait for the next frame.
     await painted();
     if (turn !== drawing) return;
-    Spike4DGS.plots.draw(page, state, view, change);
+    Spike4DGS.table.finish();
+    await Spike4DGS.plots.draw(page, state, view, change, () => turn === drawing);
+    if (turn !== drawing) return;
     await Spike4DGS.compare.draw(page, state, view, change);
     if (turn === drawing) document.body.dataset.whole = location.hash || "#";
   }

@@ -34,6 +34,7 @@ Spike4DGS.compare = (() => {
       el("div", { class: "fields" },
         choice("scene", "Scene", board.scenes[s].id, board.scenes.map((scene) => scene.id)),
         choice("a", "Method A", board.rows[a].name, rowNames), choice("b", "Method B", board.rows[b].name, rowNames),
+        picture && scaleChoice(context),
         picture && el("label", { class: "check" }, el("input", { type: "checkbox", name: "crop", checked: state.crop,
           onchange: (e) => change({ crop: e.target.checked }) }), "Crop what moves")),
       sceneFacts(board.scenes[s]),
@@ -55,8 +56,51 @@ Spike4DGS.compare = (() => {
     return el("p", { class: "small" }, `Revision ${scene.revision.slice(0, 12)}.${ceiling}`);
   }
 
+  /* The error of the brightest colour: the one chosen, or the wider of what both methods start with. */
+  function scaleOf({ page, state, picture, a, b }) {
+    const own = page.errors.scales.find((scale) => nameOf(page, scale) === state.e);
+    return own ?? Math.max(picture.scales[a], picture.scales[b]);
+  }
+
+  const nameOf = (page, scale) => String(Math.round(page.errors.max / scale));
+
+  function scaleChoice(context) {
+    const { page, state, change } = context;
+    const names = page.errors.scales.map((scale) => [nameOf(page, scale), `×${nameOf(page, scale)}: 0 to ${scale}`]);
+    return el("label", {}, el("span", {}, "Scale of errors"), el("select", { name: "e", onchange: (e) => change({ e: e.target.value }) },
+      [["", "as both need"], ...names].map(([v, text]) => el("option", { value: v, selected: v === state.e }, text))));
+  }
+
+  /* Return the address of a filter that colours error levels on a scale: level v stands for max (v / 255)^2. */
+  function colours(page, scale) {
+    const id = `errors-${nameOf(page, scale)}`;
+    if (!byId(id)) {
+      const svg = (tag, attributes, ...children) => {
+        const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
+        for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+        node.append(...children);
+        return node;
+      };
+      const index = (v) => Math.round(255 * Math.min(1, (page.errors.max * (v / 255) ** 2) / scale));
+      const table = (c) => Array.from({ length: 256 }, (_, v) => page.errors.colors[index(v)][c] / 255).join(" ");
+      const parts = ["R", "G", "B"].map((name, c) => svg(`feFunc${name}`, { type: "table", tableValues: table(c) }));
+      document.body.append(svg("svg", { width: 0, height: 0, class: "hidden-text", "aria-hidden": "true" },
+        svg("filter", { id, "color-interpolation-filters": "sRGB" }, svg("feComponentTransfer", {}, ...parts))));
+    }
+    return `url(#${id})`;
+  }
+
+  /* What the colours of the error maps mean. */
+  function scaleBar(page, scale) {
+    const bar = el("span", { class: "scale", "aria-hidden": "true" });
+    const stops = page.errors.colors.filter((_, i) => i % 15 === 0).map((c) => `rgb(${c.join(" ")})`);
+    bar.style.backgroundImage = `linear-gradient(to right, ${stops.join(", ")})`;
+    return [`Absolute error ×${nameOf(page, scale)}: 0 `, bar, ` ${scale}, where 1 is white`];
+  }
+
   function panes(context, text, figure) {
-    const { board, a, b, picture, k, names, state, change } = context;
+    const { page, board, a, b, k, names, state, change } = context;
+    const scale = scaleOf(context);
     const nameA = board.rows[a].name;
     const nameB = board.rows[b].name;
     const split = Math.min(Math.max(state.split ?? 50, 0), 100);
@@ -70,13 +114,14 @@ Spike4DGS.compare = (() => {
           el("input", { type: "range", name: "split", min: "0", max: "100", value: String(split),
             oninput: (e) => place(node, Number(e.target.value)), onchange: (e) => change({ split: Number(e.target.value) }, true) })),
         el("label", {}, el("span", {}, "Time: ", el("output", { id: "at" })),
-          el("input", { type: "range", name: "k", min: "0", max: String(names.length - 1), value: String(k),
+          el("input", { type: "range", name: "k", "aria-label": "Time", min: "0", max: String(names.length - 1), value: String(k),
             oninput: (e) => update(context, Number(e.target.value), text, figure),
             onchange: (e) => change({ k: Number(e.target.value) }, true) }))),
       el("div", { class: "grid" },
         pane("pane-truth", "Truth", "Truth"),
         pane("pane-images", `${nameA} | ${nameB}`, `Images of ${nameA} and ${nameB}`),
-        pane("pane-errors", "Absolute error, black 0 to white 0.3", `Error maps of ${nameA} and ${nameB}`)));
+        pane("pane-errors", scaleBar(page, scale), `Error maps of ${nameA} and ${nameB}`)));
+    for (const img of node.querySelectorAll("#pane-errors img")) img.style.filter = colours(page, scale);
     place(node, split);
     return node;
   }
@@ -98,11 +143,16 @@ Spike4DGS.compare = (() => {
       const values = scores.values[scores.rows.indexOf(row)]?.[s];
       return values && image >= 0 ? [values[image]].flat().reduce((x, y) => x + y, 0) / [values[image]].flat().length : null;
     };
-    fill(text, `${heading(metric)} at ${at}: `, el("strong", {}, board.rows[a].name), ` ${format(metric, one(a))}, `,
-      el("strong", {}, board.rows[b].name), ` ${format(metric, one(b))}`);
     const lines = scores.rows.map((row, r) => ({ name: board.rows[row].name, color: row === a ? COLORS[0] : row === b ? COLORS[1] : null,
       values: scores.values[r][s].map((v) => [v].flat().reduce((x, y) => x + y, 0) / [v].flat().length) }));
+    fill(text, `${heading(metric)} at ${at}: `, named(board.rows[a], COLORS[0]), ` ${format(metric, one(a))}, `, named(board.rows[b], COLORS[1]), ` ${format(metric, one(b))}`,
+      lines.every((line) => line.color) ? null : ". Gray: the other methods.");
     Spike4DGS.plots.curves(figure, lines, metric, image >= 0 ? image : null, scores.images[s]);
+  }
+  function named(row, color) {
+    const swatch = el("span", { class: "swatch", "aria-hidden": "true" });
+    swatch.style.background = color;
+    return [swatch, el("strong", {}, row.name)];
   }
 
   function show(picture, crop, a, b, k) {

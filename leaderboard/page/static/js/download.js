@@ -8,7 +8,7 @@ Spike4DGS.download = (() => {
     const columns = ["rank_best", "rank_worst", "ties", "method", "label", ...view.columns.map((c) => c.id), "published", "scenes", "why"];
     const rows = view.shown.map((item) => {
       const rank = ranks?.get(item.index);
-      return [rank?.best ?? null, rank?.worst ?? null, rank ? rank.ties.map((i) => view.board.rows[i].name).join(" ") : null,
+      return [rank?.best ?? null, rank?.worst ?? null, rank ? rank.ties().map((i) => view.board.rows[i].name).join(" ") : null,
         item.row.name, item.row.label, ...view.columns.map((c) => item.values[c.id]), item.published,
         view.scenes.map((s) => view.board.scenes[s].id).join(" "), item.row.why];
     });

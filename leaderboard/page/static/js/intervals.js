@@ -84,14 +84,36 @@ Spike4DGS.intervals = (() => {
   const nested = (scores, scenes) =>
     scores.values.map((row) => scenes.map((s) => row[s].map((v) => (Array.isArray(v) ? v : [v]))));
 
-  /* Return for each of the `shown` row numbers { best, worst, ties } among them; rows that are not compared have none. */
+  const matrices = new WeakMap();
+
+  /* Return the comparison as bytes, row by row; the page comes with texts of 0 and 1. */
+  function matrix(better) {
+    if (!matrices.has(better)) {
+      const n = better.length;
+      const bytes = new Uint8Array(n * n);
+      better.forEach((line, i) => {
+        for (let j = 0; j < n; j++) bytes[i * n + j] = typeof line === "string" ? line.charCodeAt(j) - 48 : Number(line[j]);
+      });
+      matrices.set(better, bytes);
+    }
+    return matrices.get(better);
+  }
+
+  /* Return for each of the `shown` row numbers { best, worst, ties() } among them; rows that are not compared have none. */
   function ranks(rows, better, shown) {
-    const compared = shown.map((index) => rows.indexOf(index)).filter((k) => k >= 0);
+    const bytes = matrix(better);
+    const n = better.length;
+    const place = new Map(rows.map((row, k) => [row, k]));
+    const compared = shown.filter((index) => place.has(index)).map((index) => place.get(index));
     const found = new Map();
     for (const k of compared) {
-      const above = compared.filter((j) => better[j][k]).length;
-      const under = compared.filter((j) => better[k][j]).length;
-      const ties = compared.filter((j) => j !== k && !better[j][k] && !better[k][j]).map((j) => rows[j]);
+      let above = 0;
+      let under = 0;
+      for (const j of compared) {
+        above += bytes[j * n + k];
+        under += bytes[k * n + j];
+      }
+      const ties = () => compared.filter((j) => j !== k && !bytes[j * n + k] && !bytes[k * n + j]).map((j) => rows[j]);
       found.set(rows[k], { best: 1 + above, worst: compared.length - under, ties });
     }
     return found;

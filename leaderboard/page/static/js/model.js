@@ -2,6 +2,7 @@
 /* From a board and the state to the rows on the screen. Pure functions of their arguments. */
 Spike4DGS.model = (() => {
   const DEFAULT_COLUMNS = ["psnr", "psnr_dynamic", "ssim", "flip"];
+  const MOST_REMEMBERED = 200; // columns and choices of scenes of a board
   const COSTS = ["fit_seconds", "render_fps", "peak_memory_mb", "model_mb"];
 
   /* Return the value of a facet that rows are filtered by. */
@@ -14,11 +15,27 @@ Spike4DGS.model = (() => {
     return row[name];
   }
 
-  /* Return the numbers of the chosen scenes; all of them where none of the names is the board's. */
+  /* Return the numbers of the chosen scenes; all of them where none of the names is the board's. Of these only the ones
+     of the chosen sensor count, if there are any: else the filter hides all rows. */
   function chosenScenes(board, state) {
     const wanted = new Set(state.scenes ?? []);
-    const chosen = board.scenes.map((_, i) => i).filter((i) => wanted.has(board.scenes[i].id));
-    return chosen.length ? chosen : board.scenes.map((_, i) => i);
+    const every = board.scenes.map((_, i) => i);
+    const named = every.filter((i) => wanted.has(board.scenes[i].id));
+    const chosen = named.length ? named : every;
+    const sensed = state.sensor ? chosen.filter((i) => board.scenes[i].sensor === state.sensor) : chosen;
+    return sensed.length ? sensed : chosen;
+  }
+
+  const cache = new WeakMap(); // board -> what was computed of it before, by a text
+
+  function remembered(board, key, compute) {
+    if (!cache.has(board)) cache.set(board, new Map());
+    const of = cache.get(board);
+    if (!of.has(key)) {
+      if (of.size >= MOST_REMEMBERED) of.clear();
+      of.set(key, compute());
+    }
+    return of.get(key);
   }
 
   /* Return the mean over scenes, null where one has no value: never a mean over fewer. */
@@ -31,6 +48,17 @@ Spike4DGS.model = (() => {
     }
     return sum / scenes.length;
   }
+
+  /* Return every row's mean of a column, and every row's scenes that were not scored: filters change neither. */
+  const means = (board, column, scenes) =>
+    remembered(board, `mean ${column} ${scenes}`, () => board.rows.map((row) => mean(row, column, scenes)));
+  const missing = (board, scenes) =>
+    remembered(board, `missing ${scenes}`, () => board.rows.map((row) => scenes.filter((s) => row.cells[s].why)));
+
+  /* Return the values of a facet on a board, sorted. */
+  const facetValues = (board, name) =>
+    remembered(board, `facet ${name}`, () => (name === "sensor" ? board.scenes.map((scene) => scene.sensor) : board.rows.map((row) => facet(row, name)))
+      .filter((v, i, all) => all.indexOf(v) === i).sort());
 
   function publishedMean(board, index, metric, scenes) {
     const values = board.published?.rows[index]?.[metric];
@@ -49,7 +77,7 @@ Spike4DGS.model = (() => {
 
   /* Return why a row is hidden by the filters, or an empty text. */
   function hiddenBy(row, values, state, limits, facets) {
-    if (state.q && !row.name.toLowerCase().includes(state.q.toLowerCase())) return "name";
+    if (state.q && !row.name.toLowerCase().includes(state.q)) return "name";
     for (const name of facets) if (facet(row, name) !== state[name]) return name;
     // A row without the cost cannot be said to be within the limit.
     const within = (limit, cost, sign) =>
@@ -70,13 +98,16 @@ Spike4DGS.model = (() => {
     const facets = Spike4DGS.state.FACETS.filter((name) => state[name]);
     const shown = [];
     const hidden = [];
+    const columnMeans = shownColumns.map((c) => [c.id, means(board, c.number, scenes)]);
+    const lacking = missing(board, scenes);
+    const asked = { ...state, q: state.q.toLowerCase() };
+    const sensed = !state.sensor || scenes.every((s) => board.scenes[s].sensor === state.sensor);
     board.rows.forEach((row, index) => {
       const values = {};
-      for (const c of shownColumns) values[c.id] = mean(row, c.number, scenes);
-      const missing = scenes.filter((s) => row.cells[s].why);
-      const item = { row, index, values, missing, published: publishedMean(board, index, metric, scenes) };
-      const why = hiddenBy(row, values, state, limits, facets);
-      (why ? hidden : shown).push({ ...item, why });
+      for (const [id, all] of columnMeans) values[id] = all[index];
+      const why = sensed ? hiddenBy(row, values, asked, limits, facets) : "sensor";
+      const item = { row, index, values, missing: lacking[index], published: publishedMean(board, index, metric, scenes), why };
+      (why ? hidden : shown).push(item);
     });
     const column = page.index.get(state.s) && shownColumns.includes(page.index.get(state.s)) ? state.s : metric;
     const sortBy = state.s === "name" ? "name" : column;
@@ -98,5 +129,5 @@ Spike4DGS.model = (() => {
     };
   }
 
-  return { COSTS, facet, chosenScenes, mean, columns, view };
+  return { COSTS, facetValues, view };
 })();

@@ -4,7 +4,7 @@ Spike4DGS.state = (() => {
   const FACETS = ["images", "initialization", "motion", "supervision", "budget", "hardware", "poses", "calibration",
     "trained", "verified"];
   const LIMITS = ["maxfit", "minfps", "maxmem", "maxmodel"];
-  const TEXTS = ["t", "m", "s", "d", "q", "iv", "color", "scene", "a", "b", "row", ...FACETS, ...LIMITS];
+  const TEXTS = ["t", "m", "s", "d", "q", "sensor", "iv", "color", "scene", "a", "b", "e", "row", ...FACETS, ...LIMITS];
   const NUMBERS = ["k", "split"];
 
   function parse(hash) {
@@ -38,7 +38,7 @@ Spike4DGS.state = (() => {
   }
 
   /* Return the state without any filter of rows. */
-  const unfiltered = (state) => ({ ...state, q: "", ...Object.fromEntries([...FACETS, ...LIMITS].map((k) => [k, ""])) });
+  const unfiltered = (state) => ({ ...state, q: "", sensor: "", ...Object.fromEntries([...FACETS, ...LIMITS].map((k) => [k, ""])) });
 
   return { FACETS, LIMITS, parse, serialize, limits, unfiltered };
 })();

@@ -2,9 +2,11 @@
 /* The ranking: a real table, with what is hidden counted above it. */
 Spike4DGS.table = (() => {
   const { el, byId, fill, format, heading, plural } = Spike4DGS.dom;
-  const MOST = 100; // rows that are drawn at once, for speed; a button shows the others
+  const MOST = 50; // rows that are drawn, for speed; a button shows the others
+  const SCREEN = 20; // rows that are drawn at once; the rest follows when these are on the screen
+  let rest = () => {};
 
-  /* `ranks`: row number -> {best, worst, ties}; null while they are computed. `leftOut`: why others have none. */
+  /* `ranks`: row number -> {best, worst, ties()}; null while they are computed. `leftOut`: why others have none. */
   function draw(page, state, view, ranks, leftOut, act) {
     const rows = state.all ? view.shown : view.shown.slice(0, MOST);
     const metric = page.index.get(view.metric);
@@ -24,7 +26,7 @@ Spike4DGS.table = (() => {
         c === metric && paper && el("th", { scope: "col", class: "number paper", title: view.board.published.source }, `${names[view.metric]}, paper`)]),
       el("th", { scope: "col" }, "Verified")));
     const best = bestValues(view);
-    const body = el("tbody", {}, rows.map((item) => el("tr", { "data-row": item.row.name },
+    const line = (item) => el("tr", { "data-row": item.row.name },
       rankCell(view, item, ranks, leftOut),
       el("th", { scope: "row", class: "name" },
         el("button", { type: "button", class: "link", "aria-haspopup": "dialog", onclick: () => act.change({ row: item.row.name }) }, item.row.name),
@@ -32,10 +34,14 @@ Spike4DGS.table = (() => {
       view.columns.map((c) => [
         el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
-      el("td", { class: "nowrap" }, item.row.label))));
-    const caption = el("caption", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
+      el("td", { class: "nowrap" }, item.row.label));
+    const body = el("tbody", {}, rows.slice(0, SCREEN).map(line));
+    rest = () => body.append(...rows.slice(SCREEN).map(line));
+    const caption = el("caption", {}, el("div", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
       `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold together; `,
-      "methods that cannot be told apart tie (=).");
+      "methods that cannot be told apart tie (=)."));
+    // The page keeps its height meanwhile: what is read further down does not jump.
+    if (rows.length > SCREEN) byId("scroller").style.minHeight = `${byId("scroller").offsetHeight}px`;
     fill(byId("table"), caption, head, body);
     fill(byId("below"),
       view.shown.length > rows.length && el("button", { type: "button", id: "more", onclick: () => act.change({ all: true }) },
@@ -61,7 +67,7 @@ Spike4DGS.table = (() => {
       return el("td", { class: "number rank", title: why }, "–", el("span", { class: "hidden-text" }, ` no rank: ${why}`));
     }
     const text = rank.best === rank.worst ? String(rank.best) : `${rank.best}–${rank.worst}`;
-    const tied = rank.ties.map((i) => view.board.rows[i].name);
+    const tied = rank.ties().map((i) => view.board.rows[i].name);
     const said = tied.length ? `cannot be told apart from ${tied.join(", ")}` : "told apart from every other row";
     return el("td", { class: "number rank", title: said }, tied.length ? "= " : "", text, el("span", { class: "hidden-text" }, `, ${said}`));
   }
@@ -84,5 +90,12 @@ Spike4DGS.table = (() => {
       hidden > 0 && el("button", { type: "button", onclick: act.unfilter }, "Show them"));
   }
 
-  return { draw };
+  /* Draw the rows below the first screen. */
+  function finish() {
+    rest();
+    rest = () => {};
+    byId("scroller").style.minHeight = "";
+  }
+
+  return { draw, finish };
 })();

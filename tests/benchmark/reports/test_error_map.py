@@ -1,0 +1,39 @@
+"""Error maps: colours and levels of known errors, and the choice of a scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+
+from spike4dgs.benchmark.reports.error_map import choose_scale, error_image, error_levels, scale_name
+
+
+def test_colours_are_those_of_the_colour_map_at_the_share_of_the_scale() -> None:
+    truth = np.full((1, 5), 0.5, np.float32)
+    image = truth + np.array([[0, 0.05, -0.05, 0.1, 0.4]], np.float32)
+    for scale in (0.3, 0.1, 0.01):
+        shares = np.clip(np.array([0, 0.05, 0.05, 0.1, 0.4]) / scale, 0, 1)
+        expected = colormaps["magma"](np.rint(shares * 255).astype(int))[:, :3] * 255
+        np.testing.assert_allclose(error_image(image, truth, scale)[0], expected, atol=4)
+
+
+def test_levels_give_the_error_back() -> None:
+    errors = np.linspace(0, 0.3, 500, dtype=np.float32)[None]
+    back = 0.3 * (error_levels(0.2 + errors, np.full_like(errors, 0.2)) / 255.0) ** 2
+    assert np.abs(back - errors).max() < 0.3 / 255 and np.abs(back - errors)[errors < 0.01].max() < 3e-4
+    assert error_levels(np.ones((1, 1), np.float32), np.zeros((1, 1), np.float32)) == 255
+
+
+@pytest.mark.parametrize(("share", "scale"), [(0.015, 0.03), (0.03, 0.1)])
+def test_a_scale_leaves_out_two_percent_at_most(share: float, scale: float) -> None:
+    errors = np.full(1000, 0.02, np.float32)
+    errors[: int(1000 * share)] = 0.08
+    assert choose_scale([errors[:400], errors[400:]]) == scale
+
+
+def test_errors_beyond_every_scale_have_the_widest_and_scales_have_names() -> None:
+    assert choose_scale([np.ones(10, np.float32)]) == 0.3 and choose_scale([np.zeros(10, np.float32)]) == 0.01
+    assert choose_scale([]) == 0.3
+    names = [scale_name(s) for s in (0.3, 0.1, 0.03, 0.01)]
+    assert names == [f"error \N{MULTIPLICATION SIGN}{k}" for k in (1, 3, 10, 30)]
