@@ -24,12 +24,12 @@ ORDER = {
     "benchmark": "errors lazy plugins variants files compilation locks schemas inputs gpu environment weights array "
     "spikes scene identity release imports metrics method results reports runs cli speed",
     "generators": "profiles sensor worlds rig conventional events recorder rendering bursts streams tasks "
-    "second_renderings oracle ground_truth audit reports scene_maker check make_dataset",
+    "second_renderings oracle ground_truth audit reports twins scene_maker check make_dataset",
     "method": "torch_state settings model_files splat speed observations gaussians motion supervision checkpoint msdi "
     "initialization images pose_refinement trainer_settings fitted_model schedule trainer fit tracking "
-    "radiance_field saved_model viewing",
+    "radiance_field saved_model viewing twins",
     "baselines": "spike_to_image nearest_view initialization self_calibration held_out_pose descriptions recipes "
-    "oracle pose_report inspect export_nerfstudio export_colmap fit_command fault_table speed",
+    "oracle pose_report inspect export_nerfstudio export_colmap fit_command fault_table speed twins",
     "leaderboard": "tracks ledger entry truth_check flags rank verify refit submit_command verify_command page season",
 }
 MOST_MODULES = 13  # in a folder; `__init__` does not count

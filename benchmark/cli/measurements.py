@@ -8,6 +8,18 @@ from __future__ import annotations
 from spike4dgs.benchmark.cli.command import Command
 
 MEASUREMENTS: dict[str, Command] = {
+    "report speed-error": Command(
+        "spike4dgs.benchmark.reports.speed_error.command:make_speed_error",
+        "measure every approximation beside its exact twin, and write one page",
+        "report speed-error --quick --out runs/speed-error",
+        needs=(
+            "spike4dgs.generators.make_dataset:make_dataset",
+            "spike4dgs.method.twins.table:measurements",
+            "spike4dgs.baselines.twins.table:measurements",
+            "spike4dgs.generators.twins.table:measurements",
+            "spike4dgs.benchmark.speed.twins:measurements",
+        ),
+    ),
     "spike-agreement": Command(
         "spike4dgs.benchmark.reports.spike_agreement:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
