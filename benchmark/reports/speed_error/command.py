@@ -11,7 +11,7 @@ from spike4dgs.benchmark.environment import choose_device, command_line, environ
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.reports.speed_error.measurement import Measurement, Request, Size
-from spike4dgs.benchmark.reports.speed_error.runner import chosen_ids, measure_all
+from spike4dgs.benchmark.reports.speed_error.runner import in_order, measure_all
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 FORMAT = "spike4dgs-speed-error/1"
@@ -50,11 +50,11 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
         """
         size = "quick" if quick else size
         device = choose_device(device)  # type: ignore[assignment]
-        measurements = [m for room in rooms for m in room()]
-        known = chosen_ids(measurements)
+        measurements = in_order(m for room in rooms for m in room())
+        known = [m.id for m in measurements]
         if wrong := [name for name in only if name not in known]:
             raise problem("--only", f"ids among {', '.join(known)}", ", ".join(wrong), "correct the id")
-        measurements = [m for m in measurements if not only or m.id in only]
+        measurements = [m for m in measurements if (m.id in only if only else size in m.sizes)]
 
         @cache
         def made() -> Path:
@@ -65,12 +65,13 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
             return out / "scenes" / f"car-0-{profile}"
 
         start = utc_now()
-        key = {"size": size, "seed": seed, "device": device, "scene": str(scene or "")}
+        key = {"size": size, "seed": seed, "device": device, "scene": str(scene or ""), "commit": harness()["commit"]}
         key |= {"again": start} if again else {}
         results = measure_all(measurements, Request(size, seed, device, made), out / "measurements", key, _say)
         report = {
             "format": FORMAT, "size": size, "seed": seed, "device": device, "started": start, "finished": utc_now(),
-            "command": command_line(), "harness": harness(), "environment": environment(device), "measurements": results,
+            "command": command_line(), "harness": harness(), "environment": environment(device),
+            "measurements": results,
         }  # fmt: skip
         return write_report(report, out)
 

@@ -74,16 +74,24 @@ def _summary(results: Iterable[dict[str, Any]]) -> Html:
     rows = []
     for r in results:
         for s in r["series"][:1]:
-            chosen, exact = (next((p for p in s["points"] if p["role"] == role), None) for role in ("chosen", "exact"))
+            chosen, exact = _pair(r, s)
             if chosen is None or exact is None:
                 continue
-            x, y = (next(c for c in r["columns"] if c["id"] == i) for i in (r["x"], r["y"][0]))
+            x, y = (next(c for c in r["columns"] if c["id"] == i) for i in (r["cost"], r["error"]))
             cost, base, error = chosen["values"][x["id"]], exact["values"][x["id"]], chosen["values"][y["id"]]
             ratio = f"{short(base / cost)}" if cost and base is not None else "-"
             cells = (r["title"], chosen["name"], x["title"], _number(cost), _number(base), ratio)
             rows.append((*cells, f"{y['title']}: {_number(error)}"))
     heads = ("approximation", "chosen", "cost", "chosen", "exact twin", "ratio", "error of the chosen")
     return table(heads, rows, words=(0, 1, 2, 6))
+
+
+def _pair(r: dict[str, Any], s: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the chosen point of a series and its exact one; where that is a series of its own, the one of its name."""
+    chosen = next((p for p in s["points"] if p["role"] == "chosen"), None)
+    exact = [p for of in (s, *r["series"]) for p in of["points"] if p["role"] == "exact"]
+    own = [p for p in exact if p in s["points"] or (chosen and p["name"] == chosen["name"])]
+    return chosen, own[0] if own else None
 
 
 def _failures(results: Iterable[dict[str, Any]]) -> list[Html]:

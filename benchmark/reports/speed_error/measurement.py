@@ -14,6 +14,15 @@ from typing import Any, Literal
 
 Size = Literal["tiny", "quick", "whole"]
 Role = Literal["", "exact", "chosen"]
+GROUPS = (  # of the page, in this order; the runner takes them in it too
+    "Rasterizer",
+    "Images from spikes",
+    "Losses and networks",
+    "Sensor and rendering",
+    "Metrics and streams",
+    "Fits",
+    "How costs grow",
+)
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Measurement:
     """One section of the report. The texts are short sentences; words between backquotes are code."""
 
     id: str  # of its file and section: lower case, hyphens
-    group: str
+    group: str  # of GROUPS
     title: str
     approximation: str
     exact: str  # the twin; empty where a cost grows
@@ -76,6 +85,9 @@ class Measurement:
     run: Callable[[Request], Iterable[Series]] = field(compare=False)
     seconds: Mapping[str, float] = field(default_factory=dict)  # by size: what it took on two cores, for the estimate
     held_by: str = ""  # the test that holds the error
+    cost: str = ""  # column of the summary, where it is not x
+    error: str = ""  # column of the summary, where it is not the first of y
+    sizes: tuple[Size, ...] = ("tiny", "quick", "whole")  # that it is part of
 
     def column(self, id: str) -> Column:
         """Return a column by its id."""

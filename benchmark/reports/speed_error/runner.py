@@ -13,7 +13,7 @@ from typing import Any
 from spike4dgs.benchmark.environment import cpu_name, harness, utc_now
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
-from spike4dgs.benchmark.reports.speed_error.measurement import Measurement, Point, Request, Series
+from spike4dgs.benchmark.reports.speed_error.measurement import GROUPS, Measurement, Point, Request, Series
 
 Result = dict[str, Any]  # a measurement of speed_error.schema.json
 _UNKNOWN_S = 10.0  # of a measurement that does not say how long it takes
@@ -67,6 +67,8 @@ def measure(m: Measurement, request: Request) -> Result:
     return {
         **{name: getattr(m, name) for name in texts},
         "y": list(m.y),
+        "cost": m.cost or m.x,
+        "error": m.error or m.y[0],
         "columns": [asdict(c) for c in m.columns],
         "series": [{"name": s.name, "points": [_point(p, m) for p in s.points]} for s in series],
         "seconds": time.perf_counter() - start,
@@ -99,9 +101,10 @@ def _minutes(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
-def chosen_ids(measurements: Iterable[Measurement]) -> list[str]:
-    """Return the ids of measurements. Raises ValueError where two have one: their files would be the same."""
-    ids = [m.id for m in measurements]
+def in_order(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """Return measurements by their groups. Raises ValueError for one id twice, and for a group that is not known."""
+    found = sorted(measurements, key=lambda m: GROUPS.index(m.group))
+    ids = [m.id for m in found]
     if twice := {i for i in ids if ids.count(i) > 1}:
         raise ValueError(f"measurements with one id: {', '.join(sorted(twice))}")
-    return ids
+    return found
