@@ -162,8 +162,8 @@ NUMBERS = Measurement(
     approximation="Ground truth and training images are kept as half floats: two bytes a pixel.",
     exact="Float64.",
     reason="A half float rounds by 0.05 % at most between 6e-5 and 65,504, far below the noise of a count. 8 bits of "
-    "sRGB lose up to 14 % in shadows and everything above white. Below 6e-5 half floats lose digits, and below 3e-8 all: "
-    "such light fires a pixel less than once in a second.",
+    "sRGB lose up to 14 % in shadows and everything above white. Below 6e-5 half floats lose digits, and below 3e-8 "
+    "all; light of 6e-5 fires a pixel about once a second.",
     columns=(
         Column("bytes", "memory, bytes a pixel"),
         MS,

@@ -45,7 +45,7 @@ def _timed(calls: dict[float, Any], name: str, column: str, request: Request) ->
 
 def _pixels(request: Request) -> Iterator[Series]:
     sizes = request.pick(
-        ((24, 16),),
+        ((24, 16), (48, 32)),
         ((200, 125), (400, 250), (800, 500), (1000, 1000)),
         ((200, 125), (400, 250), (800, 500), (1000, 1000)),
     )

@@ -186,9 +186,9 @@ EXTENT = Measurement(
     id="splat-extent",
     group=GROUP,
     title="Rasterizer: faint Gaussians",
-    approximation="A Gaussian is skipped at a pixel where its alpha is below 1/255; its tiles are the others.",
+    approximation="A Gaussian is left out of a pixel, and of a tile, where its alpha is below 1/255.",
     exact="No limit: every Gaussian at every pixel, float64.",
-    reason="1/255 is 3DGS's limit, and other viewers of the same model have it. A fit and its renders are cut alike, so "
+    reason="1/255 is 3DGS's limit, and other viewers of a model have it. A fit and its renders are cut alike, so "
     "that no error of this size is seen in a score: the fit makes up for it. 1/1024 would composite a third more "
     "Gaussians for a quarter of the error.",
     columns=(PAIRS, MAX, RMS),
@@ -234,7 +234,7 @@ EXPONENTIAL = Measurement(
     title="Rasterizer: exp by a polynomial",
     approximation="2^x is a polynomial of degree 5 from -0.5 to 0.5; the rest goes into the exponent's bits.",
     exact="`numpy.exp2` in float64.",
-    reason="Degree 5 is the lowest whose error is near that of float32 itself; a higher one costs time and gains little.",
+    reason="Degree 5 is the lowest whose error is near that of float32 itself; a higher one costs more, for little.",
     columns=(Column("ns", "time, ns a number"), Column("best_ns", "best time, ns a number"), _BITS),
     x="ns",
     y=("relative",),

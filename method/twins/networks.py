@@ -38,7 +38,7 @@ def _msdi(request: Request) -> Iterator[Series]:
             "features in bfloat16": partial(network.images, spikes, half=True),
         }
         chosen = "features in bfloat16" if has_bfloat16(torch.device("cpu")) else "float32"
-        with torch.inference_mode():
+        with torch.inference_mode(), one_torch_thread():
             exact = calls["float64"]()
             times = by_turns_ms(list(calls.values()), request.pick(1, 2, 5))
             points = []

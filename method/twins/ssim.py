@@ -61,9 +61,9 @@ SSIM = Measurement(
     title="SSIM and its gradient",
     approximation="One fused pass in float32 with a separable 11x11 window.",
     exact="Torch in float64 with the same window.",
-    reason="A loss needs three digits of its value and of its gradient, and has seven on images. Where variances cancel "
-    "float32 loses them: the gradient of two flat images, which is almost zero, by some percent, and all of it for noise "
-    "of 0.001 at radiance 50. Torch in float32 loses as much.",
+    reason="A loss needs three digits of its value and of its gradient, and has seven on images. Where variances "
+    "cancel float32 loses them: some percent of the gradient of two flat images, which is almost zero, and all of it "
+    "for noise of 0.001 at radiance 50. Torch in float32 loses as much.",
     columns=(
         MS,
         BEST_MS,
