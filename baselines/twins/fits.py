@@ -17,7 +17,7 @@ import numpy as np
 from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS
 from spike4dgs.benchmark.environment import peak_memory_mb, reset_peak_memory
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, training_for
-from spike4dgs.benchmark.reports.speed_error.measurement import Column, Measurement, Point, Request, Series
+from spike4dgs.benchmark.reports.speed_error.measurement import Column, Measurement, Point, Request, Series, Size
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.motion.paths import Paths
@@ -139,9 +139,10 @@ def _widths(request: Request) -> Iterator[Series]:
 def _fit(id: str, title: str, texts: tuple[str, str, str], run: Any, count: int) -> Measurement:
     approximation, exact, reason = texts
     seconds = {"tiny": 4.0 * count, "quick": 12.0 * count, "whole": 110.0 * count}
+    sizes: tuple[Size, ...] = ("tiny", "quick", "whole") if id == "budget" else ("quick", "whole")  # one is a trial
     return Measurement(
         id, GROUP, title, approximation, exact, reason, _COLUMNS, "seconds", ("rms", "moving"), run, seconds,
-        "tests/baselines/twins/test_fits.py",
+        "tests/baselines/twins/test_fits.py", sizes=sizes,
     )  # fmt: skip
 
 
