@@ -20,6 +20,7 @@ from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, training_for
 from spike4dgs.benchmark.reports.speed_error.measurement import Column, Measurement, Point, Request, Series, Size
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.motion.paths import Paths
 
 GROUP = "Fits"
@@ -103,11 +104,16 @@ def _budgets(request: Request) -> Iterator[Series]:
 
 
 def _caps(request: Request) -> Iterator[Series]:
-    limit = X_RECIPE.settings["density.max_gaussians"]
-    counts = {limit // 16: "", limit // 4: "", limit: "chosen", 1_000_000: "exact"}
-    trials = (
-        Trial(f"{n} at most", {"density.max_gaussians": n}, _steps(request), role=role) for n, role in counts.items()
-    )
+    usual, most = DensitySettings(), X_RECIPE.settings["density.max_gaussians"]
+    trials = []
+    for factor, role in ((1 / 16, ""), (1 / 4, ""), (1.0, "chosen"), (100.0, "exact")):
+        limits = {
+            "density.max_per_pixel": factor * usual.max_per_pixel,
+            "density.max_moving_per_pixel": factor * usual.max_moving_per_pixel,
+            "density.max_gaussians": most if factor <= 1 else usual.max_gaussians,
+        }
+        name = f"{factor * usual.max_per_pixel:g} a pixel" if factor <= 1 else "no limit"
+        trials.append(Trial(name, limits, _steps(request), role=role))
     yield from _series(request, X_RECIPE, tuple(trials))
 
 
@@ -163,9 +169,10 @@ FITS = (
         "cap",
         "Gaussians: their largest number",
         (
-            "Density control stops at 36,000 Gaussians.",
+            "Density control stops at 0.8 Gaussians a pixel of a view, at 0.4 of those that move, and at 36,000.",
             "No limit that a fit reaches.",
-            "Scenes of small images have fewer points than that; where there are more, each costs time in every step.",
+            "Each Gaussian costs time in every step and every image. Beyond about one a pixel there is no more detail in "
+            "the images for them to hold.",
         ),
         _caps,
         4,
