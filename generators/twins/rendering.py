@@ -158,8 +158,8 @@ SAVINGS = Measurement(
     title="Rendering: adaptive keys and samples",
     approximation="Only what changes is traced, as often as its motion asks, with the profile's samples per pixel.",
     exact=f"Mitsuba's own loop: every pixel at every tick, {MORE} times the samples. Its own noise counts as error.",
-    reason="Where nothing moves the background has more samples than any key. At moving pixels the samples' noise is "
-    "most of the error, and four times the samples would cost up to four times the time for half of it.",
+    reason="Where nothing moves the background has more samples than any key. At moving pixels the noise of the "
+    "samples counts: four times as many halve it, for up to four times the time.",
     columns=(
         Column("minutes", "time of a clip's keys, min"),
         Column("mean", "mean error, %"),
