@@ -29,18 +29,21 @@ Run = Callable[
 ]  # -> image [H, W], gradients of means, quats, scales, opacities, colours
 
 
-def random_scene(n: int, seed: int = 0) -> tuple[Splats, Views]:
-    """Return N Gaussians in front of a camera, most in view, radii as in `MEAN_RADIUS_PX`; float32, one channel."""
+def random_scene(n: int, seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> tuple[Splats, Views]:
+    """Return N Gaussians in front of a camera, most in view; float32, one channel.
+
+    Radii are those of `MEAN_RADIUS_PX` in an image of 400 px, and grow with the width.
+    """
     g = torch.Generator().manual_seed(seed)
     z = 2 + 4 * torch.rand(n, generator=g)
-    at = [(1.06 * torch.rand(n, generator=g) - 0.53) * size / WIDTH * z for size in (WIDTH, HEIGHT)]
+    at = [(1.06 * torch.rand(n, generator=g) - 0.53) * size / width * z for size in (width, height)]
     size = MEAN_RADIUS_PX.get(n, 4.3) / 2.6 / WIDTH * torch.exp(0.45 * torch.randn(n, generator=g)) * z
     scales = size[:, None] * torch.exp(0.45 * torch.randn(n, 3, generator=g))
     opacities = torch.sigmoid(1.5 * torch.randn(n, generator=g))
     quats, colors = torch.randn(n, 4, generator=g), torch.rand(n, 1, generator=g)
-    K = torch.tensor([[[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]]])
+    K = torch.tensor([[[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]])
     splats = Splats(torch.stack([*at, z], -1), quats, scales, opacities, colors)
-    return splats, Views(torch.eye(4)[None], K, WIDTH, HEIGHT)
+    return splats, Views(torch.eye(4)[None], K, width, height)
 
 
 def _leaves(splats: Splats, channels: int, gradients: bool) -> list[Tensor]:
@@ -131,16 +134,16 @@ def ssim(argv: Sequence[str] = ()) -> int:
     a = p.parse_args(list(argv))
     g = torch.Generator().manual_seed(0)
     image, target = torch.rand(1, HEIGHT, WIDTH, generator=g), torch.rand(1, HEIGHT, WIDTH, generator=g)
-    exact = _differentiate(ssim_reference, image.double(), target.double())
+    exact = differentiate(ssim_reference, image.double(), target.double())
     rows: list[tuple[str, ...]] = []
     base = 0.0
     for name, function, repeats in (
-        ("torch, 11x11 window", _ssim_square, 5),
+        ("torch, 11x11 window", ssim_square, 5),
         ("torch, separable window", ssim_reference, 5),
         ("spike4dgs", fused_ssim, a.repeats),
     ):
-        value, gradient = _differentiate(function, image, target)
-        times = time_ms(lambda f=function: _differentiate(f, image, target), repeats)  # type: ignore[misc]
+        value, gradient = differentiate(function, image, target)
+        times = time_ms(lambda f=function: differentiate(f, image, target), repeats)  # type: ignore[misc]
         base = base or times[1]
         errors = float((value - exact[0]).abs()), float((gradient - exact[1]).norm() / exact[1].norm())
         ms = f"{times[0]:.2f}", f"{times[1]:.2f}"
@@ -151,16 +154,15 @@ def ssim(argv: Sequence[str] = ()) -> int:
     return 0
 
 
-def _differentiate(
-    function: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor
-) -> tuple[Tensor, Tensor]:
+def differentiate(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the value of a loss and its gradient for the image."""
     leaf = image.detach().clone().requires_grad_()
     value = function(leaf, target)
     return value.detach(), torch.autograd.grad(value, leaf)[0]
 
 
-def _ssim_square(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM as training code usually writes it: five convolutions with one 11x11 window."""
+def ssim_square(image: Tensor, target: Tensor) -> Tensor:
+    """Return SSIM as training code usually writes it: five convolutions with one 11x11 window."""
     at = torch.arange(-RADIUS, RADIUS + 1, dtype=image.dtype)
     line = torch.exp(-0.5 * (at / SSIM_SIGMA) ** 2)
     window = torch.outer(line, line) / line.sum() ** 2

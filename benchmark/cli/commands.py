@@ -1,28 +1,14 @@
 """The table of commands.
 
-It is the one place where rooms meet. Import strings name the commands, and the functions of other rooms that a command
-calls; both are loaded only when they run, so `--help` imports nothing heavy and no room imports another for the command
-line's sake.
+With `measurements` beside it, it is the one place where rooms meet. Import strings name the commands, and the functions
+of other rooms that a command calls; both are loaded only when they run, so `--help` imports nothing heavy and no room
+imports another for the command line's sake.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class Command:
-    """A subcommand, of one word or two: its function, a summary, and a command line that people can copy.
-
-    A command that calls functions of other rooms `needs` them: its target is then called with them and returns the
-    command's function.
-    """
-
-    target: str  # module:function
-    summary: str
-    example: str
-    needs: tuple[str, ...] = ()  # module:function, in the order of the target's arguments
-
+from spike4dgs.benchmark.cli.command import Command
+from spike4dgs.benchmark.cli.measurements import MEASUREMENTS
 
 COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
@@ -244,57 +230,10 @@ COMMANDS: dict[str, Command] = {
         "write the Gaussians of a fitted model at several times as .ply files",
         "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
     ),
-    "spike-agreement": Command(
-        "spike4dgs.benchmark.reports.spike_agreement:spike_agreement",
-        "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
-        "spike-agreement runs/small --data data --out runs/spike-agreement",
-    ),
-    "tradeoff": Command(
-        "spike4dgs.generators.reports.tradeoff:tradeoff",
-        "report render time against error for several settings",
-        "tradeoff car --profile paper",
-    ),
-    "spacing": Command(
-        "spike4dgs.generators.reports.spacing:spacing",
-        "report key-frame spacing against error and render time",
-        "spacing --help",
-    ),
+    **MEASUREMENTS,
     "completion": Command(
         "spike4dgs.benchmark.cli.completion:completion",
         "print a script that completes commands in bash, zsh or fish",
         "completion bash",
-    ),
-}
-
-SPEED_SUMMARY = "measure the speed of a part beside a plain one"
-# Speed measurements take the rest of the command line as a list of strings.
-SPEED: dict[str, Command] = {
-    "splat": Command(
-        "spike4dgs.method.speed:splat", "render and differentiate Gaussians, beside a torch reference", "speed splat"
-    ),
-    "ssim": Command("spike4dgs.method.speed:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
-    "render": Command(
-        "spike4dgs.method.viewing.speed_render:render",
-        "render images of saved models, side by side",
-        "speed render runs/small/models/*/car-0-small.safetensors",
-    ),
-    "simulate": Command(
-        "spike4dgs.generators.reports.speed:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
-    ),
-    "record": Command(
-        "spike4dgs.generators.recorder.speed:record",
-        "record emulated cameras into memory and to disk, queued beside single reads",
-        "speed record",
-    ),
-    "decode": Command(
-        "spike4dgs.benchmark.speed.decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
-    ),
-    "metrics": Command("spike4dgs.benchmark.speed.metrics:metrics", "every metric for one image", "speed metrics"),
-    "tfi": Command("spike4dgs.baselines.speed.stacks:tfi", "images from spike intervals, whole stack", "speed tfi"),
-    "tfp": Command("spike4dgs.baselines.speed.stacks:tfp", "images from spike counts, whole stack", "speed tfp"),
-    "images": Command(
-        "spike4dgs.baselines.speed.images:images",
-        "time and quality of each way from spikes to an image, beside the paper's Table 6",
-        "speed images data/car-0-small data/turntable-0-small",
     ),
 }

@@ -7,7 +7,8 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.cli.commands import COMMANDS, SPEED, SPEED_SUMMARY
+from spike4dgs.benchmark.cli.commands import COMMANDS
+from spike4dgs.benchmark.cli.measurements import SPEED, SPEED_SUMMARY
 
 Shell = Literal["bash", "zsh", "fish"]
 Words = Mapping[str, str]  # word -> what it does

@@ -13,7 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
-from spike4dgs.benchmark.cli.commands import COMMANDS, SPEED, SPEED_SUMMARY, Command
+from spike4dgs.benchmark.cli.command import Command
+from spike4dgs.benchmark.cli.commands import COMMANDS
+from spike4dgs.benchmark.cli.measurements import SPEED, SPEED_SUMMARY
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.inputs.numbers import shown
 

@@ -24,6 +24,22 @@ def time_ms(run: Callable[[], object], repeats: int) -> tuple[float, float]:
     return min(times), statistics.median(times)
 
 
+def by_turns_ms(runs: Sequence[Callable[[], object]], repeats: int) -> list[tuple[float, float]]:
+    """Return (minimum, median) wall time in ms of each run, after one uncounted call of each.
+
+    They take turns, so that other load on the machine and its changing clock meet all of them alike.
+    """
+    for run in runs:
+        run()
+    times: list[list[float]] = [[] for _ in runs]
+    for _ in range(repeats):
+        for run, own in zip(runs, times, strict=True):
+            start = time.perf_counter()
+            run()
+            own.append((time.perf_counter() - start) * 1e3)
+    return [(min(own), statistics.median(own)) for own in times]
+
+
 def module_of(package: str, file: str) -> ModuleType | None:
     """Import one file of a package without running its `__init__`; return None where the package is not installed.
 

@@ -79,7 +79,7 @@ def spacing(
         raise problem("--ticks", "a positive multiple of 64", str(ticks), "give 256, for example")
     console = Console(highlight=False, width=120)
     built = WORLDS[world].build(seed, variant, ticks / RATE_HZ)
-    frames, speed_px_s, seconds = _render(built, (width, height), ticks, spp, seed, console)
+    frames, speed_px_s, seconds = render_every_tick(built, (width, height), ticks, spp, seed, console)
     rows = compare(frames, speed_px_s, seconds, [2**k for k in range(1, 7)], seed)
     out.mkdir(parents=True, exist_ok=True)
     with atomic_path(out / f"{world}.csv") as part, open(part, "w", newline="") as f:
@@ -156,7 +156,7 @@ def _share_off(a: NDArray[np.int64], b: NDArray[np.int64], moving: NDArray[np.bo
     return 100 * float((a != b)[moving].mean())
 
 
-def _render(
+def render_every_tick(
     world: Any, size: tuple[int, int], n: int, spp: int, seed: int, console: Any
 ) -> tuple[Float32, float, float]:
     """Return the frames [n + 1, H, W] at every tick, speed of the fastest point in px/s, seconds per frame."""

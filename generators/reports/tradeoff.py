@@ -37,7 +37,7 @@ from spike4dgs.generators.tasks import (
 )
 
 _TICKS = 3
-_MORE = 4  # times the profile's samples, for the truth
+MORE = 4  # times the profile's samples, for the truth
 
 
 @dataclass(frozen=True)
@@ -94,15 +94,15 @@ def tradeoff(
     p = PROFILES[profile]
     job, console = Job(world, variant, seed, profile, p, p.seconds), Console(width=120)
     ticks = sorted(int(t) for t in np.random.default_rng(seed).choice(job.n_ticks, _TICKS, replace=False))
-    console.print(f"truth at ticks {ticks}, {_MORE * p.spp} samples a pixel")
-    truth, moving = _truth(job, ticks)
+    console.print(f"truth at ticks {ticks}, {MORE * p.spp} samples a pixel")
+    truth, moving = truth_at(job, ticks)
     rows: list[Row] = []
     static: dict[int, StaticParts] = {}
     for name, changed in settings(job).items():
         spp = changed.profile.spp
         if spp not in static:
             static[spp] = RenderStatic(changed)(None)
-        rows.append(_measure(name, changed, static[spp], ticks, truth, moving))
+        rows.append(measure(name, changed, static[spp], ticks, truth, moving))
         console.print(f"{name}: {rows[-1].keys_minutes:.1f} min, {rows[-1].mean_percent:.2f} %", markup=False)
         _write(rows, out / f"{world}.csv")  # after every setting: the last ones take longest
         title = f"{world}, {profile}: {p.width}x{p.height}, {p.seconds * 1e3:g} ms, {len(p.views)} views"
@@ -138,15 +138,16 @@ def needed(plan: KeyPlan, ticks: Sequence[int]) -> list[int]:
     return sorted(keys)
 
 
-def _truth(job: Job, ticks: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def truth_at(job: Job, ticks: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return full renderings [n, H, W] of the held-out view at some ticks, and the pixels that move there."""
     view = held_out_view(job)
     camera, p = cameras_of(job)[view : view + 1], job.profile
     renderer = MultiViewRenderer(world_of(job), camera, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
-    images = [renderer.reference_frames(t / RATE_HZ, _MORE * p.spp)[0] for t in ticks]
+    images = [renderer.reference_frames(t / RATE_HZ, MORE * p.spp)[0] for t in ticks]
     return np.stack(images), np.stack([renderer.traced(t / RATE_HZ)[0] for t in ticks])
 
 
-def _measure(
+def measure(
     name: str,
     job: Job,
     static: StaticParts,
@@ -154,6 +155,7 @@ def _measure(
     truth: NDArray[np.float32],
     moving: NDArray[np.bool_],
 ) -> Row:
+    """Return the row of one setting: the time of its keys, and its errors at ticks whose truth is known."""
     plan, task = plan_of(job), RenderKeys(job, static.views)
     seconds: dict[int, list[float]] = {level: [] for level in range(len(plan.chain))}
     with tempfile.TemporaryDirectory() as folder:

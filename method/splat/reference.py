@@ -13,7 +13,7 @@ Memory grows as pixels x Gaussians. Not differentiated: the visibility decisions
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -117,6 +117,21 @@ def composite(view: Projection, center: Tensor, colors: Tensor, size: tuple[int,
     image = torch.einsum("mp,mf->pf", before * alpha, colors)
     opaque = 1 - after[-1] if len(colors) else torch.zeros(size[0] * size[1], dtype=colors.dtype)
     return image.reshape(size[1], size[0], -1), opaque.reshape(size[1], size[0])
+
+
+def composite_patch(
+    view: Projection, colors: Tensor, corner: tuple[int, int], size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Return image [h, w, F] and alpha [h, w] of the part of a view that has `size` (width, height) px from `corner`.
+
+    Gaussians that cannot reach the part are left out, so that memory grows with the part and not with the image.
+    `colors` are those of all N Gaussians.
+    """
+    offset = torch.tensor(corner, dtype=torch.float64)
+    half = torch.tensor(size, dtype=torch.float64) / 2
+    near = ((view.center - offset - half).abs() <= half + view.radius[:, None]).all(-1)
+    part = Projection(*(getattr(view, f.name)[near] for f in fields(view)))
+    return composite(part, part.center - offset, colors[part.index], size)
 
 
 def render_reference(

@@ -10,7 +10,6 @@ import argparse
 import statistics
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -23,7 +22,7 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.speed.timing import show_table
 from spike4dgs.method.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
-from spike4dgs.method.splat.reference import Projection, composite, project
+from spike4dgs.method.splat.reference import composite_patch, project
 from spike4dgs.method.splat.types import NEAR, PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
@@ -129,13 +128,9 @@ def exact_patch(
     whole = (camera.width, camera.height)
     f = model.pixel_filter
     seen = project(wide, views.w2c[0], views.K[0], whole, f.compensated, NEAR, f.variance)
-    offset = torch.tensor(corner, dtype=torch.float64)
-    half = torch.tensor(size, dtype=torch.float64) / 2
-    near = ((seen.center - offset - half).abs() <= half + seen.radius[:, None]).all(-1)
-    part = Projection(*(getattr(seen, f.name)[near] for f in fields(seen)))
-    image, _ = composite(part, part.center - offset, wide.colors[part.index], size)
+    image, _ = composite_patch(seen, wide.colors, corner, size)
     K = views.K.clone()
-    K[:, :2, 2] -= offset
+    K[:, :2, 2] -= torch.tensor(corner, dtype=K.dtype)
     device = splats.means.device
     cut = Views(views.w2c.to(device), K.to(device), *size)
     gray = model.image(image[None].to(splats.colors), cut)

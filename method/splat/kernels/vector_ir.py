@@ -121,8 +121,8 @@ class Lanes:
         """Return -|x|: sets the sign bit."""
         return self.b.bitcast(self.b.or_(self.b.bitcast(x, self.int_type), self.int_const(-(2**31))), self.type)
 
-    def exp2(self, x: Any) -> Any:
-        """Return 2**x for x <= 127; below -125 the result stays at 2**-125.
+    def exp2(self, x: Any, polynomial: tuple[float, ...] = EXP2_POLYNOMIAL) -> Any:
+        """Return 2**x for x <= 127; below -125 the result stays at 2**-125. `polynomial`: coefficients, lowest first.
 
         Adding 1.5 * 2**23 leaves round(x) in the low bits; shifted by 23 they are added to the exponent of the
         polynomial in the remainder.
@@ -131,8 +131,8 @@ class Lanes:
         magic = self.const(12582912.0)
         rounded = self.b.fadd(x, magic)
         rest = self.b.fsub(x, self.b.fsub(rounded, magic))
-        value = self.const(EXP2_POLYNOMIAL[-1])
-        for c in reversed(EXP2_POLYNOMIAL[:-1]):
+        value = self.const(polynomial[-1])
+        for c in reversed(polynomial[:-1]):
             value = self.fma(value, rest, self.const(c))
         exponent = self.b.shl(self.b.bitcast(rounded, self.int_type), self.int_const(23))
         return self.b.bitcast(self.b.add(exponent, self.b.bitcast(value, self.int_type)), self.type)

@@ -49,7 +49,7 @@ def test_light_that_changes_linearly_in_time_has_no_error():
 def test_report_writes_a_table_and_a_plot(tmp_path, monkeypatch, capsys):
     world = SimpleNamespace(build=lambda *a: None)
     monkeypatch.setattr("spike4dgs.generators.worlds.WORLDS", {"car": world})
-    monkeypatch.setattr(spacing, "_render", lambda *a: (drifting(64, 0.03), 600.0, 0.1))
+    monkeypatch.setattr(spacing, "render_every_tick", lambda *a: (drifting(64, 0.03), 600.0, 0.1))
     assert spacing.spacing("car", out=tmp_path, ticks=64) == 0
     with open(tmp_path / "car.csv") as f:
         rows = list(csv.DictReader(f))

@@ -1,0 +1,1 @@
+"""Measurements of this room for `report speed-error`: each approximation beside its exact twin."""

@@ -1,0 +1,1 @@
+"""`report speed-error`: every approximation beside its exact twin, in one run, on one page."""

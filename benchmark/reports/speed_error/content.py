@@ -1,0 +1,149 @@
+"""The page of the report: a summary, then each measurement with its plots, its numbers and its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.reports.html.chart import Axis, Curve, Dot, chart
+from spike4dgs.benchmark.reports.html.page import (
+    Html,
+    contents,
+    facts,
+    figure,
+    folded,
+    grid,
+    paragraph,
+    section,
+    table,
+    write_page,
+)
+from spike4dgs.benchmark.reports.html.scales import short
+
+_OPEN_ROWS = 12  # a longer table is folded
+
+
+def write_content(path: Path, report: dict[str, Any]) -> None:
+    """Write the page of a report of `speed_error.schema.json`."""
+    results = report["measurements"]
+    groups = list(dict.fromkeys(r["group"] for r in results))
+    intro = (
+        "Every approximation stands beside its slow exact twin, measured in the same run by turns. A ring marks the "
+        "point that the project uses. Errors are against the exact twin, and do not depend on the machine; times do."
+    )
+    sections = [section(g, [_measurement(r) for r in results if r["group"] == g]) for g in groups]
+    parts = [
+        paragraph(intro),
+        _run(report),
+        contents(["Summary", *groups]),
+        section("Summary", [_summary(results), *_failures(results)]),
+        *sections,
+        section("Program", [_program(report)]),
+    ]
+    write_page(path, "Speed against error", parts)
+
+
+def _run(report: dict[str, Any]) -> Html:
+    machine, harness = report["environment"], report["harness"]
+    commit = harness["commit"] or "unknown (an installed package)"
+    return facts(
+        [
+            ("machine", machine["gpu"] or machine["cpu"]),
+            ("commit", f"{commit}{', with changes' if harness['dirty'] else ''}"),
+            ("size, seed, device", f"{report['size']}, {report['seed']}, {report['device']}"),
+            ("measured", f"{report['started']} to {report['finished']}"),
+        ]
+    )
+
+
+def _program(report: dict[str, Any]) -> Html:
+    machine = report["environment"]
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    return facts(
+        [
+            ("command", f"`{report['command']}`"),
+            ("system", f"Python {machine['python']}, {machine['platform']}"),
+            ("packages", packages),
+        ]
+    )
+
+
+def _summary(results: Iterable[dict[str, Any]]) -> Html:
+    """Return a row for each measurement with an exact twin: its chosen point on the first input."""
+    rows = []
+    for r in results:
+        for s in r["series"][:1]:
+            chosen, exact = _pair(r, s)
+            if chosen is None or exact is None:
+                continue
+            x, y = (next(c for c in r["columns"] if c["id"] == i) for i in (r["cost"], r["error"]))
+            cost, base, error = chosen["values"][x["id"]], exact["values"][x["id"]], chosen["values"][y["id"]]
+            ratio = f"{short(base / cost)}" if cost and base is not None else "-"
+            cells = (r["title"], chosen["name"], x["title"], _number(cost), _number(base), ratio)
+            rows.append((*cells, f"{y['title']}: {_number(error)}"))
+    heads = ("approximation", "chosen", "cost", "chosen", "exact twin", "ratio", "error of the chosen")
+    return table(heads, rows, words=(0, 1, 2, 6))
+
+
+def _pair(r: dict[str, Any], s: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the chosen point of a series and its exact one; where that is a series of its own, the one of its name."""
+    chosen = next((p for p in s["points"] if p["role"] == "chosen"), None)
+    exact = [p for of in (s, *r["series"]) for p in of["points"] if p["role"] == "exact"]
+    own = [p for p in exact if p in s["points"] or (chosen and p["name"] == chosen["name"])]
+    return chosen, own[0] if own else None
+
+
+def _failures(results: Iterable[dict[str, Any]]) -> list[Html]:
+    return [paragraph(f"Failed: {r['title']}: {r['problem']}", "bad") for r in results if r["problem"]]
+
+
+def _measurement(r: dict[str, Any]) -> Html:
+    said = [("approximation", r["approximation"]), ("exact twin", r["exact"]), ("chosen because", r["reason"])]
+    said += [("held by", f"`{r['held_by']}`" if r["held_by"] else ""), ("id", f"`{r['id']}`")]
+    plots = [figure(_plot(r, y), _caption(r, y)) for y in r["y"]]
+    numbers = _numbers(r)
+    rows = sum(len(s["points"]) for s in r["series"])
+    parts = [
+        facts((name, words) for name, words in said if words),
+        *([paragraph(f"Failed: {r['problem']}", "bad")] if r["problem"] else []),
+        *([grid(plots)] if r["series"] else []),
+        *([folded(f"{rows} rows of numbers", [numbers]) if rows > _OPEN_ROWS else numbers] if rows else []),
+    ]
+    return section(r["title"], parts, level=3)
+
+
+def _caption(r: dict[str, Any], y: str) -> str:
+    return f"{_title(r, y)} against {_title(r, r['x'])}"
+
+
+def _plot(r: dict[str, Any], y: str) -> Html:
+    curves = []
+    for s in r["series"]:
+        shown = [p for p in s["points"] if p["values"][r["x"]] is not None and p["values"][y] is not None]
+        dots = (Dot(p["values"][r["x"]], p["values"][y], p["name"], p["role"] == "chosen") for p in shown)
+        curves.append(Curve(s["name"], tuple(dots)))
+    axes = [Axis(_title(r, c), next(x["log"] for x in r["columns"] if x["id"] == c)) for c in (r["x"], y)]
+    return chart(curves, *axes, what=f"{r['title']}: {_caption(r, y)}")
+
+
+def _numbers(r: dict[str, Any]) -> Html:
+    rows, marked = [], []
+    several = len(r["series"]) > 1
+    for s in r["series"]:
+        for p in s["points"]:
+            if p["role"] == "chosen":
+                marked.append(len(rows))
+            role = f" ({p['role']})" if p["role"] else ""
+            cells = [_number(p["values"][c["id"]]) for c in r["columns"]]
+            rows.append([*([s["name"]] if several else []), f"{p['name']}{role}", *cells])
+    heads = [*(["input"] if several else []), "setting", *(c["title"] for c in r["columns"])]
+    return table(heads, rows, words=range(1 + several), marked=marked)
+
+
+def _title(r: dict[str, Any], column: str) -> str:
+    return str(next(c["title"] for c in r["columns"] if c["id"] == column))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else short(value)

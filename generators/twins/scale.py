@@ -1,0 +1,87 @@
+"""How the cost of the spike simulator grows: pixels, length of the clip, threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+from spike4dgs.benchmark.reports.speed_error.measurement import BEST_MS, MS, Column, Measurement, Point, Request, Series
+from spike4dgs.benchmark.speed.timing import by_turns_ms
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.generators.profiles import RATE_HZ
+from spike4dgs.generators.reports.speed import pattern
+from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+
+GROUP = "How costs grow"
+SPACING = 10  # ticks between keys
+
+
+def _run(width: int, height: int, ticks: int, moving: float, threads: int | None = None) -> Any:
+    """Return a call that simulates one camera with maps and shot noise; all keys are made in advance."""
+    at = list(range(0, ticks + SPACING, SPACING))
+    few = pattern(height, width, min(len(at), 16), moving)
+    keys = [few[k % len(few)] for k in range(len(at))]  # a long clip repeats them: its memory does not grow
+    maps = gain_map(height, width, 0, "cam_00"), dark_map(height, width, 0, "cam_00")
+    sensor = Sensor(gain=maps[0], dark=maps[1], photons=SENSOR.photons_per_spike)
+    charge = random_charge(height, width, [0])
+
+    def run() -> int:
+        return sum(len(part) for part in simulate(keys, at, ticks, sensor, charge, threads=threads))
+
+    return run
+
+
+def _timed(calls: dict[float, Any], name: str, column: str, request: Request) -> Series:
+    times = by_turns_ms(list(calls.values()), request.pick(1, 3, 5))
+    points = (
+        Point(f"{x:g}", {column: x, "ms": median, "best_ms": best})
+        for x, (best, median) in zip(calls, times, strict=True)
+    )
+    return Series(name, tuple(points))
+
+
+def _pixels(request: Request) -> Iterator[Series]:
+    sizes = request.pick(
+        ((24, 16),),
+        ((200, 125), (400, 250), (800, 500), (1000, 1000)),
+        ((200, 125), (400, 250), (800, 500), (1000, 1000)),
+    )
+    ticks = request.pick(40, 200, 1000)
+    for moving in (1.0, 0.1):
+        calls = {float(w * h): _run(w, h, ticks, moving) for w, h in sizes}
+        yield _timed(calls, f"{ticks} ticks, {moving:.0%} of the pixels move", "pixels", request)
+
+
+def _clips(request: Request) -> Iterator[Series]:
+    lengths = request.pick((1, 2), (10, 30, 100), (10, 30, 100, 300, 1000))
+    width, height = request.pick((24, 16), (200, 125), (400, 250))
+    for moving in (1.0, 0.1):
+        calls = {float(ms): _run(width, height, ms * RATE_HZ // 1000, moving) for ms in lengths}
+        yield _timed(calls, f"{width}x{height}, {moving:.0%} of the pixels move", "clip", request)
+
+
+def _threads(request: Request) -> Iterator[Series]:
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= len(os.sched_getaffinity(0))]
+    shape = request.pick((24, 16, 40), (400, 250, 400), (400, 250, 2000))
+    calls = {float(n): partial(_run(*shape, 1.0, n)) for n in counts}
+    yield _timed(calls, f"{shape[2]} ticks of {shape[0]}x{shape[1]}", "threads", request)
+
+
+def _growth(
+    id: str, title: str, words: str, column: Column, run: Any, seconds: tuple[float, float, float]
+) -> Measurement:
+    by_size = dict(zip(("tiny", "quick", "whole"), seconds, strict=True))
+    return Measurement(id, GROUP, title, words, "", "", (column, MS, BEST_MS), column.id, ("ms",), run, by_size)
+
+
+SCALE = (
+    _growth("scale-sensor-pixels", "Sensor: pixels", "One camera, with maps and shot noise; a key every 10 ticks.",
+            Column("pixels", "pixels"), _pixels, (1, 15, 60)),
+    _growth("scale-sensor-clip", "Sensor: length of the clip", "10 to 1000 ms; memory does not grow with the clip.",
+            Column("clip", "clip, ms"), _clips, (1, 10, 90)),
+    _growth("scale-sensor-threads", "Sensor: threads", "1 to 16, as many as the machine has cores.",
+            Column("threads", "threads"), _threads, (1, 5, 30)),
+)  # fmt: skip
