@@ -31,8 +31,9 @@ _FEW: dict[str, Any] = {
     "images.max_times": 4,
     "images.flat_field": True,
 }
+_FROZEN = {"trainer.freeze_background": True}
 RECIPES = {
-    "exposure": Recipe("exposure", "intervals", "made", "paths", "exposure", {**_FEW, "trainer.freeze_background": True}),
+    "exposure": Recipe("exposure", "intervals", "made", "paths", "exposure", {**_FEW, **_FROZEN}),
     "spss": Recipe("spss", "tfp", "made", "hexplane", "spss", {**_FEW, "motion.mlp_width": 8, "motion.features": 4}),
     "pixel+spike": Recipe("pixel+spike", "tfi", "made", "spacetime", "pixel+spike", _FEW),
 }  # fmt: skip
@@ -60,10 +61,10 @@ def _one_view(rng: np.random.Generator) -> TrainingScene:
 SCENES: dict[str, tuple[str, Callable[[np.random.Generator], TrainingScene]]] = {
     "dark": ("streams without a spike", _with_spikes(lambda rng, shape: np.zeros(shape))),
     "saturated": ("a spike in every tick of every pixel", _with_spikes(lambda rng, shape: np.ones(shape))),
-    "still": ("the same spikes in every tick", _with_spikes(lambda rng, s: np.broadcast_to(rng.random(s[1:]) < 0.5, s))),
+    "still": ("the same in every tick", _with_spikes(lambda rng, s: np.tile(rng.random(s[1:]) < 0.5, (s[0], 1, 1)))),
     "blinded": ("one saturated camera among good ones", _with_spikes(lambda rng, shape: np.ones(shape), 1)),
     "short": ("a clip of one tick", _with_spikes(lambda rng, shape: rng.random((1, *shape[1:])) < 0.5)),
-    "long": ("a clip of 20,000 ticks", _with_spikes(lambda rng, s: np.tile(rng.random((100, *s[1:])) < 0.3, (200, 1, 1)))),
+    "long": ("20,000 ticks", _with_spikes(lambda rng, s: np.tile(rng.random((100, *s[1:])) < 0.3, (200, 1, 1)))),
     "one-view": ("one training view", _one_view),
 }  # fmt: skip
 
@@ -75,7 +76,8 @@ def cases() -> list[Case]:
         Case(id="baselines/clocks/refuse", asked="clocks from two cameras, and from a clip of 40 ticks",
              twin="the contract: one clear error each", unit="inputs taken", tolerance=0, run=_refused_clocks),
         Case(id="baselines/clocks/still", asked="clocks of an array that sees nothing, and one that is saturated",
-             twin="standard errors above 2 ticks: nothing is known", unit="cameras too sure", tolerance=0, run=_unsure_clocks),
+             twin="standard errors above 2 ticks: nothing is known", unit="cameras too sure", tolerance=0,
+             run=_unsure_clocks),
     ]  # fmt: skip
 
 
@@ -87,7 +89,7 @@ def _fit_case(recipe: str, name: str) -> Case:
 
     return Case(
         id=f"baselines/fit/{name}-{recipe}",
-        asked=f"fit {SCENES[name][0]} ({r.images}, {r.motion}, {r.supervision}), 12 steps",
+        asked=f"fit: {SCENES[name][0]} ({r.images}, {r.motion}, {r.supervision}), 12 steps",
         twin="finite losses, parameters and images",
         unit="values that are not finite",
         tolerance=0,

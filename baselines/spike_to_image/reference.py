@@ -81,7 +81,10 @@ def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None =
 
 
 def slow_intervals(spikes: Spikes, tick: int, half: float) -> tuple[float, float, float] | None:
-    """Return rate, first and last instant of one pixel [T] between the spikes nearest to tick -+ half; None with < 2."""
+    """Return rate, first and last instant of one pixel [T] between the spikes nearest to tick -+ half.
+
+    None with fewer than two spikes.
+    """
     instants = np.flatnonzero(spikes) + 0.5
     if len(instants) < 2:
         return None
