@@ -61,6 +61,7 @@ class Case:
     run: Callable[[Setting], Outcome]
     kind: Kind = "twin"
     on_device: bool = False  # it computes on the device of the setting, not always on the CPU
+    seconds: float = 0.1  # that it takes on two cores, for the estimate of the time left
 
 
 def compare(found: ArrayLike, expected: ArrayLike, *, relative: bool = False) -> Outcome:
