@@ -95,6 +95,7 @@ def _fit_case(recipe: str, name: str) -> Case:
         tolerance=0,
         run=run,
         on_device=True,
+        seconds=0.6,
     )
 
 

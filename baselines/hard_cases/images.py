@@ -166,6 +166,7 @@ def _network_case(maker: str, level: str) -> Case:
         tolerance=_NETWORK_TOLERANCE,
         run=run,
         on_device=True,
+        seconds=1.5,
     )
 
 

@@ -138,11 +138,18 @@ def _resumed_case(name: str) -> Case:
         run=run,
         kind="resume",
         on_device=True,
+        seconds=4,
     )
 
 
 def _threads_cases() -> list[Case]:
-    shared: dict[str, Any] = {"twin": "one thread", "unit": "bytes that differ", "tolerance": 0, "kind": "threads"}
+    shared: dict[str, Any] = {
+        "twin": "one thread",
+        "unit": "bytes that differ",
+        "tolerance": 0,
+        "kind": "threads",
+        "seconds": 1.5,
+    }
     counts = ", ".join(map(str, thread_counts()))
     return [
         Case(id="method/splat/threads", asked=f"render and differentiate 3,000 Gaussians on {counts} threads",
@@ -201,8 +208,11 @@ def _seed_cases() -> list[Case]:
             twin="the first of the two fits",
             unit="bytes that differ",
             tolerance=0,
-            run=lambda s: equal_bytes([_fit_bytes("paths", "exposure", s.seed) for _ in range(2)], ["the first fit", "the second"]),
+            run=lambda s: equal_bytes(
+                [_fit_bytes("paths", "exposure", s.seed) for _ in range(2)], ["the first fit", "the second"]
+            ),
             kind="seeds",
+            seconds=2,
         ),
         Case(
             id="method/fit/other-seeds",
@@ -213,6 +223,7 @@ def _seed_cases() -> list[Case]:
             run=_other_seeds,
             kind="seeds",
             on_device=True,
+            seconds=8,
         ),
     ]
 
@@ -253,6 +264,7 @@ def _saved_case(motion: str) -> Case:
         unit="of white",
         tolerance=0,
         run=run,
+        seconds=1,
     )
 
 

@@ -22,9 +22,9 @@ from spike4dgs.benchmark.reports.html.scales import short
 
 Rows = Sequence[dict[str, Any]]
 _INTRO = (
-    "Every row is an input that tends to break programs. What came out stands beside an independent result: a slow twin "
-    "in float64, a closed form, another library, or a contract that an input is refused. A case passes if its result is "
-    "finite and the worst error is within the tolerance. Errors are worst cases, not means."
+    "Every row is an input that tends to break programs. What came out stands beside an independent result: a slow "
+    "twin in float64, a closed form, another library, or a contract that an input is refused. A case passes if its "
+    "result is finite and the worst error is within the tolerance. Errors are worst cases, not means."
 )
 _KINDS = {
     "seeds": (
