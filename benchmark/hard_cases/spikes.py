@@ -34,7 +34,10 @@ def cases() -> list[Case]:
         _bits("no-ticks", "a window of no ticks", lambda s: _decoded(np.zeros((0, 12), np.uint8), 13, 7)),
         _bits("count-blocks", "counts of 1, 254 ... 257, 510, 511 and 4,000 ticks", _count_blocks),
         _bits(
-            "long-clip", "a memory map of 1,000,000 ticks of 9x7 pixels: first and last windows, all counts", _long_clip
+            "long-clip",
+            "a memory map of 1,000,000 ticks of 9x7 pixels: first and last windows, all counts",
+            _long_clip,
+            1.0,
         ),
         Case(
             id="benchmark/spikes/write",
@@ -76,14 +79,14 @@ def cases() -> list[Case]:
             tolerance=0,
             run=_threads,
             kind="threads",
+            seconds=1,
         ),
     ]
 
 
-def _bits(name: str, asked: str, run: Callable[[Setting], Outcome]) -> Case:
-    return Case(
-        id=f"benchmark/spikes/{name}", asked=asked, twin=_NUMPY, unit="pixels that differ", tolerance=0, run=run
-    )
+def _bits(name: str, asked: str, run: Callable[[Setting], Outcome], seconds: float = 0.1) -> Case:
+    texts = {"asked": asked, "twin": _NUMPY, "unit": "pixels that differ"}
+    return Case(id=f"benchmark/spikes/{name}", tolerance=0, run=run, seconds=seconds, **texts)
 
 
 def _list_of_sizes() -> str:
