@@ -41,13 +41,13 @@ def cases() -> list[Case]:
         _case("moving-region", "a moving region of one pixel, and none", "float64 formulas", "dB", 1e-9, _moving),
         _case("gain", "the gain of a prediction 1e-6 and 1e6 times the truth, of a black one and a negative one",
               "numpy.linalg.lstsq; none", "of the gain", 1e-9, _gain),
-        _case("flip", "FLIP of equal, even, inverted, 1x1 images", "the package flip-evaluator", "", 2e-4, _flip, seconds=1),
+        _case("flip", "FLIP of equal, even, inverted, 1x1 images", "the package flip-evaluator", "", 2e-4, _flip, 1),
         _case("lpips", "LPIPS of black, white, even and random images, random trunks of three networks",
-              "the formula in float64, layer by layer", "relative", 1e-4, _lpips, seconds=4),
+              "the formula in float64, layer by layer", "relative", 1e-4, _lpips, 4),
         _case("refuse", "NaN, infinity, integers, another size, 10x64 pixels, no boolean mask",
               "the contract: one clear error each", "inputs taken", 0, _bad_images),
         _case("no-reference", "BRISQUE and NIQE of black, white, gray, HDR-bright and nearly even images",
-              "the contract: no value where an image shows nothing, else a finite one", "wrong answers", 0, _blind, seconds=2),
+              "the contract: no value where an image shows nothing, else a finite one", "wrong answers", 0, _blind, 2),
     ]  # fmt: skip
 
 
