@@ -164,7 +164,7 @@ FITS = (
         (
             "Density control stops at 36,000 Gaussians.",
             "No limit that a fit reaches.",
-            "The scene's points are fewer than that at small sizes; where they are more, each costs time in every step.",
+            "Scenes of small images have fewer points than that; where there are more, each costs time in every step.",
         ),
         _caps,
         4,
@@ -175,8 +175,8 @@ FITS = (
         (
             "Gaussians where nothing changes become a background, which no later step deforms or differentiates.",
             "All Gaussians are fitted to the end.",
-            "0.012 is above the noise of static pixels and below the change of moving ones. A limit too high freezes what "
-            "moves, which costs most where it moves.",
+            "0.012 is above the noise of static pixels and below the change of moving ones. A limit too high freezes "
+            "what moves, which costs most where it moves.",
         ),
         _freezing,
         5,
@@ -187,8 +187,8 @@ FITS = (
         (
             "Each 20 ms of a clip have Gaussians of their own, whose paths are cubics.",
             "More pieces: each follows a shorter part of the motion.",
-            "One piece is what clips of 20 ms have. More pieces fit more steps and Gaussians for the same clip; they pay "
-            "only in longer clips.",
+            "One piece is what clips of 20 ms have. More pieces fit more steps and Gaussians for the same clip; they "
+            "pay only in longer clips.",
         ),
         _pieces,
         3,

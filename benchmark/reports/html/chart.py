@@ -98,17 +98,23 @@ def _curves(curves: Sequence[Curve], across: Scale, up: Scale) -> Iterator[str]:
 
 
 def _names(curves: Sequence[Curve], across: Scale, up: Scale) -> Iterator[str]:
-    """Yield the names of points, the chosen ones first, where they hide neither a point nor another name."""
+    """Yield the names of points, the chosen ones first, where they hide neither a point nor another name.
+
+    Of more than two curves with the same names each name is shown once.
+    """
+    seen = {""}
     dots = sorted((d for curve in curves for d in curve.dots), key=lambda d: not d.chosen)
     taken = [(_x(across, d.x) - 4, _y(up, d.y) - 4, _x(across, d.x) + 4, _y(up, d.y) + 4) for d in dots]
     for dot in dots:
         px, py, width = _x(across, dot.x), _y(up, dot.y), LETTER * len(dot.name)
         for left, top in ((9, -6), (-9 - width, -6), (-width / 2, -20), (-width / 2, 8), (8, -18), (8, 6),
                           (-8 - width, -18), (-8 - width, 6)):  # fmt: skip
+            left += 3 * dot.chosen * ((left > 0) - (left < -width / 2))  # clear of its ring
             box = (px + left, py + top, px + left + width, py + top + LINE)
             inside = box[0] > LEFT - 2 and box[2] < WIDTH and box[1] > 0 and box[3] < HEIGHT - BOTTOM + 2
-            if dot.name and inside and not any(_meet(box, other) for other in taken):
+            if dot.name not in seen and inside and not any(_meet(box, other) for other in taken):
                 taken.append(box)
+                seen |= {dot.name} if len(curves) > 2 else set()
                 weight = ' font-weight="600"' if dot.chosen else ""
                 at = f'x="{box[0]:.1f}" y="{box[1] + 10:.1f}"'
                 yield f'<text class="halo" {at}{weight}>{escape(dot.name)}</text>'

@@ -7,12 +7,13 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from html import escape
 from pathlib import Path
-from typing import NewType
 
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.reports.html.style import STYLE
 
-Html = NewType("Html", str)
+
+class Html(str):
+    """Text that is HTML already: nothing escapes it again."""
 
 
 def write_page(path: Path, title: str, parts: Iterable[Html]) -> None:
@@ -27,7 +28,9 @@ def write_page(path: Path, title: str, parts: Iterable[Html]) -> None:
 
 
 def text(plain: str) -> Html:
-    """Return a text for HTML. Words between backquotes become code."""
+    """Return a text for HTML. Words between backquotes become code; what is HTML stays as it is."""
+    if isinstance(plain, Html):
+        return plain
     return Html(re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(plain)))
 
 
@@ -49,8 +52,13 @@ def section(title: str, parts: Iterable[Html], level: int = 2) -> Html:
 
 def contents(titles: Iterable[str]) -> Html:
     """Return links to sections by their titles."""
-    links = "".join(f'<li><a href="#{anchor(title)}">{text(title)}</a></li>' for title in titles)
+    links = "".join(f"<li>{link(title, title)}</li>" for title in titles)
     return Html(f'<nav aria-label="Contents"><ul>{links}</ul></nav>')
+
+
+def link(title: str, words: str) -> Html:
+    """Return a link to the section of that title."""
+    return Html(f'<a href="#{anchor(title)}">{text(words)}</a>')
 
 
 def anchor(title: str) -> str:
@@ -69,7 +77,7 @@ def table(
 ) -> Html:
     """Return a table that scrolls by itself where it is wider than the page.
 
-    Columns are numbers, at the right, but those of `words`; rows of `marked` stand out.
+    Columns are numbers, at the right, but those of `words`; rows of `marked` stand out. A cell may be a `link`.
     """
     top = "".join(f'<th scope="col"{_column(i, words)}>{text(head)}</th>' for i, head in enumerate(heads))
     lines = "".join(

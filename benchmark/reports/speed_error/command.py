@@ -66,7 +66,8 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
 
         start = utc_now()
         key = {"size": size, "seed": seed, "device": device, "scene": str(scene or ""), "commit": harness()["commit"]}
-        key |= {"again": start} if again else {}
+        for m in measurements if again else ():
+            (out / "measurements" / f"{m.id}.json").unlink(missing_ok=True)
         results = measure_all(measurements, Request(size, seed, device, made), out / "measurements", key, _say)
         report = {
             "format": FORMAT, "size": size, "seed": seed, "device": device, "started": start, "finished": utc_now(),

@@ -14,6 +14,7 @@ from spike4dgs.benchmark.reports.html.page import (
     figure,
     folded,
     grid,
+    link,
     paragraph,
     section,
     table,
@@ -30,7 +31,8 @@ def write_content(path: Path, report: dict[str, Any]) -> None:
     groups = list(dict.fromkeys(r["group"] for r in results))
     intro = (
         "Every approximation stands beside its slow exact twin, measured in the same run by turns. A ring marks the "
-        "point that the project uses. Errors are against the exact twin, and do not depend on the machine; times do."
+        "point that the project uses. Errors are against the exact twin, and do not depend on the machine; times do. A "
+        "time is the best of several turns, unless its title says otherwise."
     )
     sections = [section(g, [_measurement(r) for r in results if r["group"] == g]) for g in groups]
     parts = [
@@ -80,10 +82,10 @@ def _summary(results: Iterable[dict[str, Any]]) -> Html:
             x, y = (next(c for c in r["columns"] if c["id"] == i) for i in (r["cost"], r["error"]))
             cost, base, error = chosen["values"][x["id"]], exact["values"][x["id"]], chosen["values"][y["id"]]
             ratio = f"{short(base / cost)}" if cost and base is not None else "-"
-            cells = (r["title"], chosen["name"], x["title"], _number(cost), _number(base), ratio)
-            rows.append((*cells, f"{y['title']}: {_number(error)}"))
-    heads = ("approximation", "chosen", "cost", "chosen", "exact twin", "ratio", "error of the chosen")
-    return table(heads, rows, words=(0, 1, 2, 6))
+            costs = (_number(cost), _number(base), ratio)
+            rows.append((link(r["title"], r["title"]), chosen["name"], *costs, x["title"], _number(error), y["title"]))
+    heads = ("approximation", "chosen", "its cost", "exact twin", "ratio", "cost in", "its error", "error in")
+    return table(heads, rows, words=(0, 1, 5, 7))
 
 
 def _pair(r: dict[str, Any], s: dict[str, Any]) -> tuple[Any, Any]:
@@ -99,7 +101,8 @@ def _failures(results: Iterable[dict[str, Any]]) -> list[Html]:
 
 
 def _measurement(r: dict[str, Any]) -> Html:
-    said = [("approximation", r["approximation"]), ("exact twin", r["exact"]), ("chosen because", r["reason"])]
+    first = "approximation" if r["exact"] else "what"
+    said = [(first, r["approximation"]), ("exact twin", r["exact"]), ("chosen because", r["reason"])]
     said += [("held by", f"`{r['held_by']}`" if r["held_by"] else ""), ("id", f"`{r['id']}`")]
     plots = [figure(_plot(r, y), _caption(r, y)) for y in r["y"]]
     numbers = _numbers(r)
@@ -121,6 +124,7 @@ def _plot(r: dict[str, Any], y: str) -> Html:
     curves = []
     for s in r["series"]:
         shown = [p for p in s["points"] if p["values"][r["x"]] is not None and p["values"][y] is not None]
+        shown.sort(key=lambda p: p["values"][r["x"]])
         dots = (Dot(p["values"][r["x"]], p["values"][y], p["name"], p["role"] == "chosen") for p in shown)
         curves.append(Curve(s["name"], tuple(dots)))
     axes = [Axis(_title(r, c), next(x["log"] for x in r["columns"] if x["id"] == c)) for c in (r["x"], y)]
@@ -130,15 +134,16 @@ def _plot(r: dict[str, Any], y: str) -> Html:
 def _numbers(r: dict[str, Any]) -> Html:
     rows, marked = [], []
     several = len(r["series"]) > 1
+    named = any(p["name"] for s in r["series"] for p in s["points"])
     for s in r["series"]:
         for p in s["points"]:
             if p["role"] == "chosen":
                 marked.append(len(rows))
             role = f" ({p['role']})" if p["role"] else ""
             cells = [_number(p["values"][c["id"]]) for c in r["columns"]]
-            rows.append([*([s["name"]] if several else []), f"{p['name']}{role}", *cells])
-    heads = [*(["input"] if several else []), "setting", *(c["title"] for c in r["columns"])]
-    return table(heads, rows, words=range(1 + several), marked=marked)
+            rows.append([*([s["name"]] if several else []), *([f"{p['name']}{role}"] if named else []), *cells])
+    heads = ["input"] * several + ["setting"] * named + [c["title"] for c in r["columns"]]
+    return table(heads, rows, words=range(several + named), marked=marked)
 
 
 def _title(r: dict[str, Any], column: str) -> str:
