@@ -56,9 +56,13 @@ def write_content(path: Path, report: dict[str, Any]) -> None:
     for part in dict.fromkeys(part_of(c) for c in cases if c["kind"] == "twin"):
         parts[part] = [c for c in cases if part_of(c) == part and c["kind"] == "twin"]
     sections = [
-        *(section("Failed", [_table(failed)]) for _ in failed[:1]),
+        *(section("Failed", [_table(failed, whole_ids=True)]) for _ in failed[:1]),
         section("Summary", [_summary(parts, kinds), *_heard(cases)]),
-        *(section(_KINDS[k][0], [paragraph(_KINDS[k][1]), _table(rows)]) for k, rows in kinds.items() if rows),
+        *(
+            section(_KINDS[k][0], [paragraph(_KINDS[k][1]), _table(rows, whole_ids=True)])
+            for k, rows in kinds.items()
+            if rows
+        ),
         *(section(part, [_table(rows)]) for part, rows in parts.items()),
         section("Program", [_program(report)]),
     ]
@@ -108,13 +112,13 @@ def _share(case: dict[str, Any]) -> float:
     return case["error"] / case["tolerance"] if case["error"] and case["tolerance"] else 0.0
 
 
-def _table(cases: Rows) -> Html:
+def _table(cases: Rows, whole_ids: bool = False) -> Html:
     marked = [i for i, c in enumerate(cases) if c["passed"] is False]
-    return wide(table(_HEADS, [_cells(c) for c in cases], words=_WORDS, marked=marked))
+    return wide(table(_HEADS, [_cells(c, whole_ids) for c in cases], words=_WORDS, marked=marked))
 
 
-def _cells(c: dict[str, Any]) -> tuple[str, ...]:
-    name = c["id"] if c["kind"] != "twin" else c["id"].rpartition("/")[2]
+def _cells(c: dict[str, Any], whole_id: bool) -> tuple[str, ...]:
+    name = c["id"] if whole_id else c["id"].rpartition("/")[2]
     device = "" if c["device"] == "cpu" else f" on {c['device']}"
     error = "none" if c["error"] is None else f"{short(c['error'])} {c['unit']}".strip()
     return (
