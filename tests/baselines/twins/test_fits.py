@@ -11,18 +11,18 @@ from spike4dgs.baselines.twins.fits import FITS, X_RECIPE, Trial, cut_in, fitted
 from spike4dgs.benchmark.method import Budget, FitRequest, training_for
 from spike4dgs.benchmark.reports.speed_error.measurement import Request
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.motion.base import Extent
 
 
 def test_a_trial_is_the_recipes_fit_judged_against_the_ground_truth(small_scene: Path) -> None:
     scene = open_scene(small_scene)
     request = Request("tiny", 5, "cpu", lambda: small_scene)
-    trial = Trial("short", {"density.max_gaussians": 200}, 0.004, role="chosen")
-    point = fitted(X_RECIPE, trial, scene, request, warm_up=False)
-    assert (point.name, point.role) == ("short", "chosen") and point.values["gaussians"] <= 200
     method = METHODS[X_RECIPE.name]
     model = method.fit(training_for(method, scene.training), FitRequest(Budget(0.004), seed=5))
-    whole = fitted(X_RECIPE, Trial("as it is", {}, 0.004), scene, request, warm_up=False)
+    whole = fitted(X_RECIPE, Trial("as it is", {}, 0.004, role="chosen"), scene, request, warm_up=False)
+    assert (whole.name, whole.role) == ("as it is", "chosen")
+    assert whole.values["gaussians"] == len(model.splats(0.5 * scene.n_ticks / scene.rate_hz * 1e6))
     squares = []
     for target in scene.targets:
         image = model.render(scene.cameras[target.camera], target.tick / scene.rate_hz * 1e6)
@@ -43,6 +43,7 @@ def test_a_clip_is_cut_as_asked_whatever_its_length(pieces: int) -> None:
 def test_the_chosen_settings_are_the_recipes() -> None:
     """The page marks what the recipe has; where the recipe changes, this says so."""
     assert X_RECIPE.settings["density.max_gaussians"] == 36_000
+    assert (DensitySettings.max_per_pixel, DensitySettings.max_moving_per_pixel) == (0.8, 0.4)
     assert X_RECIPE.settings["trainer.moving_change"] == 0.012
     hexplane = METHODS["tfp+4dgs"].settings["motion"]  # type: ignore[attr-defined]
     assert (hexplane.mlp_width, hexplane.features) == (32, 16)

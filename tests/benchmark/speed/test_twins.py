@@ -32,4 +32,4 @@ def test_scores_and_decoded_spikes_differ_from_their_twins_by_rounding() -> None
 def test_eight_bits_change_a_score() -> None:
     scores = next(m for m in measurements() if m.id == "scores")
     off = {s.name: next(p for p in s.points if "8-bit" in p.name).values["error"] for s in scores.run(REQUEST)}
-    assert off["PSNR of almost equal images"] > 1 > 1e-3 > off["SSIM of a noisy image"]
+    assert off["PSNR of almost equal images"] > 1 > 1e-2 > off["SSIM of a noisy image"]

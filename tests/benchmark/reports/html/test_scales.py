@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.reports.html.scales import scale_of, short
@@ -11,6 +11,7 @@ from spike4dgs.benchmark.reports.html.scales import scale_of, short
 POSITIVE = st.floats(1e-12, 1e12)
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(POSITIVE, min_size=1, max_size=9), st.booleans(), st.booleans())
 def test_places_keep_the_order_and_stay_inside(values: list[float], log: bool, zero: bool) -> None:
     values = sorted(values + [0.0] * zero)
@@ -19,6 +20,7 @@ def test_places_keep_the_order_and_stay_inside(values: list[float], log: bool, z
     assert at == sorted(at) and at[0] >= 0 and at[-1] <= 1
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(POSITIVE, min_size=1, max_size=9), st.booleans())
 def test_ticks_are_few_and_on_the_axis(values: list[float], log: bool) -> None:
     scale = scale_of(values, log)

@@ -19,8 +19,8 @@ def request(tmp_path: Path) -> Request:
 
 
 def measured(id: str, run: Any, **changes: Any) -> Measurement:
-    texts = ("Fits", f"title of {id}", "less", "all", "because")
-    return Measurement(id, *texts, **{"columns": (MS, ERROR), "x": "ms", "y": ("error",), "run": run} | changes)
+    texts = {"group": "Fits", "title": f"title of {id}", "approximation": "less", "exact": "all", "reason": "because"}
+    return Measurement(id, **texts | {"columns": (MS, ERROR), "x": "ms", "y": ("error",), "run": run} | changes)
 
 
 def good(request: Request) -> Iterator[Series]:
