@@ -32,8 +32,8 @@ def make_hard_cases(*rooms: Room) -> Callable[..., int]:
 
         A case passes if what came out is finite and its worst error is within the tolerance beside it. Other rows run
         one thing twice: with the same and with other seeds, interrupted and resumed, on one and on more threads. Writes
-        OUT/index.html, which opens from the disk, and OUT/hard_cases.json. Takes a few minutes on two cores; the first
-        run also compiles. Returns 1 if a case fails.
+        OUT/index.html, which opens from the disk, and OUT/hard_cases.json. Takes minutes on two cores; the first run
+        also compiles. Returns 1 if a case fails.
 
         Args:
             out: Folder for the page and the JSON.
