@@ -60,8 +60,15 @@ def _case(
     run: Callable[[Setting], Outcome],
     seconds: float = 0.1,
 ) -> Case:
-    texts = {"asked": asked, "twin": twin, "unit": unit}
-    return Case(id=f"benchmark/metrics/{name}", tolerance=tolerance, run=run, seconds=seconds, **texts)
+    return Case(
+        id=f"benchmark/metrics/{name}",
+        asked=asked,
+        twin=twin,
+        unit=unit,
+        tolerance=tolerance,
+        run=run,
+        seconds=seconds,
+    )
 
 
 Pair = Callable[[np.random.Generator], tuple[Float64, NDArray[np.floating]]]

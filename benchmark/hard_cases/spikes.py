@@ -85,8 +85,15 @@ def cases() -> list[Case]:
 
 
 def _bits(name: str, asked: str, run: Callable[[Setting], Outcome], seconds: float = 0.1) -> Case:
-    texts = {"asked": asked, "twin": _NUMPY, "unit": "pixels that differ"}
-    return Case(id=f"benchmark/spikes/{name}", tolerance=0, run=run, seconds=seconds, **texts)
+    return Case(
+        id=f"benchmark/spikes/{name}",
+        asked=asked,
+        twin=_NUMPY,
+        unit="pixels that differ",
+        tolerance=0,
+        run=run,
+        seconds=seconds,
+    )
 
 
 def _list_of_sizes() -> str:
