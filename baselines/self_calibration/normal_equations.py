@@ -65,7 +65,7 @@ def reduce(value: Float64, by_surface: Float64, by_numbers: Float64, weight: Flo
         a = by_numbers[:, :, c].reshape(-1, q)
         H[c * q : (c + 1) * q, c * q : (c + 1) * q] += weighted[:, :, c].reshape(-1, q).T @ a
     g = (weighted * r[..., None]).sum(axis=(0, 1)).ravel()
-    cross = np.stack([(weighted * x[..., None]).sum(axis=1).reshape(patches, -1) for x in h], axis=1)
+    cross = np.stack([(weighted * x[..., None]).sum(axis=1).reshape(patches, cameras * q) for x in h], axis=1)
     own_H = np.stack([(weight * x * h).sum(axis=(2, 3)) for x in h]).transpose(2, 0, 1) + np.diag(prior.weight)
     own_g = (weight * r * h).sum(axis=(2, 3)).T + prior.gradient
     gain = np.linalg.solve(own_H, cross)  # [P, M, C * Q]

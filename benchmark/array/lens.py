@@ -60,8 +60,8 @@ def distort(xy: Float64, lens: Distortion) -> Float64:
     """Return the lens's coordinates [..., 2] of a pinhole's [..., 2]; NaN beyond the fold."""
     x, y = xy[..., 0], xy[..., 1]
     k1, k2, p1, p2, k3 = lens
-    s = x * x + y * y
     with np.errstate(over="ignore", invalid="ignore"):
+        s = x * x + y * y
         radial = 1 + s * (k1 + s * (k2 + s * k3))
         bent = np.stack(
             [

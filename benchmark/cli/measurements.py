@@ -20,6 +20,17 @@ MEASUREMENTS: dict[str, Command] = {
             "spike4dgs.benchmark.speed.twins:measurements",
         ),
     ),
+    "report hard-cases": Command(
+        "spike4dgs.benchmark.reports.hard_cases.command:make_hard_cases",
+        "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
+        "report hard-cases --out runs/hard-cases",
+        needs=(
+            "spike4dgs.benchmark.hard_cases.table:hard_cases",
+            "spike4dgs.generators.hard_cases.table:hard_cases",
+            "spike4dgs.method.hard_cases.table:hard_cases",
+            "spike4dgs.baselines.hard_cases.table:hard_cases",
+        ),
+    ),
     "spike-agreement": Command(
         "spike4dgs.benchmark.reports.spike_agreement:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",

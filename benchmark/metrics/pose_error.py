@@ -81,11 +81,14 @@ def umeyama(source: Float64, target: Float64) -> Sim3:
     """Return the similarity that takes points [N, 3] to their partners with the least sum of squares (Umeyama 1991).
 
     A reflection is never returned: the sign goes to the direction of the smallest singular value.
-    Raises UserError for points that do not determine it: fewer than 3, coincident, or on one line.
+    Raises UserError for points that do not determine it: fewer than 3, coincident, or on one line; and for points that
+    are not finite.
     """
     if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
         found = f"{source.shape} and {target.shape}"
         raise problem("similarity", "two lists of points of one shape [N, 3]", found, "pair the points")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise problem("similarity", "finite points", "NaN or infinity", "correct the poses or points")
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a / len(a))
     if len(a) < 3 or not s[1] > 1e-12 * s[0]:

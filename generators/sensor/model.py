@@ -104,7 +104,8 @@ def simulate(
     `n_ticks`. With `means`, key k is the mean radiance of tick k instead: one key for each tick, no interpolation.
     `charge` [H, W] is the charge before the first tick (`random_charge`); it is not changed.
     Only one batch of keys (16 MiB, at least four keys) is held at a time. The bytes do not depend on `threads`
-    (default: all cores of the process). Raises UserError for keys, ticks or maps that do not fit together.
+    (default: all cores of the process). Raises UserError for keys, ticks or maps that do not fit together, and for
+    radiance that is not finite.
     """
     ticks = np.asarray(key_ticks, dtype=np.int64)
     height, width = charge.shape
@@ -188,7 +189,11 @@ def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int) -> No
         kept = 3
         window[:3] = window[-3:]
     for row in range(kept, last - first + 3):
-        _store(np.asarray(keys[min(max(first - 1 + row, 0), n_keys - 1)], dtype=np.float32), window[row])
+        k = min(max(first - 1 + row, 0), n_keys - 1)
+        image = np.asarray(keys[k], dtype=np.float32)
+        if not np.isfinite(image).all():  # as an integer charge it would be any number
+            raise problem(f"key frame {k}", "finite radiance", "NaN or infinity", "render it again")
+        _store(image, window[row])
 
 
 def _tangent_weights(ticks: NDArray[np.int64]) -> Float32:

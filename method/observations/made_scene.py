@@ -26,7 +26,7 @@ def made_scene() -> tuple[TrainingScene, NDArray[np.float32], NDArray[np.float32
     )
     steady = np.full((_TICKS, _HEIGHT, _WIDTH), 1.0)
     recordings = Recordings(_stream(steady), _stream(0.02 * steady), 1.0)
-    streams = tuple(_stream(_seen(camera)) for camera in cameras)
+    streams = tuple(_stream(radiance_of(camera)) for camera in cameras)
     scene = TrainingScene(
         "warm-up", "warm-up", cameras, streams, _RATE_HZ, _TICKS, _GAIN, recordings=(recordings,) * len(cameras)
     )
@@ -39,7 +39,7 @@ def _texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float
     return np.asarray(0.5 + 0.2 * np.sin(9 * x) + 0.2 * np.cos(7 * y + 3 * x))
 
 
-def _seen(camera: Camera) -> NDArray[np.float64]:
+def radiance_of(camera: Camera) -> NDArray[np.float64]:
     """Return the radiance [T, H, W] of the wall and the bar."""
     v, u = np.mgrid[:_HEIGHT, :_WIDTH].reshape(2, -1) + 0.5
     world = camera.unproject(np.stack([u, v], axis=1), np.full(len(u), _DISTANCE_M))

@@ -12,7 +12,6 @@ from dummy_methods import CountMethod, CountModel, FailingMethod, run
 from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import GAIN, TICKS
-from splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from torch import Tensor
 from toy_world import ToyWorld
 
@@ -29,6 +28,7 @@ from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Parts
+from spike4dgs.method.hard_cases.splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from spike4dgs.method.initialization import Initialization, Start, StartRequest
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.observations.pinholes import make_lenses

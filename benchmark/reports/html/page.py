@@ -89,6 +89,11 @@ def table(
     return Html(f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>')
 
 
+def wide(content: Html) -> Html:
+    """Return a table of sentences, which keeps its width and scrolls by itself on a phone."""
+    return Html(f'<div class="wide">{content}</div>')
+
+
 def figure(picture: Html, caption: str) -> Html:
     """Return a picture with a caption, such as a chart or an `image`."""
     return Html(f"<figure>{picture}<figcaption>{text(caption)}</figcaption></figure>")

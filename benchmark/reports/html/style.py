@@ -38,6 +38,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
 thead th { vertical-align: bottom; color: var(--soft); font-weight: 600; }
 .number { text-align: right; white-space: nowrap; } thead .number { white-space: normal; }
+.wide table { min-width: 64rem; } .wide td { max-width: 19rem; } .wide td:first-child { white-space: nowrap; }
 tr.marked > * { font-weight: 600; background: var(--panel); }
 .facts th { white-space: nowrap; } .facts td { overflow-wrap: anywhere; }
 .grid { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: 1rem 1.5rem; }

@@ -38,3 +38,13 @@ def test_eliminated_unknowns_change_nothing(seed: int) -> None:
     dense = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
     np.testing.assert_allclose(numbers, dense[: C * Q], atol=1e-9)
     np.testing.assert_allclose(surfaces.ravel(), dense[C * Q : C * Q + P * M], atol=1e-9)
+
+
+def test_no_patch_tells_nothing() -> None:
+    """An array that sees nothing has no patches: the equations are zeros of the usual shapes."""
+    C, Q, M = 5, 2, 3
+    empty = np.zeros((0, 3, C))
+    found = reduce(empty, np.zeros((0, 3, C, M)), np.zeros((0, 3, C, Q)), empty, Prior(np.ones(M), np.zeros((0, M))))
+    np.testing.assert_array_equal(found.H, np.zeros((C * Q, C * Q)))
+    np.testing.assert_array_equal(found.g, np.zeros(C * Q))
+    assert found.surface_steps(np.zeros(C * Q)).shape == (0, M)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adaptive_image, half_windows, spike_times
+from spike4dgs.baselines.spike_to_image.reference import slow_adaptive
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -25,39 +24,6 @@ def fire(rates, charge):
     return np.diff(np.floor(total), axis=0, prepend=np.floor(charge)[None]) > 0
 
 
-def slow(spikes, tick, settings=None):
-    """The definition, pixel by pixel, window by window."""
-    n, height, width = spikes.shape
-    settings = settings or AdaptiveSettings()
-    halves, reach = half_windows(n, settings), settings.shared_px // 2
-
-    def window(y, x, half):
-        t = np.flatnonzero(spikes[:, y, x])
-        near = (t >= tick - half) & (t < tick + half)
-        near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=n))
-        t = t[near]
-        return (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else None, t
-
-    level = np.full((height, width), len(halves) - 1)
-    for y, x in np.ndindex(height, width):
-        known = []
-        for s, half in enumerate(halves):
-            rate, t = window(y, x, half)
-            if rate is None:
-                continue
-            k, length = len(t) - 1, t[-1] - t[0]
-            known.append((k / (length + 1), k / (length - 1) if length > 1 else math.inf))
-            if max(a for a, _ in known) > min(b for _, b in known):
-                level[y, x] = s - 1
-                break
-    image = spikes.sum(axis=0) / n
-    for y, x in np.ndindex(height, width):
-        s = level[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].min()
-        rates = [window(y, x, half)[0] for half in halves[s:]]
-        image[y, x] = next((r for r in rates if r is not None), image[y, x])
-    return image
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 5), st.integers(1, 19), st.integers(1, 90), st.booleans(), st.integers(0, 2**31))
 def test_images_are_those_of_the_definition(height, width, n, bottom_up, seed):
@@ -66,7 +32,7 @@ def test_images_are_those_of_the_definition(height, width, n, bottom_up, seed):
     spikes = fire(rates, rng.random((height, width))) ^ (rng.random((n, height, width)) < 0.02)
     tick = int(rng.integers(n))
     found = adaptive_image(stream_of(spikes, bottom_up), tick)
-    np.testing.assert_allclose(found, slow(spikes, tick), rtol=1e-6)
+    np.testing.assert_allclose(found, slow_adaptive(spikes, tick), rtol=1e-6)
 
 
 def test_the_windows_are_settings_of_the_maker():
@@ -74,7 +40,7 @@ def test_the_windows_are_settings_of_the_maker():
     spikes = fire(np.where(np.arange(90) < 40, 0.2, 0.5)[:, None, None] * rng.random((9, 11)), rng.random((9, 11)))
     wide = AdaptiveSettings(shortest=3.0, growth=1.2, shared_px=5)
     found = IMAGES["adaptive"].with_settings(wide)(stream_of(spikes), [35], 1.0)[0]
-    np.testing.assert_allclose(found, slow(spikes, 35, wide), rtol=1e-6)
+    np.testing.assert_allclose(found, slow_adaptive(spikes, 35, wide), rtol=1e-6)
     assert half_windows(90, wide)[0] == 3 and not np.array_equal(found, adaptive_image(stream_of(spikes), 35))
 
 

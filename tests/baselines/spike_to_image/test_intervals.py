@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adaptive_image
 from spike4dgs.baselines.spike_to_image.intervals import IntervalSettings, intervals
+from spike4dgs.baselines.spike_to_image.reference import slow_intervals
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
@@ -33,17 +34,6 @@ def sweeping(n, height, width, px_per_tick, seed=0):
     return 0.5 + 0.1 * total
 
 
-def slow(spikes, tick, half):
-    """The definition for one pixel: rate, first and last instant; None with fewer than two spikes."""
-    instants = np.flatnonzero(spikes) + 0.5
-    if len(instants) < 2:
-        return None
-    i, j = (int(np.argmin(abs(instants - end))) for end in (tick - half, tick + half))
-    if i == j:
-        i, j = (i - 1, j) if (instants[i] > tick and i > 0) or j + 1 == len(instants) else (i, j + 1)
-    return (j - i) / (instants[j] - instants[i]), instants[i] - tick, instants[j] - tick
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(30, 120), st.booleans(), st.sampled_from([4.0, 5.0, 9.7, 25.3]), st.integers(0, 2**31))
 def test_what_changes_has_the_rate_and_the_span_of_the_definition(n, bottom_up, half, seed):
@@ -54,7 +44,7 @@ def test_what_changes_has_the_rate_and_the_span_of_the_definition(n, bottom_up, 
     rate, spans = intervals(stream_of(spikes, bottom_up), tick, s)
     still = adaptive_image(stream_of(spikes, bottom_up), tick, s)
     for y, x in np.ndindex(4, 5):
-        twin = slow(spikes[:, y, x], tick, half)
+        twin = slow_intervals(spikes[:, y, x], tick, half)
         if twin and tuple(spans[:, y, x]) != (np.float32(-half), np.float32(half)):
             assert (rate[y, x], *spans[:, y, x]) == pytest.approx(twin, rel=1e-6)
         else:

@@ -7,37 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from spike4dgs.baselines.spike_to_image.reference import slow_tfi, slow_tfp
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image, tfi_stack
 from spike4dgs.baselines.spike_to_image.tfp import TfpSettings, count_stack, tfp_image, tfp_stack
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.settings import Settings
-
-
-def slow_tfp(spikes: np.ndarray, tick: int, half_window: int) -> np.ndarray:
-    return spikes[max(0, tick - half_window) : tick + half_window].astype(np.float64).mean(axis=0)
-
-
-def slow_tfi(spikes: np.ndarray, tick: int) -> np.ndarray:
-    """Written from the definition, pixel by pixel."""
-    n = len(spikes)
-    image = np.zeros(spikes.shape[1:])
-    for y, x in np.ndindex(image.shape):
-        fired = np.flatnonzero(spikes[:, y, x])
-        if len(fired) == 0:
-            continue
-        before, after = fired[fired < tick], fired[fired >= tick]
-        if len(before) and len(after):
-            interval = after[0] - before[-1]
-        elif len(fired) == 1:
-            interval = n
-        elif len(after):  # the interval reaches over the beginning: at least after[0] + 1 ticks of it were seen
-            interval = max(after[1] - after[0], after[0] + 1)
-        else:
-            interval = max(before[-1] - before[-2], n - before[-1])
-        image[y, x] = 1 / interval
-    return image
 
 
 def random_spikes(n: int, height: int, width: int, seed: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -10,46 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from spike4dgs.baselines.spike_to_image.reference import slow_tfstp_pixel
 from spike4dgs.baselines.spike_to_image.table import IMAGES
 from spike4dgs.baselines.spike_to_image.tfi import tfi_image
 from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.baselines.spike_to_image.tfstp import TfstpSettings, tfstp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-
-PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # u0, f, D, F
-
-
-def slow_rate(fired: list[int], n: int, tick: int, constants: tuple[Decimal, ...] = PUBLISHED) -> float:
-    """One pixel, from the published equations: the whole history, and both inversions as they are printed."""
-    U0, f, D, F = constants
-
-    def update(R: Decimal, u: Decimal, d: int) -> tuple[Decimal, Decimal]:
-        return (
-            1 - (1 - R * (1 - u)) * (-d / D).exp(),
-            U0 + (u + f * (1 - u) - U0) * (-d / F).exp(),
-        )
-
-    before, after = [t for t in fired if t < tick], [t for t in fired if t >= tick]
-    if len(fired) < 2:
-        return len(fired) / n
-    if not before:
-        return 1 / max(after[1] - after[0], after[0] + 1)
-    gaps = list(np.diff(before))
-    if after:
-        gaps.append(after[0] - before[-1])
-    elif n - before[-1] >= gaps[-1]:
-        gaps.append(n - before[-1])
-    with localcontext() as context:
-        context.prec = 20 + int(max(gaps)) // 2  # 1 - R is exp(-d): long intervals need as many digits
-        R, u = Decimal(1), U0
-        for _ in range(160 // int(gaps[0]) + 4):  # until the first interval is at rest
-            R, u = update(R, u, int(gaps[0]))
-        for gap in gaps[1:]:
-            R, u = update(R, u, int(gap))
-        d_r = -D * ((1 - R) / (1 - R * (1 - u))).ln()
-        d_u = -F * ((u - U0) / (f - U0 + u * (1 - f))).ln()
-        return float((1 / d_r + 1 / d_u) / 2)
 
 
 def stream_of(spikes: np.ndarray, bottom_up: bool = True) -> SpikeStream:
@@ -73,7 +40,7 @@ def test_images_equal_the_published_equations(n: int, height: int, width: int, b
     for tick in {0, n // 3, n - 1}:
         image = tfstp_image(stream_of(spikes, bottom_up), tick)
         assert image.dtype == np.float32 and image.shape == (height, width)
-        expected = [slow_rate(list(np.flatnonzero(s)), n, tick) for s in spikes.reshape(n, -1).T]
+        expected = [slow_tfstp_pixel(list(np.flatnonzero(s)), n, tick) for s in spikes.reshape(n, -1).T]
         np.testing.assert_allclose(image.ravel(), expected, rtol=1e-6)
 
 
@@ -82,7 +49,7 @@ def test_other_constants_are_settings_of_the_maker() -> None:
     pixels = [list(np.flatnonzero(rng.random(n) < p)) for p in (0.05, 0.2, 0.5)]
     maker = IMAGES["tfstp"].with_settings(TfstpSettings(u0=0.25, jump=0.5, d_ticks=2, f_ticks=5.0, memory_ticks=200))
     constants = Decimal("0.25"), Decimal("0.5"), Decimal(2), Decimal(5)
-    expected = [slow_rate(p, n, 80, constants) for p in pixels]
+    expected = [slow_tfstp_pixel(p, n, 80, constants) for p in pixels]
     np.testing.assert_allclose(maker(one_row(n, *pixels), [80], 1.0)[0, 0], expected, rtol=1e-6)
     assert not np.allclose(IMAGES["tfstp"](one_row(n, *pixels), [80], 1.0)[0, 0], expected, rtol=1e-3)
 
@@ -103,7 +70,7 @@ def test_forgetting_what_is_older_than_the_memory_changes_little() -> None:
     ]
     pixels += [list(np.flatnonzero(rng.random(n) < p)) for p in (0.01, 0.02, 0.05, 0.3, 0.8)]
     image = tfstp_image(one_row(n, *pixels), 300)[0]
-    np.testing.assert_allclose(image, [slow_rate(p, n, 300) for p in pixels], rtol=1e-4)
+    np.testing.assert_allclose(image, [slow_tfstp_pixel(p, n, 300) for p in pixels], rtol=1e-4)
 
 
 @pytest.mark.parametrize("interval", [1, 2, 3, 7, 20, 90, 700])

@@ -52,8 +52,8 @@ def test_nothing_is_seen_beyond_the_fold() -> None:
     lens = make_distortion([-0.3])
     fold = fold_radius(lens)
     assert fold == pytest.approx(1 / np.sqrt(0.9))  # 1 + 3 k1 r^2 = 0
-    x = np.array([[0.99 * fold, 0], [1.01 * fold, 0], [2.0, 0]])
-    np.testing.assert_array_equal(np.isnan(distort(x, lens)).any(axis=1), [False, True, True])
+    x = np.array([[0.99 * fold, 0], [1.01 * fold, 0], [2.0, 0], [1e200, 0]])
+    np.testing.assert_array_equal(np.isnan(distort(x, lens)).any(axis=1), [False, True, True, True])
     largest = fold * (1 - 0.3 * fold**2)
     bent = np.array([[0.999 * largest, 0], [1.001 * largest, 0], [5.0, 5.0], [0.0, 0.0]])
     np.testing.assert_array_equal(np.isnan(undistort(bent, lens)).any(axis=1), [False, True, True, False])

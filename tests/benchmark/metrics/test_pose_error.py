@@ -94,6 +94,15 @@ def test_points_that_determine_no_similarity_are_refused(points: np.ndarray) -> 
         umeyama(points, points)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_refused(value: float) -> None:
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    broken = np.where(np.eye(5, 3) > 0, value, points)
+    for source, target in ((points, broken), (broken, points)):
+        with pytest.raises(UserError, match="similarity: expected finite points"):
+            umeyama(source, target)
+
+
 def test_cameras_at_one_position_are_refused() -> None:
     with pytest.raises(UserError, match="cameras at different positions"):
         align_cameras(parallel(np.ones((3, 3))), parallel(np.ones((3, 3))))

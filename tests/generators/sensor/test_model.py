@@ -227,6 +227,14 @@ def test_bad_input_is_named():
         list(simulate(keys, ticks, n, Sensor(gain=np.ones((2, 2), np.float32)), charge))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_radiance_that_is_not_finite_is_refused(value):
+    keys, ticks, n = scene()
+    keys[7, 3, 5] = value
+    with pytest.raises(UserError, match="key frame 7: expected finite radiance"):
+        list(simulate(keys, ticks, n, Sensor(), random_charge(31, 45, [0])))
+
+
 # ---------------------------------------------------------------- shot noise and tick means
 
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
 
 import pytest
 import splat_parity
-import splat_scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_parity import differentiate
-from splat_scenes import HARD, changed, far_origin, random_splats, views
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.hard_cases.splat import differentiate
+from spike4dgs.method.hard_cases.splat_scenes import HARD, changed, far_origin, random_splats, views
 from spike4dgs.method.splat import Splats, Views, cpu, render, set_threads
 
 
@@ -123,7 +121,7 @@ def test_a_second_process_compiles_nothing() -> None:
     """The kernels come from numba's cache, also those that exist once per number of channels."""
     render(random_splats(5, 1), views(1))
     code = (
-        "from splat_scenes import random_splats, views\n"
+        "from spike4dgs.method.hard_cases.splat_scenes import random_splats, views\n"
         "from spike4dgs.method.splat import render\n"
         "from spike4dgs.method.splat.kernels import project\n"
         "from spike4dgs.method.splat.kernels.raster import raster_kernels\n"
@@ -132,7 +130,6 @@ def test_a_second_process_compiles_nothing() -> None:
         "used = [project.project_forward, raster_kernels(host_lanes(), 1)[0]]\n"
         "print([sum(k.stats.cache_misses.values()) for k in used])\n"
     )
-    here = os.path.dirname(os.path.abspath(splat_scenes.__file__))
-    done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[0, 0]"
     assert "compiling" not in done.stderr

@@ -13,7 +13,6 @@ import pytest
 import saved_models
 import splat_parity
 import torch
-from splat_scenes import HARD, far_origin, random_splats, views
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
@@ -21,6 +20,7 @@ from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.gpu import missing_rasterizer
 from spike4dgs.benchmark.method import Budget, FitRequest
 from spike4dgs.benchmark.scene.bursts import open_folder
+from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views
 from spike4dgs.method.msdi import TINY
 from spike4dgs.method.msdi.training.data import Bursts
 from spike4dgs.method.msdi.training.train import Training, TrainingSettings

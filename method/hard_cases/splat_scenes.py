@@ -1,4 +1,4 @@
-"""Scenes for the rasteriser's tests: random ones, and one for each way to get a rasteriser wrong."""
+"""Gaussians that are hard to render: random ones, and a scene for each way to get a rasteriser wrong, all float64."""
 
 from __future__ import annotations
 
@@ -122,6 +122,28 @@ def opaque_stack() -> tuple[Splats, Views]:
     return changed(s, opacities=0.5 + 0.5 * s.opacities, scales=s.scales * 3), views()
 
 
+def crowd() -> tuple[Splats, Views]:
+    """Return 100,000 Gaussians in front of one pixel of an image of 5x3, one behind the other."""
+    s = random_splats(100_000, seed=11)
+    z = torch.linspace(2, 5, 100_000, dtype=torch.float64)[torch.randperm(100_000, generator=_generator(12))]
+    means = torch.stack([1e-3 * s.means[:, 0], 1e-3 * s.means[:, 1], z], 1)
+    faint = 0.006 + 0.01 * s.opacities  # hundreds count before a pixel is full
+    K = torch.tensor([[FOCAL, 0.0, 2.5], [0.0, FOCAL, 1.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return changed(s, means=means, scales=torch.ones_like(means), opacities=faint), Views(views(1).w2c, K[None], 5, 3)
+
+
+def behind() -> tuple[Splats, Views]:
+    """Return Gaussians behind the camera alone, huge ones among them that would cover the image."""
+    s = random_splats(40, seed=13)
+    means = s.means * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    huge = torch.where(torch.arange(40) % 2 > 0, 100.0, 1.0)[:, None]
+    return changed(s, means=means, scales=s.scales * huge), views(1)
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def zero_quaternions() -> tuple[Splats, Views]:
     """Return Gaussians of which a third have no rotation: those are not rendered."""
     s = random_splats(30, seed=10)
@@ -142,4 +164,5 @@ HARD: list[Callable[[], tuple[Splats, Views]]] = [
     far_origin,
     opaque_stack,
     zero_quaternions,
+    behind,
 ]

@@ -1,0 +1,1 @@
+"""Hard cases of the generators: the spike sensor, events, emulated cameras."""

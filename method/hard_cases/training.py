@@ -1,0 +1,232 @@
+"""Hard cases of the losses, the motion lookup and the poses from points, each beside a float64 twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, worst
+from spike4dgs.benchmark.metrics.pose_error import angle_deg
+from spike4dgs.benchmark.scene.cameras import look_at
+from spike4dgs.method.motion.hexplane import sample_level
+from spike4dgs.method.motion.hexplane_cpu import sample_levels
+from spike4dgs.method.msdi.pose import solve_poses
+from spike4dgs.method.observations.made_scene import made_scene
+from spike4dgs.method.observations.training_images import Spans
+from spike4dgs.method.splat.ssim import ssim, ssim_reference
+from spike4dgs.method.supervision.base import Sample
+from spike4dgs.method.supervision.exposure import Exposure
+from spike4dgs.method.supervision.pixel import PixelSettings
+from spike4dgs.method.supervision.spike_neuron import encode, firing_rate
+from spike4dgs.method.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
+
+Float64 = NDArray[np.float64]
+_SSIM_PAIRS: dict[str, tuple[str, Callable[[torch.Generator], tuple[Tensor, Tensor]]]] = {
+    "black": ("black against black", lambda g: (torch.zeros(1, 30, 30), torch.zeros(1, 30, 30))),
+    "flat": ("0.7 everywhere, twice: variances cancel", lambda g: (_flat(0.7), _flat(0.7))),
+    "overexposed": ("20 everywhere against noise in 0..1", lambda g: (_flat(20.0), torch.rand(1, 30, 30, generator=g))),
+    "negative": ("an image against its negative", lambda g: (x := torch.rand(2, 25, 31, generator=g), 1 - x)),
+    "one-pixel": ("1x1 pixels", lambda g: (torch.rand(3, 1, 1, generator=g), torch.rand(3, 1, 1, generator=g))),
+}
+
+
+def cases() -> list[Case]:
+    """Return the cases of what a fit computes beside rendering."""
+    return [
+        *(_ssim_case(name) for name in _SSIM_PAIRS),
+        _case("loss/neuron-rate", "firing rates of currents 0, 1e-12, 1/n, 1, 1e6 from all starts, 1 to 256 steps",
+              "a loop over the steps, float64", "spikes per step", 1e-12, lambda s: _neurons(0)),
+        _case("loss/neuron-gradient", "their surrogate gradients", "the step of the last spike in that loop",
+              "of the slope", 1e-12, lambda s: _neurons(1)),
+        _case("loss/dark-rate", "slope of the compared scale (rate + 1/256)^(1/2.2) at a rate of 0",
+              "the derivative in closed form, float64", "relative", 1e-5, _dark_rate),
+        _case("loss/exposure", "means of light that is cubic in time, over spans of 10 and 20 ticks",
+              "the integral in closed form", "of radiance", 1e-8, _exposure),
+        _case("motion/hexplane", "lookups on cell borders, at the box's corners and 10,000 boxes outside",
+              "bilinear lookups by torch, float64", "relative L2", 2e-5, _hexplane),
+        _case("motion/tracking", "rigidity, rotation and isometry of points that coincide, or lie 1 km away",
+              "plain torch, float64", "of the largest", 2e-3, _tracking),
+        _case("poses/pnp-scale", "poses from exact points in units of 1 mm, 1 m and 10 km", "the true poses", "degrees",
+              1e-4, _pnp_scales),
+        _case("poses/pnp-degenerate", "points that are NaN, equal, on a line, nonsense, infinite; no confidence",
+              "the contract: no pose, and a reason", "views with a pose", 0, _pnp_degenerate),
+    ]  # fmt: skip
+
+
+def _case(name: str, asked: str, twin: str, unit: str, tolerance: float, run: Callable[[Setting], Outcome]) -> Case:
+    return Case(id=f"method/{name}", asked=asked, twin=twin, unit=unit, tolerance=tolerance, run=run)
+
+
+def _flat(level: float) -> Tensor:
+    return torch.full((1, 30, 30), level)
+
+
+def _ssim_case(name: str) -> Case:
+    asked, pair = _SSIM_PAIRS[name]
+
+    def run(setting: Setting) -> Outcome:
+        a, b = pair(torch.Generator().manual_seed(setting.seed))
+        fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
+        values = ssim(fast, b), ssim_reference(slow, b.double())
+        for value in values:
+            value.backward()  # type: ignore[no-untyped-call]
+        assert fast.grad is not None and slow.grad is not None
+        both = {"value": compare(*(v.detach().numpy() for v in values)), "gradient": compare(fast.grad, slow.grad)}
+        return worst(both)
+
+    return _case(f"loss/ssim-{name}", f"SSIM of training and its gradient: {asked}", "torch convolutions, float64",
+                 "", 2e-4, run)  # fmt: skip
+
+
+def _neurons(which: int) -> Outcome:
+    """Compare rates (0) or gradients (1) with a loop; all are multiples of 2^-12, so that every sum is exact."""
+    outcomes = {}
+    levels = [0.0, 2**-12, 1 / 256, 0.25, 0.5, 1 - 2**-12, 1.0, 1.5, 1e6]
+    current, start = np.meshgrid(levels, [0.0, 2**-12, 0.5, 1 - 2**-12])
+    for steps in (1, 2, 7, 256):
+        leaf = torch.tensor(current, requires_grad=True)
+        rate = firing_rate(leaf, torch.tensor(start), steps)
+        rate.sum().backward()  # type: ignore[no-untyped-call]
+        assert leaf.grad is not None
+        found = (rate.detach().numpy(), leaf.grad.numpy())[which]
+        outcomes[f"{steps} steps"] = compare(found, _looped(current, start, steps)[which])
+    return worst(outcomes)
+
+
+def _looped(current: Float64, start: Float64, steps: int) -> tuple[Float64, Float64]:
+    """Return the rate and the surrogate's gradient of neurons with subtractive reset, step by step."""
+    charge, count, last = start.copy(), np.zeros_like(start), np.zeros_like(start)
+    for step in range(1, steps + 1):
+        charge += np.minimum(current, 1.0)
+        fired = charge >= 1
+        charge -= fired
+        count += fired
+        last[fired] = step
+    return count / steps, last / steps
+
+
+def _dark_rate(setting: Setting) -> Outcome:
+    rate = torch.zeros(3, requires_grad=True)
+    encode(rate).sum().backward()  # type: ignore[no-untyped-call]
+    assert rate.grad is not None
+    return compare(rate.grad, np.full(3, (1 / 2.2) * (1 / 256) ** (1 / 2.2 - 1)), relative=True)
+
+
+def _exposure(setting: Setting) -> Outcome:
+    tick, n_ticks, shape = 40, 81, (2, 40, 64)
+    texture = torch.tensor(setting.rng().random(shape) + 0.5)
+    powers = torch.stack([c * texture for c in (0.5, 0.01, -2e-3, 1e-4)])
+    scene = made_scene()[0]
+    supervision = Exposure(PixelSettings(ssim_weight=0.0), scene)
+    outcomes = {}
+
+    def light(t: float) -> Tensor:
+        return sum_of(powers, lambda k: (t * n_ticks - tick) ** k)
+
+    for half in (5.0, 10.0):
+        ends = torch.stack([torch.full(shape, -half), torch.full(shape, half)], 1).double()
+        mean = sum_of(powers, lambda k, h=half: (h ** (k + 1) - (-h) ** (k + 1)) / ((k + 1) * 2 * h))  # type: ignore[misc]
+        sample = Sample(tick / n_ticks, tick, (0, 1), mean, 0, Spans(ends, half, n_ticks))
+        outcomes[f"{2 * half:g} ticks"] = compare(supervision(light, sample).detach().numpy(), 0.0)
+    return worst(outcomes)
+
+
+def sum_of(coefficients: Tensor, weight: Callable[[int], float]) -> Tensor:
+    """Return sum_k weight(k) coefficients[k]."""
+    return torch.stack([c * weight(k) for k, c in enumerate(coefficients)]).sum(0)
+
+
+def _hexplane(setting: Setting) -> Outcome:
+    g = torch.Generator().manual_seed(setting.seed)
+    steps = torch.tensor([-1e4, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1e4])
+    unit = torch.cartesian_prod(steps, steps, steps)  # a plane of 5x5 has its values at multiples of 1/4
+    space, lines = torch.randn(3, 5, 5, 4, generator=g), torch.randn(3, 5, 4, generator=g)
+    weight = torch.randn(len(unit), 4, generator=g)
+    # No gradient of the points: on a border between cells their slope is that of either side.
+    results = []
+    for fast in (True, False):
+        leaves = [x.clone().requires_grad_() for x in (unit, space, lines)]
+        out = (
+            sample_levels(leaves[0], [leaves[2]], [leaves[1]]) if fast else sample_level(*(x.double() for x in leaves))
+        )
+        (out * weight).sum().backward()  # type: ignore[no-untyped-call]
+        results.append([out.detach(), *(x.grad for x in leaves[1:])])
+    names = ("features", "gradient of planes", "gradient of lines")
+    return worst({n: compare(a, b, relative=True) for n, a, b in zip(names, *results, strict=True)})
+
+
+def _tracking(setting: Setting) -> Outcome:
+    rng, outcomes = setting.rng(), {}
+    cloud, turns = torch.tensor(rng.normal(size=(60, 3))), torch.tensor(rng.normal(size=(60, 4)))
+    moves = torch.tensor(0.05 * rng.normal(size=(60, 3))), torch.tensor(0.05 * rng.normal(size=(60, 4)))
+    coincident = cloud.clone()
+    coincident[1::2] = coincident[::2]
+    for name, points in (("random", cloud), ("coincident", coincident), ("1 km away", cloud + 1e3)):
+        start = points.float().double()
+        graph = find_neighbours(start, 9)
+        moved = [(a + b).float().double() for a, b in zip((start, turns), moves, strict=True)]
+        results = [_terms(graph, (start, turns), moved, dtype) for dtype in (torch.float64, torch.float32)]
+        for part, slow, fast in zip(("value", "of means", "of turns"), *results, strict=True):
+            size = float(slow.abs().max()) + 1e-4
+            outcomes[f"{name}, {part}"] = compare(fast / size, slow / size)
+    return worst(outcomes)
+
+
+def _terms(graph: Neighbours, before: Sequence[Tensor], now: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    """Return the loss of a moved cloud and its two gradients, computed in one precision."""
+    leaves = [t.to(dtype, copy=True).requires_grad_() for t in now]
+    own = Neighbours(graph.index, graph.root.to(dtype), graph.rest.to(dtype), graph.unit)
+    value = physical_loss(own, remember(own, *(t.to(dtype) for t in before)), leaves[0], leaves[1], (4.0, 4.0, 2.0))
+    value.backward()  # type: ignore[no-untyped-call]
+    return [value.detach().double(), *(leaf.grad.double() for leaf in leaves if leaf.grad is not None)]
+
+
+def _seen(scale: float = 1.0) -> tuple[Float64, Float64, Float64]:
+    """Return points [3, H, W, 3] in view 0's frame of a wavy wall, their cameras' K [3, 3, 3] and poses [3, 4, 4]."""
+    up, aim = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 4.0])
+    places = ((0.0, 0.0, 0.0), (0.5, 0.1, 0.0), (-0.4, -0.3, 0.2))
+    cameras = [look_at("c", np.array(p), aim, up, focal=70, width=64, height=40) for p in places]
+    v, u = np.mgrid[:40, :64] + 0.5
+    maps = []
+    for camera in cameras:
+        depth = 4 + 0.3 * np.sin(u / 9) * np.cos(v / 7)
+        world = camera.unproject(np.column_stack([u.ravel(), v.ravel()]), depth.ravel())
+        maps.append(scale * (world @ cameras[0].R.T + cameras[0].t).reshape(40, 64, 3))
+    back = np.linalg.inv(cameras[0].w2c)
+    return np.stack(maps), np.stack([c.K for c in cameras]), np.stack([c.w2c @ back for c in cameras])
+
+
+def _pnp_scales(setting: Setting) -> Outcome:
+    outcomes = {}
+    for scale in (1e-3, 1.0, 1e4):
+        points, K, true = _seen(scale)
+        for i, pose in enumerate(solve_poses(points, np.ones(points.shape[:3]), K, setting.seed)):
+            found = np.full((4, 4), np.nan) if pose.w2c is None else pose.w2c
+            outcomes[f"view {i}, scale {scale:g}"] = compare(angle_deg(found[:3, :3] @ true[i, :3, :3].T), 0.0)
+    return worst(outcomes)
+
+
+def _pnp_degenerate(setting: Setting) -> Outcome:
+    points, K, _ = _seen()
+    bad = {
+        "NaN": np.full_like(points[1], np.nan),
+        "infinite": np.full_like(points[1], np.inf),
+        "equal": np.ones_like(points[1]),
+        "on a line": points[1] * [1, 0, 0] + [0, 0.5, 3.0],
+        "nonsense": 5 * setting.rng().normal(size=points[1].shape),
+        "1e300": np.full_like(points[1], 1e300),
+    }
+    sure = np.ones((2, 40, 64))
+    found = {n: solve_poses(np.stack([points[0], p]), sure, K[:2], setting.seed)[1] for n, p in bad.items()}
+    found["no confidence"] = solve_poses(points[:2], np.full_like(sure, np.nan), K[:2], setting.seed)[1]
+    posed = [name for name, pose in found.items() if pose.found or not pose.reason]
+    text = (
+        f"a pose of points that are {', '.join(posed)}"
+        if posed
+        else f"no pose of {len(found)}; NaN: {found['NaN'].reason}"
+    )
+    return Outcome(text, float(len(posed)))
