@@ -132,7 +132,9 @@ def _make(
 ) -> tuple[tuple[int, ...], Float32, list[Half] | None]:
     """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
     make = on_device(make, device)
-    ticks, images, spans = choose_ticks(scene.n_ticks, settings), [], []
+    ticks = choose_ticks(scene.n_ticks, settings)
+    images: list[Float32] = []
+    spans: list[Half] = []
     for camera, stream in zip(scene.cameras, scene.streams, strict=True):  # one by one: a stream's spikes are kept
         state = scene.state(camera.id)
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)

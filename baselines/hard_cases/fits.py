@@ -33,7 +33,7 @@ _FEW: dict[str, Any] = {
 }
 _FROZEN = {"trainer.freeze_background": True}
 RECIPES = {
-    "exposure": Recipe("exposure", "intervals", "made", "paths", "exposure", {**_FEW, **_FROZEN}),
+    "pixel": Recipe("pixel", "intervals", "made", "paths", "pixel", {**_FEW, **_FROZEN}),
     "spss": Recipe("spss", "tfp", "made", "hexplane", "spss", {**_FEW, "motion.mlp_width": 8, "motion.features": 4}),
     "pixel+spike": Recipe("pixel+spike", "tfi", "made", "spacetime", "pixel+spike", _FEW),
 }  # fmt: skip

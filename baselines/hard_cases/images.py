@@ -119,8 +119,9 @@ def _intervals_case(name: str) -> Case:
         half = float(maker.settings.half)  # type: ignore[attr-defined]
         stream, outcomes = stream_of(spikes), {}
         for tick in _ticks(len(spikes)):
-            found, spans = maker(stream, [tick], _GAIN)[0], maker.measured_over(stream, [tick])
+            images, spans = maker.with_spans(stream, [tick], _GAIN)
             assert spans is not None
+            found = images[0]
             expected = slow_adaptive(spikes, tick)
             for y, x in np.ndindex(expected.shape):
                 twin = slow_intervals(spikes[:, y, x], tick, half)

@@ -20,6 +20,7 @@ from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, training_for
 from spike4dgs.benchmark.reports.speed_error.measurement import Column, Measurement, Point, Request, Series, Size
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.motion.paths import Paths
 
@@ -59,6 +60,7 @@ def fitted(recipe: Recipe, trial: Trial, scene: Scene, request: Request, warm_up
     reset_peak_memory(request.device)
     start = time.perf_counter()
     model = method.fit(training_for(method, scene.training), fit)
+    assert isinstance(model, FittedModel)
     seconds, memory = time.perf_counter() - start, peak_memory_mb(request.device)
     squares: dict[str, list[float]] = {"rms": [], "moving": []}
     rendered = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +142,7 @@ def _rotations(setting: Setting) -> Outcome:
         "a shear": np.eye(3) + 1e-4 * np.eye(3)[::-1],
         "zeros": np.zeros((3, 3)),
     }
-    return refused({name: lambda R=R: check_rotation(R, "pose") for name, R in bad.items()})
+    return refused({name: partial(check_rotation, R, "pose") for name, R in bad.items()})
 
 
 def _angles(setting: Setting) -> Outcome:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ def cases() -> list[Case]:
         _psnr("constant", "0.5 everywhere against 0.6 everywhere", lambda rng: (_even(0.5), _even(0.6))),
         _psnr("black-and-white", "black against white", lambda rng: (_even(0.0), _even(1.0))),
         _psnr("hdr", "values from -1e4 to 1e4: clipped to 0..1", lambda rng: (_texture(rng), 1e4 * _noise(rng))),
-        _psnr("float32", "float32, 1e-4 apart", lambda rng: (a := np.float32(_texture(rng)), a + np.float32(1e-4))),
+        _psnr("float32", "float32, 1e-4 apart", lambda rng: (a := _texture(rng).astype(np.float32), a + np.float32(1e-4))),
         _ssim("equal", "equal images", lambda rng: (image := _texture(rng), image)),
         _ssim("constant", "0.5 against 0.6 everywhere: variances cancel", lambda rng: (_even(0.5), _even(0.6))),
         _ssim("both-black", "black against black", lambda rng: (_even(0.0), _even(0.0))),
@@ -124,7 +125,7 @@ def _number(value: float | None) -> float:
 def _ssim_map(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> Float64:
     import cv2
 
-    x, y = (np.clip(np.float64(i), 0, 1) for i in (truth, prediction))
+    x, y = (np.clip(np.asarray(i, np.float64), 0, 1) for i in (truth, prediction))
 
     def blur(image: Float64) -> Float64:
         size = (SSIM_WINDOW, SSIM_WINDOW)
@@ -168,7 +169,7 @@ def _flip(setting: Setting) -> Outcome:
         from flip_evaluator import evaluate
     except ImportError:
         raise NotRunError("the package flip-evaluator is not installed") from None
-    image = np.uint8(np.rint(255 * _texture(setting.rng())))
+    image = np.rint(255 * _texture(setting.rng())).astype(np.uint8)
     even = np.full_like(image, 128)
     pairs = {
         "equal": (image, image),
@@ -244,7 +245,7 @@ def _bad_images(setting: Setting) -> Outcome:
         "10x64 pixels": (small, small, small > 1),
         "a mask of numbers": (truth, truth, truth),
     }
-    return refused({name: lambda images=images: check_images(*images, "image") for name, images in bad.items()})
+    return refused({name: partial(check_images, *images, where="image") for name, images in bad.items()})
 
 
 def _blind(setting: Setting) -> Outcome:

@@ -52,7 +52,7 @@ def error_levels(image: Float32, truth: Float32) -> UInt8:
     The root gives small errors many levels: a level is less than 0.0003 for errors below 0.01.
     """
     share = absolute_error(image, truth).clip(max=ERROR_MAX) / ERROR_MAX
-    return np.rint(255 * np.sqrt(share)).astype(np.uint8)
+    return np.asarray(np.rint(255 * np.sqrt(share)), np.uint8)
 
 
 @cache

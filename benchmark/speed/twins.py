@@ -60,7 +60,8 @@ def psnr_slowly(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 def pairs(request: Request) -> dict[str, ImagePair]:
     """Return pairs of images by name: usual ones, and those on which a score has the least room."""
-    usual = make_image_pair(*request.pick((24, 40), (125, 200), (250, 400)), request.seed)
+    height, width = request.pick((24, 40), (125, 200), (250, 400))
+    usual = make_image_pair(height, width, request.seed)
     close = usual.truth_radiance + 1e-3 * (usual.predicted_radiance - usual.truth_radiance)
     dark = 1e-2
     return {

@@ -79,7 +79,7 @@ def _case(name: str, asked: str, twin: str, unit: str, tolerance: float, run: Ca
 
 
 def _simulated(keys: Keys, ticks: Sequence[int], n: int, sensor: Sensor, seed: int, threads: int = 1) -> SpikeStream:
-    charge = random_charge(*keys.shape[1:], [seed])
+    charge = random_charge(keys.shape[1], keys.shape[2], [seed])
     packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads=threads)))
     return SpikeStream(packed, keys.shape[2], keys.shape[1], 20_000.0)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 from spike4dgs.benchmark.reports.speed_error.measurement import (
@@ -72,9 +71,9 @@ def _clips(request: Request) -> Iterator[Series]:
 
 def _threads(request: Request) -> Iterator[Series]:
     counts = [n for n in (1, 2, 4, 8, 16) if n <= len(os.sched_getaffinity(0))]
-    shape = request.pick((24, 16, 40), (400, 250, 400), (400, 250, 2000))
-    calls = {float(n): partial(_run(*shape, 1.0, n)) for n in counts}
-    yield _timed(calls, f"{shape[2]} ticks of {shape[0]}x{shape[1]}", "threads", request)
+    width, height, ticks = request.pick((24, 16, 40), (400, 250, 400), (400, 250, 2000))
+    calls = {float(n): _run(width, height, ticks, 1.0, n) for n in counts}
+    yield _timed(calls, f"{ticks} ticks of {width}x{height}", "threads", request)
 
 
 def _growth(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -56,7 +56,7 @@ def _sensor(request: Request) -> Iterator[Series]:
         def ours(threads: int, keys: Float32 = keys) -> NDArray[Any]:
             return np.concatenate(list(simulate(keys, key_ticks.tolist(), ticks, sensor, charge, threads=threads)))
 
-        calls = {
+        calls: dict[str, Callable[[], NDArray[Any]]] = {
             "numpy, float32": by_numpy,
             "kernel, 1 thread": partial(ours, 1),
             "kernel, 2 threads": partial(ours, 2),

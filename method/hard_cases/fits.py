@@ -47,10 +47,10 @@ _SMALL = {"hexplane": {"mlp_width": 16, "features": 4}}
 FITS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "hexplane": ("hexplane", "spss", {}),
     "spacetime": ("spacetime", "spike-render", {}),
-    "paths-background": ("paths", "exposure", {"freeze_background": True}),
+    "paths-background": ("paths", "pixel", {"freeze_background": True}),
 }
 _SEEDS = 3  # other seeds
-_PSNR_STEPS = {"trainer.coarse_steps": 40, "trainer.fine_steps": 160, "trainer.views_per_step": 4}
+_PSNR_STEPS = {"trainer.coarse_steps": 60, "trainer.fine_steps": 240, "trainer.views_per_step": 2}
 
 
 def silent(done: int, total: int, note: str = "") -> None:
@@ -204,12 +204,12 @@ def _seed_cases() -> list[Case]:
     return [
         Case(
             id="method/fit/same-seed",
-            asked="fit the made scene twice with one seed (paths, exposure)",
+            asked="fit the made scene twice with one seed (paths, pixel)",
             twin="the first of the two fits",
             unit="bytes that differ",
             tolerance=0,
             run=lambda s: equal_bytes(
-                [_fit_bytes("paths", "exposure", s.seed) for _ in range(2)], ["the first fit", "the second"]
+                [_fit_bytes("paths", "pixel", s.seed) for _ in range(2)], ["the first fit", "the second"]
             ),
             kind="seeds",
             seconds=2,

@@ -15,12 +15,9 @@ from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.method.motion.hexplane import sample_level
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.pose import solve_poses
-from spike4dgs.method.observations.made_scene import made_scene
+from spike4dgs.method.observations.instants import correction, node
 from spike4dgs.method.observations.training_images import Spans
 from spike4dgs.method.splat.ssim import ssim, ssim_reference
-from spike4dgs.method.supervision.base import Sample
-from spike4dgs.method.supervision.exposure import Exposure
-from spike4dgs.method.supervision.pixel import PixelSettings
 from spike4dgs.method.supervision.spike_neuron import encode, firing_rate
 from spike4dgs.method.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
 
@@ -44,8 +41,8 @@ def cases() -> list[Case]:
               "of the slope", 1e-12, lambda s: _neurons(1)),
         _case("loss/dark-rate", "slope of the compared scale (rate + 1/256)^(1/2.2) at a rate of 0",
               "the derivative in closed form, float64", "relative", 1e-5, _dark_rate),
-        _case("loss/exposure", "means of light that is cubic in time, over spans of 10 and 20 ticks",
-              "the integral in closed form", "of radiance", 1e-8, _exposure),
+        _case("loss/instants", "instants from means of light of the fifth power in time, over 10 and 20 ticks",
+              "the light in closed form", "of radiance", 1e-8, _instants),
         _case("motion/hexplane", "lookups on cell borders, at the box's corners and 10,000 boxes outside",
               "bilinear lookups by torch, float64", "relative L2", 2e-5, _hexplane),
         _case("motion/tracking", "rigidity, rotation and isometry of points that coincide, or lie 1 km away",
@@ -116,22 +113,19 @@ def _dark_rate(setting: Setting) -> Outcome:
     return compare(rate.grad, np.full(3, (1 / 2.2) * (1 / 256) ** (1 / 2.2 - 1)), relative=True)
 
 
-def _exposure(setting: Setting) -> Outcome:
-    tick, n_ticks, shape = 40, 81, (2, 40, 64)
+def _instants(setting: Setting) -> Outcome:
+    shape, outcomes = (2, 40, 64), {}
     texture = torch.tensor(setting.rng().random(shape) + 0.5)
-    powers = torch.stack([c * texture for c in (0.5, 0.01, -2e-3, 1e-4)])
-    scene = made_scene()[0]
-    supervision = Exposure(PixelSettings(ssim_weight=0.0), scene)
-    outcomes = {}
+    powers = torch.stack([c * texture for c in (0.5, 0.01, -2e-3, 1e-4, 3e-5, -2e-6)])
 
-    def light(t: float) -> Tensor:
-        return sum_of(powers, lambda k: (t * n_ticks - tick) ** k)
+    def light(ticks: float) -> Tensor:
+        return sum_of(powers, lambda k: ticks**k)
 
     for half in (5.0, 10.0):
-        ends = torch.stack([torch.full(shape, -half), torch.full(shape, half)], 1).double()
+        spans = Spans(torch.stack([torch.full(shape, -half), torch.full(shape, half)], 1).double(), half, 81)
         mean = sum_of(powers, lambda k, h=half: (h ** (k + 1) - (-h) ** (k + 1)) / ((k + 1) * 2 * h))  # type: ignore[misc]
-        sample = Sample(tick / n_ticks, tick, (0, 1), mean, 0, Spans(ends, half, n_ticks))
-        outcomes[f"{2 * half:g} ticks"] = compare(supervision(light, sample).detach().numpy(), 0.0)
+        found = mean + correction(*(light(t) for t in (-node(half), 0.0, node(half))), spans)
+        outcomes[f"{2 * half:g} ticks"] = compare(found.numpy(), light(0.0).numpy())
     return worst(outcomes)
 
 

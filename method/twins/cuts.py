@@ -40,7 +40,8 @@ FINER = 8  # samples across a pixel, of the exact box
 def composited(splats: Splats, views: Views, alpha_min: float, t_min: float) -> tuple[Tensor, float]:
     """Return the image [H*W] in float64, cut at other limits than the rasteriser's, and the mean work at a pixel."""
     opaque = torch.ones(len(splats), dtype=torch.float64)  # so that the projection culls nothing
-    wide = Splats(*(t.double() for t in (splats.means, splats.quats, splats.scales)), opaque, splats.colors.double())
+    means, quats, scales = (t.double() for t in (splats.means, splats.quats, splats.scales))
+    wide = Splats(means, quats, scales, opaque, splats.colors.double())
     size = (views.width, views.height)
     view = project(wide, views.w2c[0].double(), views.K[0].double(), size, False, NEAR, EPS2D)
     view = replace(view, opacity=splats.opacities.double()[view.index])

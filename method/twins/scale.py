@@ -58,7 +58,7 @@ def _pixels(request: Request) -> Iterator[Series]:
     yield _timed({k: partial(_image, *s) for k, s in scenes.items()}, f"render {n} Gaussians", "pixels", request)
     yield _timed({k: partial(_step, *s) for k, s in scenes.items()}, "render and differentiate", "pixels", request)
     images = {float(w * h): torch.rand(2, 1, h, w) for w, h in sizes}
-    calls = {k: partial(differentiate, ssim, *pair) for k, pair in images.items()}
+    calls: dict[float, Call] = {k: partial(differentiate, ssim, *pair) for k, pair in images.items()}
     yield _timed(calls, "SSIM and its gradient", "pixels", request)
 
 

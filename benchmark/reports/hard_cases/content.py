@@ -51,7 +51,7 @@ def write_content(path: Path, report: dict[str, Any]) -> None:
     """Write the page of a report of `hard_cases.schema.json`."""
     cases: Rows = report["cases"]
     failed = [c for c in cases if c["passed"] is False]
-    kinds = {kind: [c for c in cases if c["kind"] == kind] for kind in _KINDS}
+    kinds: dict[str, Rows] = {kind: [c for c in cases if c["kind"] == kind] for kind in _KINDS}
     parts: dict[str, Rows] = {}
     for part in dict.fromkeys(part_of(c) for c in cases if c["kind"] == "twin"):
         parts[part] = [c for c in cases if part_of(c) == part and c["kind"] == "twin"]

@@ -71,5 +71,5 @@ def short(value: float) -> str:
 
 
 def _nice(step: float) -> float:
-    power = 10 ** math.floor(math.log10(step))
-    return min((m * power for m in (1, 2, 5, 10)), key=lambda s: abs(s - step))
+    power = 10.0 ** math.floor(math.log10(step))
+    return float(min((m * power for m in (1, 2, 5, 10)), key=lambda s: abs(s - step)))

@@ -127,12 +127,13 @@ def _plot(r: dict[str, Any], y: str) -> Html:
         shown.sort(key=lambda p: p["values"][r["x"]])
         dots = (Dot(p["values"][r["x"]], p["values"][y], p["name"], p["role"] == "chosen") for p in shown)
         curves.append(Curve(s["name"], tuple(dots)))
-    axes = [Axis(_title(r, c), next(x["log"] for x in r["columns"] if x["id"] == c)) for c in (r["x"], y)]
-    return chart(curves, *axes, what=f"{r['title']}: {_caption(r, y)}")
+    x, up = (Axis(_title(r, c), next(a["log"] for a in r["columns"] if a["id"] == c)) for c in (r["x"], y))
+    return chart(curves, x, up, f"{r['title']}: {_caption(r, y)}")
 
 
 def _numbers(r: dict[str, Any]) -> Html:
-    rows, marked = [], []
+    rows: list[list[Any]] = []
+    marked = []
     several = len(r["series"]) > 1
     named = any(p["name"] for s in r["series"] for p in s["points"])
     for s in r["series"]:
