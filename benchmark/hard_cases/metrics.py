@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.flip import flip
-from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.lpips import LpipsNetwork, empty_trunk, make_network
 from spike4dgs.benchmark.metrics.measure import Values, fit_gain, measure
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
@@ -32,7 +32,7 @@ def cases() -> list[Case]:
         _psnr("constant", "0.5 everywhere against 0.6 everywhere", lambda rng: (_even(0.5), _even(0.6))),
         _psnr("black-and-white", "black against white", lambda rng: (_even(0.0), _even(1.0))),
         _psnr("hdr", "values from -1e4 to 1e4: clipped to 0..1", lambda rng: (_texture(rng), 1e4 * _noise(rng))),
-        _psnr("float32", "float32, 1e-4 apart", lambda rng: (a := _texture(rng).astype(np.float32), a + np.float32(1e-4))),
+        _psnr("float32", "float32, 1e-4 apart", _float32_pair),
         _ssim("equal", "equal images", lambda rng: (image := _texture(rng), image)),
         _ssim("constant", "0.5 against 0.6 everywhere: variances cancel", lambda rng: (_even(0.5), _even(0.6))),
         _ssim("both-black", "black against black", lambda rng: (_even(0.0), _even(0.0))),
@@ -50,6 +50,11 @@ def cases() -> list[Case]:
         _case("no-reference", "BRISQUE and NIQE of black, white, gray, HDR-bright and nearly even images",
               "the contract: no value where an image shows nothing, else a finite one", "wrong answers", 0, _blind, 2),
     ]  # fmt: skip
+
+
+def _float32_pair(rng: np.random.Generator) -> tuple[Image, Image]:
+    image = _texture(rng).astype(np.float32)
+    return image, image + np.float32(1e-4)
 
 
 def _case(
@@ -72,7 +77,7 @@ def _case(
     )
 
 
-Pair = Callable[[np.random.Generator], tuple[Float64, NDArray[np.floating]]]
+Pair = Callable[[np.random.Generator], tuple[Image, Image]]
 
 
 def _psnr(name: str, asked: str, pair: Pair) -> Case:

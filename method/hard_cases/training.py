@@ -124,7 +124,7 @@ def _instants(setting: Setting) -> Outcome:
     for half in (5.0, 10.0):
         spans = Spans(torch.stack([torch.full(shape, -half), torch.full(shape, half)], 1).double(), half, 81)
         mean = sum_of(powers, lambda k, h=half: (h ** (k + 1) - (-h) ** (k + 1)) / ((k + 1) * 2 * h))  # type: ignore[misc]
-        found = mean + correction(*(light(t) for t in (-node(half), 0.0, node(half))), spans)
+        found = mean + correction(light(-node(half)), light(0.0), light(node(half)), spans)
         outcomes[f"{2 * half:g} ticks"] = compare(found.numpy(), light(0.0).numpy())
     return worst(outcomes)
 
