@@ -229,6 +229,11 @@ COMMANDS: dict[str, Command] = {
         "estimate the training cameras' poses and measure their errors",
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
+    "patterns": Command(
+        "spike4dgs.baselines.pattern_report:patterns",
+        "estimate the cameras' fixed patterns from the clip alone and measure their errors",
+        "patterns data/car-0-small",
+    ),
     "export-nerfstudio": Command(
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
         "write a scene as nerfstudio's D-NeRF data: images, poses, times",
