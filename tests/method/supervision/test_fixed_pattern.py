@@ -28,33 +28,46 @@ def cosines(height: int, width: int, order: int) -> np.ndarray:
 def regression(r: np.ndarray, i: np.ndarray, s: FixedPatternSettings) -> tuple[np.ndarray, np.ndarray]:
     """Gain and dark level [C, H, W]: least squares in float64 for the shading, gain and dark of every pixel at once.
 
-    Then the shadings' mean is taken away, and gain and dark are found once more.
+    The shadings' mean is taken away, and gain and dark are found once more; then all that with the noise around pixels.
     """
-    n, basis = r[0].size, cosines(*r.shape[1:], s.shading_order).reshape(r[0].size, -1)
-    m = basis.shape[1]
-    spread = s.shading / np.sqrt((basis**2).mean(axis=0).sum()) if m else 1.0
-    prior = np.diag(1 / np.repeat([spread, s.pixel_gain, s.dark_spread / WHITE], [m, n, n]))
-
-    def unknowns(left: np.ndarray, light: np.ndarray, first: int) -> np.ndarray:
-        data = np.concatenate([light[:, None] * basis, np.diag(light), np.eye(n)], axis=1) / s.model_error
-        target = np.concatenate([left / s.model_error, np.zeros(m + 2 * n - first)])
-        return np.linalg.lstsq(
-            np.concatenate([data, prior])[:, first:][[*range(n), *range(n + first, 3 * n + m)]], target
-        )[0]
-
     light, left = r.reshape(len(r), -1), (i - r - s.dark / WHITE).reshape(len(r), -1)
-    waves = np.stack([unknowns(b, a, 0)[:m] for a, b in zip(light, left, strict=True)])
-    shading = (waves - waves.mean(axis=0)) @ basis.T
-    own = np.stack([unknowns(b - a * c, a, m) for a, b, c in zip(light, left, shading, strict=True)])
+    basis = cosines(*r.shape[1:], s.shading_order).reshape(light.shape[1], -1)
+    (n, m), own_dark = basis.shape, s.dark_spread / WHITE
+    spread = s.shading / np.sqrt((basis**2).mean(axis=0).sum()) if m else 1.0
+    noise = np.full(r.shape, s.model_error**2)
+    for _ in range(2):
+        deviation = np.sqrt(noise.reshape(len(r), -1))
+        columns = [np.concatenate([a[:, None] * basis, np.diag(a), np.eye(n)], axis=1) for a in light]
+        prior = 1 / np.repeat([spread, s.pixel_gain, own_dark], [m, n, n])
+        waves = np.stack([ridge(x, y, e, prior)[:m] for x, y, e in zip(columns, left, deviation, strict=True)])
+        shading = (waves - waves.mean(axis=0)) @ basis.T
+        u = left - light * shading
+        own = np.stack([ridge(x[:, m:], y, e, prior[m:]) for x, y, e in zip(columns, u, deviation, strict=True)])
+        excess = (u**2 - (s.pixel_gain * light) ** 2 - own_dark**2).reshape(r.shape)
+        noise = s.model_error**2 + np.maximum(around(excess, s.noise_px // 2), 0)
     gain = shading + own[:, :n]
     return (gain - gain.mean(axis=1, keepdims=True)).reshape(r.shape), s.dark / WHITE + own[:, n:].reshape(r.shape)
+
+
+def ridge(columns: np.ndarray, values: np.ndarray, deviation: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    data = np.concatenate([columns / deviation[:, None], np.diag(prior)])
+    return np.linalg.lstsq(data, np.concatenate([values / deviation, np.zeros(len(prior))]), rcond=None)[0]
+
+
+def around(images: np.ndarray, reach: int) -> np.ndarray:
+    """Means [C, H, W] over squares, of what of them is in the image."""
+    out = np.empty_like(images)
+    for c, y, x in np.ndindex(images.shape):
+        top, left = max(0, y - reach), max(0, x - reach)
+        out[c, y, x] = images[c, top : y + reach + 1, left : x + reach + 1].mean()
+    return out
 
 
 @pytest.mark.parametrize(
     "light, settings",
     [
         ((0.0, 1.0), SETTINGS),
-        ((0.2, 0.6), replace(SETTINGS, shading_order=1, model_error=0.1)),
+        ((0.2, 0.6), replace(SETTINGS, shading_order=1, model_error=0.1, noise_px=3)),
         ((0.0, 1e-4), SETTINGS),  # the dark: nothing tells a gain
         ((0.9, 30.0), replace(SETTINGS, shading_order=0, model_error=1e-3)),  # far brighter than white
     ],
@@ -62,7 +75,8 @@ def regression(r: np.ndarray, i: np.ndarray, s: FixedPatternSettings) -> tuple[n
 def test_maps_are_those_of_ridge_regression(light: tuple[float, float], settings: FixedPatternSettings) -> None:
     rng = np.random.default_rng(0)
     r = rng.uniform(*light, (2, 7, 9))
-    i = r * rng.normal(1, 0.1, r.shape) + rng.normal(0.01, 0.01, r.shape)
+    i = r * rng.normal(1, 0.03, r.shape) + rng.normal(0.01, 0.01, r.shape)
+    i[:, 2:5, 3:6] += 0.3 * rng.random((2, 3, 3))  # what no pattern explains
     count = torch.from_numpy(rng.uniform(0.5, 20, r.shape))
     sums = torch.stack([count, count * torch.from_numpy(r), count * torch.from_numpy(i)])
     gain, dark = solve(sums.float(), settings, WHITE)
@@ -97,16 +111,16 @@ def loss_of(settings: FixedPatternSettings) -> FixedPattern:
 
 
 def patterns(rng: np.random.Generator, s: FixedPatternSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Gain and dark level [C, H, W] drawn from the prior."""
+    """Gain and dark level [C, H, W] drawn from the prior; the cameras' shadings have the mean 0."""
     basis, spread = shading_basis(*SIZE, s, torch.device("cpu"))
-    shading = (torch.from_numpy(rng.normal(size=(VIEWS, len(basis)))).float() * spread) @ basis
-    gain = shading.reshape(VIEWS, *SIZE) + s.pixel_gain * torch.from_numpy(rng.normal(size=(VIEWS, *SIZE))).float()
+    waves = torch.from_numpy(rng.normal(size=(VIEWS, len(basis)))).float() * spread
+    gain = ((waves - waves.mean(0)) @ basis).reshape(VIEWS, *SIZE) + s.pixel_gain * torch.from_numpy(rng.normal(size=(VIEWS, *SIZE))).float()
     dark = (s.dark + s.dark_spread * torch.from_numpy(rng.normal(size=(VIEWS, *SIZE))).float()) / WHITE
     return gain - gain.mean((1, 2), keepdim=True), dark
 
 
 def test_known_patterns_are_found_from_noisy_images_of_a_changing_scene() -> None:
-    """The error of the gain is what the prior leaves: sqrt(1 / (1/σ_l² + r²/(σ_d² + σ_n²))) in constant light r."""
+    """The error of the gain is hardly more than the prior leaves: sqrt(1 / (1/σ_l² + r²/(σ_d² + σ_n²))) in constant light r."""
     noise, memory = 0.02, 200
     s = replace(
         SETTINGS, model_error=noise / 128**0.5, memory=memory, every=20
@@ -124,7 +138,7 @@ def test_known_patterns_are_found_from_noisy_images_of_a_changing_scene() -> Non
         loss.gain - gain,
         (s.pixel_gain**-2 + 0.7**2 / ((s.dark_spread / WHITE) ** 2 + s.model_error**2)) ** -0.5,
     )
-    assert float(found.std()) == pytest.approx(expected, rel=0.1)
+    assert expected < float(found.std()) < 1.4 * expected  # the noise is measured, from 49 pixels
     assert float(found.std()) < 0.3 * float(gain.std())
     assert float((loss.dark - dark).std()) < float(dark.std())
 
