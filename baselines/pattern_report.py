@@ -18,7 +18,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.recipes import METHODS, SELF_CALIBRATED
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json
-from spike4dgs.benchmark.method import FitRequest, make_budget
+from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -87,7 +87,8 @@ def patterns(
         )
     with RunDisplay(make_console(), 1) as display, display.cell(f"patterns of {training.id}") as shown:
         request = FitRequest(make_budget(budget), device, seed, shown.progress)
-        model = METHODS[SELF_CALIBRATED.name].fit(training, request)
+        method = METHODS[SELF_CALIBRATED.name]
+        model = method.fit(training_for(method, training), request)
     assert isinstance(model, FittedModel)
     gain, dark = (model.estimates[name].cpu().numpy().astype(np.float64) for name in ("gain", "dark"))
     for camera, g, d in zip(training.cameras, gain, dark, strict=True):

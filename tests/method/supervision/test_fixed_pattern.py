@@ -110,17 +110,21 @@ def loss_of(settings: FixedPatternSettings) -> FixedPattern:
     return made
 
 
+def normal(rng: np.random.Generator, *shape: int) -> torch.Tensor:
+    return torch.from_numpy(rng.normal(size=shape)).float()
+
+
 def patterns(rng: np.random.Generator, s: FixedPatternSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """Gain and dark level [C, H, W] drawn from the prior; the cameras' shadings have the mean 0."""
     basis, spread = shading_basis(*SIZE, s, torch.device("cpu"))
-    waves = torch.from_numpy(rng.normal(size=(VIEWS, len(basis)))).float() * spread
-    gain = ((waves - waves.mean(0)) @ basis).reshape(VIEWS, *SIZE) + s.pixel_gain * torch.from_numpy(rng.normal(size=(VIEWS, *SIZE))).float()
-    dark = (s.dark + s.dark_spread * torch.from_numpy(rng.normal(size=(VIEWS, *SIZE))).float()) / WHITE
+    waves = normal(rng, VIEWS, len(basis)) * spread
+    gain = ((waves - waves.mean(0)) @ basis).reshape(VIEWS, *SIZE) + s.pixel_gain * normal(rng, VIEWS, *SIZE)
+    dark = (s.dark + s.dark_spread * normal(rng, VIEWS, *SIZE)) / WHITE
     return gain - gain.mean((1, 2), keepdim=True), dark
 
 
 def test_known_patterns_are_found_from_noisy_images_of_a_changing_scene() -> None:
-    """The error of the gain is hardly more than the prior leaves: sqrt(1 / (1/σ_l² + r²/(σ_d² + σ_n²))) in constant light r."""
+    """The error of the gain is hardly more than the prior leaves in light r: (1/σ_l² + r²/(σ_d² + σ_n²))^(-1/2)."""
     noise, memory = 0.02, 200
     s = replace(
         SETTINGS, model_error=noise / 128**0.5, memory=memory, every=20
