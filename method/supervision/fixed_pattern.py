@@ -15,17 +15,21 @@ For each pixel, r and i are the means of R and I over the steps that saw it, old
     m: the typical dark level, a constant;  e: the pixel's own    e ~ N(0, σ_d²)
     noise: what the model still gets wrong there             N(0, σ_n²)
 
+σ_n² is σ_0², and by how much the mean of u² (below) over a square around the pixel exceeds what patterns explain:
+patterns are the same everywhere, but edges, and what moves before the fit has followed it, are not. Two rounds.
+
 With v = σ_l² r² + σ_d² + σ_n² the most probable maps are
 
     a = (Bᵀ W B + 1/S)⁻¹ Bᵀ w (i - r - m),   W = r²/v,  w = r/v    of each camera,
     l = σ_l² r u / v,   e = σ_d² u / v,   u = i - r - m - r s      of each pixel.
 
-(The weighted ridge regression of all unknowns at once, with l and e eliminated.) The mean of γ over a camera is 0: the
-overall gain is the scene's. Least squares of i on r over time could tell gain from dark where light changes, but
-moving edges that are rendered a little late would lower all such gains; means over time do not see that.
+(The weighted ridge regression of all unknowns at once, with l and e eliminated.) The mean of γ over a camera is 0, as
+the overall gain is the scene's; and so is the mean of a over the cameras. For a pattern that all cameras have in
+common, at the pixels that see one point, is a texture of the scene as well; only parallax and motion could tell. Left
+free it drifts, and the scene with it.
 
-A pattern that all cameras have in common, at the pixels that see one point, is a texture of the scene as well; only
-parallax and motion tell. So the maps hold what cameras differ by, and of what is common little.
+Least squares of i on r over time could tell gain from dark where light changes, but moving edges that are rendered a
+little late would lower all such gains; means over time do not see that.
 """
 
 from __future__ import annotations
@@ -60,9 +64,10 @@ class FixedPatternSettings(PixelSettings):
     dark_spread: float = dark * math.sqrt(math.expm1(SENSOR.dark_log_spread**2))
     model_error: float = 0.002  # σ_0, in white
     noise_px: int = 7  # side of the square in which σ_n is measured
-    memory: int = 40  # steps that see a pixel, over which the weight of one falls to 1/e
+    memory: int = 20  # steps that see a pixel, over which the weight of one falls to 1/e
     every: int = 10  # steps between two solutions
-    first: int = 100  # step of the first solution: before, what is left over is the scene's
+    first: int = 20  # step of the first solution: soon, before Gaussians take up the pattern
+    ssim_weight: float = 0.05  # SSIM is all contrast: with 0.2 Gaussians take up the pattern of flat surfaces
 
 
 class FixedPattern(Supervision):
