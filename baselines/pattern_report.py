@@ -114,10 +114,12 @@ def _plot(scene: TrainingScene, gain: Float64, path: Path) -> None:
     """Write an image of all gain maps, those of the calibration below where there is one."""
     from matplotlib.figure import Figure
 
-    known = [c.gain for c in scene.calibrations or ()]
-    figure = Figure(figsize=(2.2 * len(gain), 3.6 if known else 2), layout="constrained")
-    grid = figure.subplots(2 if known else 1, len(gain), squeeze=False)
-    for row, title, maps in zip(grid, ("from the clip", "from flat fields"), (gain, known), strict=False):
+    rows = {"from the clip": list(gain)}
+    if scene.calibrations:
+        rows["from flat fields"] = [c.gain.astype(np.float64) for c in scene.calibrations]
+    figure = Figure(figsize=(2.2 * len(gain), 0.4 + 1.6 * len(rows)), layout="constrained")
+    grid = figure.subplots(len(rows), len(gain), squeeze=False)
+    for row, (title, maps) in zip(grid, rows.items(), strict=True):
         for axes, camera, image in zip(row, scene.cameras, maps, strict=True):
             axes.imshow(image, vmin=0.85, vmax=1.15, cmap="viridis")
             axes.set(title=f"{camera.id} {title}", xticks=[], yticks=[])

@@ -1,8 +1,7 @@
-"""The table of commands.
+"""The table of commands, the one place where rooms meet.
 
-It is the one place where rooms meet. Import strings name the commands, and the functions of other rooms that a command
-calls; both are loaded only when they run, so `--help` imports nothing heavy and no room imports another for the command
-line's sake.
+Import strings name the commands, and the functions of other rooms that a command calls; both are loaded only when they
+run, so `--help` imports nothing heavy and no room imports another for the command line's sake.
 """
 
 from __future__ import annotations
@@ -12,16 +11,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand, of one word or two: its function, a summary, and a command line that people can copy.
-
-    A command that calls functions of other rooms `needs` them: its target is then called with them and returns the
-    command's function.
-    """
+    """A subcommand, of one word or two: its function, a summary, and a command line that people can copy."""
 
     target: str  # module:function
     summary: str
     example: str
-    needs: tuple[str, ...] = ()  # module:function, in the order of the target's arguments
+    needs: tuple[str, ...] = ()  # module:function of other rooms; called with them, the target returns the function
 
 
 COMMANDS: dict[str, Command] = {
@@ -230,9 +225,7 @@ COMMANDS: dict[str, Command] = {
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
     "patterns": Command(
-        "spike4dgs.baselines.pattern_report:patterns",
-        "estimate the cameras' fixed patterns from the clip alone and measure their errors",
-        "patterns data/car-0-small",
+        "spike4dgs.baselines.pattern_report:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
     ),
     "export-nerfstudio": Command(
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",

@@ -118,7 +118,7 @@ def solve(sums: Tensor, s: FixedPatternSettings, white: float) -> tuple[Tensor, 
     r, i = (torch.where(seen, total / count.clamp(min=1e-6), 0.0) for total in (light, measured))
     own_gain, own_dark = s.pixel_gain**2 * r * r, (s.dark_spread / white) ** 2
     left, noise = torch.where(seen, i - r - s.dark / white, 0.0), torch.full_like(r, s.model_error**2)
-    basis, spread = shading_basis(*r.shape[1:], s, r.device)
+    basis, spread = shading_basis(r.shape[1], r.shape[2], s, r.device)
     for _ in range(_ROUNDS):
         variance = own_gain + own_dark + noise
         shading = _shading(r, left, variance, basis, spread)
