@@ -26,6 +26,7 @@ _IMAGES = {
 }
 _SUPERVISION = {
     "pixel": "",
+    "fixed-pattern": "the cameras' fixed patterns estimated from the clip",
     "spike": "SpikeNeRF's loss",
     "spike-render": "SpikeGS's loss",
     "pixel+spike": "pixel loss and SpikeNeRF's",

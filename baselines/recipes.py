@@ -152,6 +152,13 @@ BEYOND = (
         },
     ),
 )
+# The same without the calibrations: it estimates the cameras' fixed patterns from the clip, beside the scene.
+SELF_CALIBRATED = replace(
+    BEYOND[-1],
+    name="spike4dgs-x+self-calibrated",
+    supervision="fixed-pattern",
+    settings={**BEYOND[-1].settings, "images.flat_field": False},
+)
 
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
 SUPERVISED = tuple(
@@ -204,7 +211,7 @@ def _with_given(method: RecipeMethod) -> RecipeMethod:
 METHODS: dict[str, Method] = {
     **{
         recipe.name: _with_given(RecipeMethod(recipe, PARTS, description=describe(recipe)))
-        for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED)
+        for recipe in (*RECIPES, *SPIKE4DGS, *BEYOND, SELF_CALIBRATED, *SUPERVISED)
     },
     **{recipe.name: _with_given(PosedRecipe(recipe, PARTS, description=describe(recipe))) for recipe in POSED},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),

@@ -204,7 +204,7 @@ def fit_gaussians(
     cameras = with_lenses(job.scene, trainer.poses.cameras(start.cameras))
     duration_us, device = job.scene.duration_us, request.device
     found = (trainer.pieces(), trainer.background, motion, duration_us, device, spec)
-    return FittedModel(*found, cameras, settings.pixel_filter)
+    return FittedModel(*found, cameras, settings.pixel_filter, trainer.supervision.estimates())
 
 
 def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -78,6 +78,7 @@ class FittedModel:
     spec: MotionSpec
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
+    estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
 
     @property
     def size_bytes(self) -> int:

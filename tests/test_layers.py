@@ -29,7 +29,8 @@ ORDER = {
     "initialization images pose_refinement trainer_settings fitted_model schedule trainer fit tracking "
     "radiance_field saved_model viewing twins hard_cases",
     "baselines": "spike_to_image nearest_view initialization self_calibration held_out_pose descriptions recipes "
-    "oracle pose_report inspect export_nerfstudio export_colmap fit_command fault_table speed twins hard_cases",
+    "oracle pose_report pattern_report inspect export_nerfstudio export_colmap fit_command fault_table speed twins "
+    "hard_cases",
     "leaderboard": "tracks ledger entry truth_check flags rank verify refit submit_command verify_command page season",
 }
 MOST_MODULES = 13  # in a folder; `__init__` does not count

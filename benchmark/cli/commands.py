@@ -215,6 +215,9 @@ COMMANDS: dict[str, Command] = {
         "estimate the training cameras' poses and measure their errors",
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
+    "patterns": Command(
+        "spike4dgs.baselines.pattern_report:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
+    ),
     "export-nerfstudio": Command(
         "spike4dgs.baselines.export_nerfstudio:export_nerfstudio",
         "write a scene as nerfstudio's D-NeRF data: images, poses, times",

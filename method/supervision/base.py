@@ -42,6 +42,10 @@ class Supervision(nn.Module):
         """Return the parameters that are trained beside the Gaussians, and their learning rates, by group."""
         return {}
 
+    def estimates(self) -> dict[str, Tensor]:
+        """Return what the loss found out beside the scene, by name, for reports."""
+        return {}
+
 
 def difference(rendered: Tensor, image: Tensor, w: float) -> Tensor:
     """Return (1 - w) mean |rendered - image| + w (1 - SSIM) of batches [V, H, W].

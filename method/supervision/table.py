@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
+from spike4dgs.method.supervision.fixed_pattern import FixedPattern
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.supervision.spike import SpikeRate, SpikeSettings
 from spike4dgs.method.supervision.spike_render import SpikeRender
@@ -63,6 +64,7 @@ class Synergy(Sum):
 
 SUPERVISIONS: dict[str, type[Supervision]] = {
     "pixel": Pixel,
+    "fixed-pattern": FixedPattern,
     "spike": SpikeRate,
     "spike-render": SpikeRender,
     "pixel+spike": PixelAndSpike,

@@ -97,6 +97,7 @@ CASES = [
 ]  # fmt: skip
 FITS = [
     ("intervals", "paths", "pixel", {"freeze_background": True}, {}),
+    ("intervals", "paths", "fixed-pattern", {"freeze_background": True}, {"first": 1, "every": 1}),
     ("tfp", "hexplane", "spss", {}, {}),
     ("tfi", "spacetime", "pixel+spike", {}, {}),
     ("tfp", "static", "spike", {}, {"spike_ticks": 1}),

@@ -48,7 +48,12 @@ def test_deformation_beats_a_static_scene_where_things_move():
 
 
 def trainer(
-    steps: int = 12, motion: str = "hexplane", supervision: str = "pixel", spans: Any = None, **settings: Any
+    steps: int = 12,
+    motion: str = "hexplane",
+    supervision: str = "pixel",
+    loss: dict[str, Any] | None = None,
+    spans: Any = None,
+    **settings: Any,
 ) -> Trainer:
     scene = WORLD.training
     s = TrainerSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, views_per_step=3, **settings)
@@ -60,9 +65,10 @@ def trainer(
     training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
     if spans is not None:
         training_images = replace(training_images, spans=spans(training_images))
-    loss = SUPERVISIONS[supervision](SUPERVISIONS[supervision].defaults, scene)
+    kind = SUPERVISIONS[supervision]
+    compare = kind(replace(kind.defaults, **(loss or {})), scene)
     gaussians, density = model.attach(first, training_images), DensitySettings(every=2)
-    return Trainer(training_images, gaussians, model, loss, s, density, scale=extent.scale, seed=3)
+    return Trainer(training_images, gaussians, model, compare, s, density, scale=extent.scale, seed=3)
 
 
 @pytest.mark.parametrize("motion", ["paths", "hexplane"])
@@ -168,6 +174,7 @@ PARTS_WITH_STATE = {
     "hexplane": {},
     "spacetime": {"motion": "spacetime"},  # parameters of each Gaussian, and guided sampling at steps 4 and 6
     "spike-render": {"supervision": "spike-render"},  # a loss with parameters
+    "fixed-pattern": {"supervision": "fixed-pattern", "loss": {"first": 2, "every": 2}},  # a loss with a memory
     "paths": {"motion": "paths", "freeze_background": True, "steps": 24},  # a background from step 8 on
     "average": {"motion": "hexplane", "average": 0.3},  # from steps 3 and 10 on, networks too
     "spans": {"motion": "paths", "freeze_background": True, "steps": 24, "spans": wide_spans},  # corrected from 13 on
@@ -185,7 +192,7 @@ def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
     ("parts", "step"),
     [
         *(("hexplane", s) for s in range(1, 12)),
-        *((p, s) for p in ("spacetime", "spike-render") for s in (3, 6, 9)),
+        *((p, s) for p in ("spacetime", "spike-render", "fixed-pattern") for s in (3, 6, 9)),
         *(("paths", s) for s in (7, 8, 9, 15)),
         *(("average", s) for s in (2, 3, 4, 5, 10, 11)),
         *(("spans", s) for s in (8, 12, 13, 14, 16, 17, 20)),
@@ -252,7 +259,7 @@ def test_checkpoint_of_another_fit_or_damaged_is_refused(tmp_path):
         ({"images": "none"}, "expected images among short, found 'none'"),
         ({"initialization": "colmap"}, "initialization among true"),
         ({"motion": "wobble"}, "motion among hexplane, paths, spacetime, spacetime-lite, static"),
-        ({"supervision": "spikes"}, r"supervision among pixel, pixel\+spike, spike"),
+        ({"supervision": "spikes"}, r"supervision among fixed-pattern, pixel, pixel\+spike, spike"),
     ],
 )
 def test_unknown_part_is_named(change, message):
