@@ -1,9 +1,9 @@
 """`run-benchmark`: run methods on scenes, then write the table, the sheets and the leaderboard's entries.
 
 Besides what `run` keeps, OUT has results.csv, sheet_SCENE.{png,pdf,mp4}, scatter.{png,pdf}, leaderboard/ and, for a
-table of the paper, table.*. Records that earlier runs left in OUT on the same scenes are in all of these. Images and tables of the paper
-show the first seed; results.csv and the leaderboard have all of them.
-A run on another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
+table of the paper, table.*. Records that earlier runs left in OUT on the same scenes are in all of these. Images and
+tables of the paper show the first seed; results.csv and the leaderboard have all of them. A run on another split than
+the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 
 With `--oracle` it climbs a ladder of oracles instead (`oracle.ladder`), whose records go into no leaderboard.
 

@@ -216,7 +216,7 @@ def _seed_cases() -> list[Case]:
         ),
         Case(
             id="method/fit/other-seeds",
-            asked=f"PSNR of an unseen camera, {_SEEDS} seeds, 200 steps (paths, pixel)",
+            asked=f"PSNR of an unseen camera, {_SEEDS} seeds, 300 steps (paths, pixel)",
             twin="the other seeds: the spread of the result",
             unit="dB",
             tolerance=3.0,  # after so few steps; whole fits of the tests stay within 0.3 dB
