@@ -92,7 +92,8 @@ def parity(
 
 
 def _relative(found: Tensor, expected: Tensor) -> float:
-    return float(((found - expected).norm() - _FLOOR).clamp(min=0) / (expected.norm() + 1e-300))
+    off, size = (found - expected).double().norm(), expected.double().norm()  # 1e-300 is 0 in float32
+    return float((off - _FLOOR).clamp(min=0) / (size + 1e-300))
 
 
 @lru_cache(maxsize=4)  # a scene's two rows follow each other

@@ -392,7 +392,9 @@ def test_the_sensor_filters_scenes_and_hides_all_rows_where_no_scene_has_it(page
 
 def as_html(markdown: str) -> str:
     """A page of documentation with its links, as far as a browser needs it."""
-    linked = re.sub(r"\[([^\]]+)\]\(([^)]+?)\)", r'<a href="\2">\1</a>', markdown)
+    linked = re.sub(
+        r"\[([^\]]+)\]\(([^)]+?)\)", lambda m: f'<a href="{m[2]}">{" ".join(m[1].split())}</a>', markdown
+    )  # a text may go on in the next line
     pages = re.sub(r'(href="(?!http)[^"#]*)\.md', r"\1.html", linked)
     return f"<meta charset=utf-8><body>{pages}"
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from splat_scenes import random_splats, views
 
 from spike4dgs.benchmark.reports.speed_error.measurement import Request
+from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
 from spike4dgs.method.splat import render
 from spike4dgs.method.twins.inputs import hard_scenes
 from spike4dgs.method.twins.splat import BACKGROUND, GRADIENTS, PRECISION, exact_image
