@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Any
 
-from spike4dgs.benchmark.reports.speed_error.measurement import (
-    MEDIAN_MS,
-    MS,
-    Column,
-    Measurement,
-    Point,
-    Request,
-    Series,
-)
-from spike4dgs.benchmark.speed.timing import by_turns_ms
+from spike4dgs.benchmark.reports.speed_error.measurement import Column, Request, Series
+from spike4dgs.benchmark.speed.growth import growth, thread_counts, timed
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.reports.speed import pattern
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
-GROUP = "How costs grow"
 SPACING = 10  # ticks between keys
 
 
@@ -41,12 +31,8 @@ def _run(width: int, height: int, ticks: int, moving: float, threads: int | None
     return run
 
 
-def _timed(calls: dict[float, Any], name: str, column: str, request: Request) -> Series:
-    times = by_turns_ms(list(calls.values()), request.pick(1, 3, 5))
-    points = (
-        Point("", {column: x, "ms": best, "median_ms": median}) for x, (best, median) in zip(calls, times, strict=True)
-    )
-    return Series(name, tuple(points))
+def _turns(request: Request) -> int:
+    return int(request.pick(1, 3, 5))
 
 
 def _pixels(request: Request) -> Iterator[Series]:
@@ -58,7 +44,7 @@ def _pixels(request: Request) -> Iterator[Series]:
     ticks = request.pick(40, 200, 1000)
     for moving in (1.0, 0.1):
         calls = {float(w * h): _run(w, h, ticks, moving) for w, h in sizes}
-        yield _timed(calls, f"{ticks} ticks, {moving:.0%} of the pixels move", "pixels", request)
+        yield timed(calls, f"{ticks} ticks, {moving:.0%} of the pixels move", "pixels", _turns(request))
 
 
 def _clips(request: Request) -> Iterator[Series]:
@@ -66,28 +52,20 @@ def _clips(request: Request) -> Iterator[Series]:
     width, height = request.pick((24, 16), (200, 125), (400, 250))
     for moving in (1.0, 0.1):
         calls = {float(ms): _run(width, height, ms * RATE_HZ // 1000, moving) for ms in lengths}
-        yield _timed(calls, f"{width}x{height}, {moving:.0%} of the pixels move", "clip", request)
+        yield timed(calls, f"{width}x{height}, {moving:.0%} of the pixels move", "clip", _turns(request))
 
 
 def _threads(request: Request) -> Iterator[Series]:
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= len(os.sched_getaffinity(0))]
     width, height, ticks = request.pick((24, 16, 40), (400, 250, 400), (400, 250, 2000))
-    calls = {float(n): _run(width, height, ticks, 1.0, n) for n in counts}
-    yield _timed(calls, f"{ticks} ticks of {width}x{height}", "threads", request)
-
-
-def _growth(
-    id: str, title: str, words: str, column: Column, run: Any, seconds: tuple[float, float, float]
-) -> Measurement:
-    by_size = dict(zip(("tiny", "quick", "whole"), seconds, strict=True))
-    return Measurement(id, GROUP, title, words, "", "", (column, MS, MEDIAN_MS), column.id, ("ms",), run, by_size)
+    calls = {float(n): _run(width, height, ticks, 1.0, n) for n in thread_counts()}
+    yield timed(calls, f"{ticks} ticks of {width}x{height}", "threads", _turns(request))
 
 
 SCALE = (
-    _growth("scale-sensor-pixels", "Sensor: pixels", "One camera, with maps and shot noise; a key every 10 ticks.",
-            Column("pixels", "pixels"), _pixels, (1, 15, 60)),
-    _growth("scale-sensor-clip", "Sensor: length of the clip", "10 to 1000 ms; memory does not grow with the clip.",
-            Column("clip", "clip, ms"), _clips, (1, 10, 90)),
-    _growth("scale-sensor-threads", "Sensor: threads", "1 to 16, as many as the machine has cores.",
-            Column("threads", "threads"), _threads, (1, 5, 30)),
+    growth("scale-sensor-pixels", "Sensor: pixels", "One camera, with maps and shot noise; a key every 10 ticks.",
+           Column("pixels", "pixels"), _pixels, (1, 15, 60)),
+    growth("scale-sensor-clip", "Sensor: length of the clip", "10 to 1000 ms; memory does not grow with the clip.",
+           Column("clip", "clip, ms"), _clips, (1, 10, 90)),
+    growth("scale-sensor-threads", "Sensor: threads", "1 to 16, as many as the machine has cores.",
+           Column("threads", "threads"), _threads, (1, 5, 30)),
 )  # fmt: skip

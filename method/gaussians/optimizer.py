@@ -112,19 +112,13 @@ def _parameters(adam: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:
 
 def export_state(adam: torch.optim.Adam) -> dict[str, Tensor]:
     """Return moments and step counts as `GROUP.INDEX.KEY` -> tensor."""
-    return {
-        f"{group['name']}.{i}.{key}": value
-        for group in adam.param_groups
-        for i, p in enumerate(group["params"])
-        for key, value in adam.state.get(p, {}).items()
-    }
+    return {f"{name}.{key}": value for name, p in _parameters(adam) for key, value in adam.state.get(p, {}).items()}
 
 
 def import_state(adam: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
     """Restore what `export_state` gave, for the same groups and shapes."""
-    for group in adam.param_groups:
-        for i, p in enumerate(group["params"]):
-            prefix = f"{group['name']}.{i}."
-            state = {k.removeprefix(prefix): v.to(p.device) for k, v in tensors.items() if k.startswith(prefix)}
-            if state:
-                adam.state[p] = state
+    for name, p in _parameters(adam):
+        prefix = f"{name}."
+        state = {k.removeprefix(prefix): v.to(p.device) for k, v in tensors.items() if k.startswith(prefix)}
+        if state:
+            adam.state[p] = state

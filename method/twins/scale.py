@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 import torch
 
-from spike4dgs.benchmark.reports.speed_error.measurement import (
-    MEDIAN_MS,
-    MS,
-    Column,
-    Measurement,
-    Point,
-    Request,
-    Series,
-)
-from spike4dgs.benchmark.speed.timing import by_turns_ms
+from spike4dgs.benchmark.reports.speed_error.measurement import Column, Request, Series
+from spike4dgs.benchmark.speed.growth import growth, thread_counts, timed
 from spike4dgs.method.speed import differentiate, random_scene
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.kernels.threads import get_threads, set_threads
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.torch_state import one_torch_thread
 
-GROUP = "How costs grow"
 SIZES = ((200, 125), (283, 177), (400, 250), (566, 354), (800, 500), (1000, 1000))  # width, height
 Call = Callable[[], Any]
 
@@ -42,14 +32,8 @@ def _step(splats: Splats, views: Views) -> Any:
 
 
 def _timed(calls: dict[float, Call], name: str, column: str, request: Request) -> Series:
-    """Return the series of calls by their size."""
     with one_torch_thread():
-        times = by_turns_ms(list(calls.values()), request.pick(1, 5, 9))
-    points = [
-        Point("", {column: size, "ms": best, "median_ms": median})
-        for size, (best, median) in zip(calls, times, strict=True)
-    ]
-    return Series(name, tuple(points))
+        return timed(calls, name, column, request.pick(1, 5, 9))
 
 
 def _pixels(request: Request) -> Iterator[Series]:
@@ -96,34 +80,26 @@ def _threads(request: Request) -> Iterator[Series]:
     splats, views = random_scene(
         request.pick(50, 50_000, 50_000), request.seed, *request.pick((24, 16), (400, 250), (800, 500))
     )
-    before, cores = get_threads(), len(os.sched_getaffinity(0))
+    before = get_threads()
 
     def with_threads(count: int, call: Callable[..., Any]) -> Any:
         set_threads(count)
         return call(splats, views)
 
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= cores]
     try:
         for name, call in (("render", _image), ("render and differentiate", _step)):
-            yield _timed({float(n): partial(with_threads, n, call) for n in counts}, name, "threads", request)
+            yield _timed({float(n): partial(with_threads, n, call) for n in thread_counts()}, name, "threads", request)
     finally:
         set_threads(before)
 
 
-def _growth(
-    id: str, title: str, words: str, column: Column, run: Any, seconds: tuple[float, float, float]
-) -> Measurement:
-    by_size = dict(zip(("tiny", "quick", "whole"), seconds, strict=True))
-    return Measurement(id, GROUP, title, words, "", "", (column, MS, MEDIAN_MS), column.id, ("ms",), run, by_size)
-
-
 SCALE = (
-    _growth("scale-pixels", "Pixels", "125x200 to 1000x1000; the Gaussians grow with the image.",
-            Column("pixels", "pixels"), _pixels, (2, 25, 60)),
-    _growth("scale-gaussians", "Gaussians", "More Gaussians are smaller, so that they cover the same image.",
-            Column("count", "Gaussians"), _gaussians, (1, 40, 90)),
-    _growth("scale-views", "Views", "Views are rendered one after the other, each on all threads.",
-            Column("views", "views", log=False), _views, (1, 20, 60)),
-    _growth("scale-threads", "Threads", "1 to 16, as many as the machine has cores.",
-            Column("threads", "threads"), _threads, (1, 15, 60)),
+    growth("scale-pixels", "Pixels", "125x200 to 1000x1000; the Gaussians grow with the image.",
+           Column("pixels", "pixels"), _pixels, (2, 25, 60)),
+    growth("scale-gaussians", "Gaussians", "More Gaussians are smaller, so that they cover the same image.",
+           Column("count", "Gaussians"), _gaussians, (1, 40, 90)),
+    growth("scale-views", "Views", "All views are rendered in one call, whose threads share them out.",
+           Column("views", "views", log=False), _views, (1, 20, 60)),
+    growth("scale-threads", "Threads", "1 to 16, as many as the machine has cores.",
+           Column("threads", "threads"), _threads, (1, 15, 60)),
 )  # fmt: skip
