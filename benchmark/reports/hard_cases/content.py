@@ -13,6 +13,7 @@ from spike4dgs.benchmark.reports.html.page import (
     facts,
     folded,
     paragraph,
+    run_facts,
     section,
     table,
     wide,
@@ -68,7 +69,11 @@ def write_content(path: Path, report: dict[str, Any]) -> None:
     ]
     titles = ["Summary", *(_KINDS[k][0] for k, rows in kinds.items() if rows), *parts, "Program"]
     verdict = paragraph(counted(cases), "bad" if failed else "good")
-    write_page(path, "Hard cases", [paragraph(_INTRO), verdict, _run(report), contents(titles), *sections])
+    write_page(
+        path,
+        "Hard cases",
+        [paragraph(_INTRO), verdict, run_facts(report, ("seed", "device"), "run"), contents(titles), *sections],
+    )
 
 
 def part_of(case: dict[str, Any]) -> str:
@@ -81,19 +86,6 @@ def counted(cases: Rows) -> str:
     count = {verdict: sum(c["passed"] is verdict for c in cases) for verdict in (True, False, None)}
     text = f"{count[True]} of {len(cases)} cases passed, {count[False]} failed"
     return text + (f", {count[None]} not run" if count[None] else "")
-
-
-def _run(report: dict[str, Any]) -> Html:
-    machine, harness = report["environment"], report["harness"]
-    commit = harness["commit"] or "unknown (an installed package)"
-    return facts(
-        [
-            ("machine", machine["gpu"] or machine["cpu"]),
-            ("commit", f"{commit}{', with changes' if harness['dirty'] else ''}"),
-            ("seed, device", f"{report['seed']}, {report['device']}"),
-            ("run", f"{report['started']} to {report['finished']}"),
-        ]
-    )
 
 
 def _summary(parts: dict[str, Rows], kinds: dict[str, Rows]) -> Html:

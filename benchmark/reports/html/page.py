@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.reports.html.style import STYLE
@@ -70,6 +71,20 @@ def facts(rows: Iterable[tuple[str, str]]) -> Html:
     """Return a table of names and texts."""
     lines = "".join(f'<tr><th scope="row">{text(name)}</th><td>{text(value)}</td></tr>' for name, value in rows)
     return Html(f'<div class="scroll"><table class="facts"><tbody>{lines}</tbody></table></div>')
+
+
+def run_facts(report: Mapping[str, Any], options: Sequence[str], when: str) -> Html:
+    """Return the table of where, by what, with which `options` of a report's JSON and `when` it was measured."""
+    machine, harness = report["environment"], report["harness"]
+    commit = harness["commit"] or "unknown (an installed package)"
+    return facts(
+        [
+            ("machine", machine["gpu"] or machine["cpu"]),
+            ("commit", f"{commit}{', with changes' if harness['dirty'] else ''}"),
+            (", ".join(options), ", ".join(str(report[name]) for name in options)),
+            (when, f"{report['started']} to {report['finished']}"),
+        ]
+    )
 
 
 def table(

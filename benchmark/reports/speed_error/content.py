@@ -16,6 +16,7 @@ from spike4dgs.benchmark.reports.html.page import (
     grid,
     link,
     paragraph,
+    run_facts,
     section,
     table,
     write_page,
@@ -37,26 +38,13 @@ def write_content(path: Path, report: dict[str, Any]) -> None:
     sections = [section(g, [_measurement(r) for r in results if r["group"] == g]) for g in groups]
     parts = [
         paragraph(intro),
-        _run(report),
+        run_facts(report, ("size", "seed", "device"), "measured"),
         contents(["Summary", *groups]),
         section("Summary", [_summary(results), *_failures(results)]),
         *sections,
         section("Program", [_program(report)]),
     ]
     write_page(path, "Speed against error", parts)
-
-
-def _run(report: dict[str, Any]) -> Html:
-    machine, harness = report["environment"], report["harness"]
-    commit = harness["commit"] or "unknown (an installed package)"
-    return facts(
-        [
-            ("machine", machine["gpu"] or machine["cpu"]),
-            ("commit", f"{commit}{', with changes' if harness['dirty'] else ''}"),
-            ("size, seed, device", f"{report['size']}, {report['seed']}, {report['device']}"),
-            ("measured", f"{report['started']} to {report['finished']}"),
-        ]
-    )
 
 
 def _program(report: dict[str, Any]) -> Html:
