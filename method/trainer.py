@@ -167,9 +167,10 @@ class Trainer:
         loss = self.supervision(render_at, sample)
         (loss + self.motion.regularizer() if stage.deforms else loss).backward()
         self.adam.step()
-        for out in outputs:
-            self.statistics.add(out)
         self.step += 1
+        if self.density.ahead(self.step - stage.first, stage.steps):
+            for out in outputs:
+                self.statistics.add(out)
         self._adapt_density(stage)
         self._average(stage)
         return loss.detach()

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -36,15 +37,25 @@ def kernel(function: F) -> F:
 
 
 def in_threads(function: Callable[..., None], n: int, *args: object, small: bool = False) -> None:
-    """Call `function(*args, start, stop)` on ranges that cover [0, n), one range per core; on one if `small`."""
+    """Call `function(*args, start, stop)` on ranges that cover [0, n), one range per core; on one if `small`.
+
+    `function` must not call this again: all calls share one pool, whose threads would wait for one another.
+    """
     parts = 1 if small else max(1, min(n, len(os.sched_getaffinity(0))))
     edges = [n * i // parts for i in range(parts + 1)]
-    if parts == 1:
-        function(*args, 0, n)
-        return
-    with ThreadPoolExecutor(parts) as pool:
-        for job in [pool.submit(function, *args, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]:
-            job.result()
+    jobs = [_pool().submit(function, *args, a, b) for a, b in zip(edges[1:-1], edges[2:], strict=True)]
+    try:
+        function(*args, 0, edges[1])
+    finally:  # no thread writes into the arguments once this has returned
+        wait(jobs)
+    for job in jobs:
+        job.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Return the threads beside the calling one: images of a clip are hundreds of calls, and a pool costs as much."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="bits")
 
 
 def rows(packed: UInt8) -> UInt8:

@@ -28,7 +28,11 @@ class DensitySettings(Settings):
 
     def due(self, done: int, steps: int) -> bool:
         """Return whether the density changes after `done` of a stage's `steps`."""
-        return done % self.every == 0 and done <= self.until * steps
+        return done % self.every == 0 and self.ahead(done, steps)
+
+    def ahead(self, done: int, steps: int) -> bool:
+        """Return whether the density changes after `done` of a stage's `steps` or later in it."""
+        return done <= self.until * steps
 
     def limit(self, width: int, height: int, background: bool) -> int:
         """Return the most Gaussians for views of a size, with a background behind them or not."""

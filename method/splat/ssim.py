@@ -1,4 +1,4 @@
-"""Fused SSIM for training: value and gradient in one pass of numba kernels, with its plain torch twin.
+"""Fused SSIM and L1 for training: value and gradient in one pass of numba kernels, with their plain torch twins.
 
 SSIM (Wang et al. 2004) with the metric's Gaussian window (`ssim_window`), zero padding, data range 1, averaged over
 all pixels and images. The window is separable; the gradient needs three more blurs:
@@ -43,15 +43,28 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     CPU tensors go through the kernels in float32, others through torch: the same formula with the window as a matrix.
     Raises UserError for other shapes, or for a target that wants a gradient, which the kernels do not give.
     """
-    if image.ndim != 3 or image.shape != target.shape or image.numel() == 0:
-        found = f"{tuple(image.shape)} and {tuple(target.shape)}"
-        raise problem("ssim", "two batches [B, H, W] of one shape", found, "add the batch dimension")
-    if target.requires_grad:
-        raise problem("ssim", "a target without gradient", "requires_grad", "pass the rendered image first")
+    _check("ssim", image, target)
     if image.device.type != "cpu":
         return _mean_ssim(image, target, _banded)
-    value: Tensor = _FusedSsim.apply(image, target)  # type: ignore[no-untyped-call]
+    value: Tensor = _Fused.apply(image, target, 1.0, 0.0)  # type: ignore[no-untyped-call]
     return value
+
+
+def l1_and_ssim(image: Tensor, target: Tensor, w: float) -> Tensor:
+    """Return (1 - w) mean |image - target| + w (1 - SSIM), the loss of 3DGS; images and errors as `ssim`."""
+    _check("l1_and_ssim", image, target)
+    if image.device.type != "cpu":
+        return (1 - w) * (image - target).abs().mean() + w * (1 - _mean_ssim(image, target, _banded))
+    value: Tensor = _Fused.apply(image, target, -w, 1 - w)  # type: ignore[no-untyped-call]
+    return w + value
+
+
+def _check(name: str, image: Tensor, target: Tensor) -> None:
+    if image.ndim != 3 or image.shape != target.shape or image.numel() == 0:
+        found = f"{tuple(image.shape)} and {tuple(target.shape)}"
+        raise problem(name, "two batches [B, H, W] of one shape", found, "add the batch dimension")
+    if target.requires_grad:
+        raise problem(name, "a target without gradient", "requires_grad", "pass the rendered image first")
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
@@ -92,17 +105,20 @@ def _mean_ssim(image: Tensor, target: Tensor, blur: Callable[[Tensor], Tensor]) 
     return (numerator / ((m1 * m1 + m2 * m2 + C1) * (q1 - m1 * m1 + q2 - m2 * m2 + C2))).mean()
 
 
-class _FusedSsim(torch.autograd.Function):
-    """Mean SSIM. The gradient is computed with the value, while the blurred images are at hand."""
+class _Fused(torch.autograd.Function):
+    """`of_ssim` x mean SSIM + `of_l1` x mean |image - target|.
+
+    The gradient is computed with the value, while the blurred images are at hand.
+    """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, of_ssim: float, of_l1: float) -> Tensor:
         batch, height, width = image.shape
         a = np.ascontiguousarray(image.detach().numpy(), dtype=np.float32)
         b = np.ascontiguousarray(target.numpy(), dtype=np.float32)
-        sums = np.empty(batch, np.float64)
+        sums = np.empty((batch, 2), np.float64)
         gradient = np.empty_like(a) if image.requires_grad else np.empty((0, 0, 0), np.float32)
-        announce_compilation(_ssim_kernel, "SSIM")
+        announce_compilation(_kernel, "SSIM")
         workers = min(threads.get_threads(), batch)
         scratch = [
             (
@@ -112,16 +128,18 @@ class _FusedSsim(torch.autograd.Function):
             )
             for _ in range(workers)
         ]
-        threads.run(_ssim_kernel, (a, b, _HALF, sums, gradient), scratch)
+        shares = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size)
+        threads.run(_kernel, (a, b, _HALF, shares, sums, gradient), scratch)
         if image.requires_grad:
             ctx.save_for_backward(torch.from_numpy(gradient))
             ctx.dtype = image.dtype
-        return torch.as_tensor(sums.sum() / a.size, dtype=image.dtype)
+        total = sums.sum(0)
+        return torch.as_tensor((of_ssim * total[0] + of_l1 * total[1]) / a.size, dtype=image.dtype)
 
     @staticmethod
-    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return (gradient * outer[0]).to(ctx.dtype), None
+        return (gradient * outer[0]).to(ctx.dtype), None, None, None
 
 
 @helper
@@ -175,21 +193,28 @@ def _row_sum(row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _ssim_kernel(images, targets, half, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
-    """Sum of SSIM of each image, and the gradient of the mean over all of them where `gradients` is not empty."""
+def _kernel(images, targets, half, shares, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
+    """Sums of SSIM and |image - target| of each image, and their gradient with the weights `shares`, if it is wanted.
+
+    `gradients` is empty where it is not.
+    """
     batch, height, width = images.shape
-    scale = np.float32(1.0 / (batch * height * width))
+    scale, edge = shares
     m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
     while True:
         i = fetch_add(counter, 0, 1)
         if i >= batch:
             return
         a, b = images[i], targets[i]
+        total = 0.0
         for y in range(height):
             for x in range(width):
                 q1[y, x] = a[y, x] * a[y, x]
                 q2[y, x] = b[y, x] * b[y, x]
                 q12[y, x] = a[y, x] * b[y, x]
+                m1[y, x] = abs(a[y, x] - b[y, x])
+            total += _row_sum(m1[y])
+        sums[i, 1] = total
         _blur(a, m1, half, rows, line)
         _blur(b, m2, half, rows, line)
         _blur(q1, q1, half, rows, line)
@@ -209,7 +234,7 @@ def _ssim_kernel(images, targets, half, sums, gradients, counter, rows, line, ma
                 m1[y, x] = _TWO * (v * (B - A) + S * u * (C - D)) * inverse * scale
                 q2[y, x] = S
             total += _row_sum(q2[y])
-        sums[i] = total
+        sums[i, 0] = total
         if gradients.size:
             _blur(m1, m1, half, rows, line)
             _blur(q1, q1, half, rows, line)
@@ -217,4 +242,6 @@ def _ssim_kernel(images, targets, half, sums, gradients, counter, rows, line, ma
             g = gradients[i]
             for y in range(height):
                 for x in range(width):
-                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x]
+                    d = a[y, x] - b[y, x]
+                    slope = edge if d > 0 else (-edge if d < 0 else np.float32(0))
+                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + slope

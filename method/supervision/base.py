@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
-from spike4dgs.method.splat.ssim import ssim
+from spike4dgs.method.splat.ssim import l1_and_ssim
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,5 @@ def difference(rendered: Tensor, image: Tensor, w: float) -> Tensor:
     """
     if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
         rendered = torch.where(finite, rendered, rendered.detach())
-    image = known(image, rendered)
-    absolute = (rendered - image).abs().mean()
-    return (1 - w) * absolute + w * (1 - ssim(rendered, image)) if w else absolute
+        image = known(image, rendered)
+    return l1_and_ssim(rendered, image, w) if w else (rendered - image).abs().mean()

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import set_threads
-from spike4dgs.method.splat.ssim import C1, _banded, _convolved, ssim, ssim_reference
+from spike4dgs.method.splat.ssim import C1, _banded, _convolved, l1_and_ssim, ssim, ssim_reference
 
 
 def images(batch: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -28,6 +28,21 @@ def test_value_and_gradient_equal_the_float64_twin(shape: tuple[int, int, int]) 
     assert abs(value.item() - expected.item()) < 1e-6
     assert fast.grad is not None and slow.grad is not None
     assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm()
+
+
+@pytest.mark.parametrize("w", [0.2, 1.0])
+@pytest.mark.parametrize("shape", [(2, 125, 200), (2, 7, 5), (1, 1, 1)])
+def test_the_loss_equals_its_two_terms(shape: tuple[int, int, int], w: float) -> None:
+    a, b = images(*shape)
+    b[..., 0] = a[..., 0]  # |d| has no gradient at 0
+    fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
+    value = l1_and_ssim(fast, b, w)
+    expected = (1 - w) * (slow - b.double()).abs().mean() + w * (1 - ssim_reference(slow, b.double()))
+    value.backward()
+    expected.backward()
+    assert value.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert fast.grad is not None and slow.grad is not None
+    assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm() + 1e-6
 
 
 @pytest.mark.parametrize("shape", [(1, 125, 200), (2, 7, 5), (1, 1, 1)])
