@@ -110,7 +110,8 @@ SPIKE4DGS = (
 _FLAT: dict[str, Any] = {"images.flat_field": True}
 
 # Customary learning rates are for 30,000 steps. In a thousand, three to seven times as much, falling to a tenth, goes
-# as far as four times the steps do.
+# as far as four times the steps do. Adam's second moment then has to forget as fast: over 20 steps, not over 100. When
+# a Gaussian is there and for how long hardly needs to be learned where paths last as long as the clip.
 _FAST: dict[str, Any] = {
     "trainer.lr_means": 1.2e-3,
     "trainer.lr_means_last": 6e-5,
@@ -119,8 +120,12 @@ _FAST: dict[str, Any] = {
     "trainer.lr_opacities": 0.1,
     "trainer.lr_colors": 0.015,
     "trainer.lr_last": 0.1,
-    "motion.lr_coefficients": 1e-2,
-    "motion.lr_coefficients_last": 5e-4,
+    "trainer.beta1": 0.85,
+    "trainer.beta2": 0.95,
+    "motion.lr_coefficients": 7e-3,
+    "motion.lr_coefficients_last": 2e-4,
+    "motion.lr_times": 1e-4,
+    "motion.lr_temporal_scales": 0.01,
 }
 
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
@@ -146,8 +151,10 @@ BEYOND = (
             "trainer.moving_change": 0.012,
             "trainer.initial_scale": 0.5,
             "trainer.coarse_steps": 600,
+            "trainer.fine_steps": 1300,
             "trainer.views_per_step": 2,
             "trainer.average": 0.2,
+            "density.max_moving_per_pixel": 0.5,
             "density.max_gaussians": 36_000,
         },
     ),
