@@ -40,7 +40,7 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
 
         Args:
             out: Folder for the page, the JSON and the scene.
-            size: whole (about two hours on two cores), quick (ten minutes), or tiny (seconds, to try the command).
+            size: whole (about an hour on two cores), quick (ten minutes), or tiny (seconds, to try the command).
             quick: The same as --size quick.
             only: Measure these alone, by the ids in the page's sections, such as splat ssim.
             scene: A scene folder for the fits and the images; without it, OUT/scenes has a new one of the world car.
