@@ -55,9 +55,14 @@ def command_line() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
+def utc(time: datetime) -> str:
+    """Return a time as ISO 8601 in UTC, such as 2026-01-31T12:00:00Z."""
+    return time.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
 def utc_now() -> str:
-    """Return the time as ISO 8601 in UTC, such as 2026-01-31T12:00:00Z."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    """Return the time now, as `utc` does."""
+    return utc(datetime.now(UTC))
 
 
 def device_type(device: str) -> str:

@@ -7,11 +7,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from spike4dgs.benchmark.environment import choose_device, command_line, environment, harness, utc_now
+from spike4dgs.benchmark.environment import choose_device, command_line, environment, harness
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.reports.speed_error.measurement import Measurement, Request, Size
-from spike4dgs.benchmark.reports.speed_error.runner import in_order, measure_all
+from spike4dgs.benchmark.reports.speed_error.runner import in_order, measure_all, measured_from_to
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 FORMAT = "spike4dgs-speed-error/1"
@@ -64,13 +64,13 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
             make_dataset(("car",), profile=profile, out=out / "scenes", seed=seed)
             return out / "scenes" / f"car-0-{profile}"
 
-        start = utc_now()
         key = {"size": size, "seed": seed, "device": device, "scene": str(scene or ""), "commit": harness()["commit"]}
         for m in measurements if again else ():
             (out / "measurements" / f"{m.id}.json").unlink(missing_ok=True)
         results = measure_all(measurements, Request(size, seed, device, made), out / "measurements", key, _say)
+        started, finished = measured_from_to(results)
         report = {
-            "format": FORMAT, "size": size, "seed": seed, "device": device, "started": start, "finished": utc_now(),
+            "format": FORMAT, "size": size, "seed": seed, "device": device, "started": started, "finished": finished,
             "command": command_line(), "harness": harness(), "environment": environment(device),
             "measurements": results,
         }  # fmt: skip

@@ -7,10 +7,11 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.environment import cpu_name, harness, utc_now
+from spike4dgs.benchmark.environment import cpu_name, harness, utc, utc_now
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.reports.speed_error.measurement import GROUPS, Measurement, Point, Request, Series
@@ -76,6 +77,13 @@ def measure(m: Measurement, request: Request) -> Result:
         "commit": harness()["commit"],
         "problem": found,
     }
+
+
+def measured_from_to(results: Sequence[Result]) -> tuple[str, str]:
+    """Return when the first of the results began and the last ended, those that were kept among them."""
+    ends = [datetime.fromisoformat(r["measured"]) for r in results]
+    begins = [end - timedelta(seconds=r["seconds"]) for end, r in zip(ends, results, strict=True)]
+    return utc(min(begins)), utc(max(ends))
 
 
 def _point(p: Point, m: Measurement) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import pytest
 from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.reports.speed_error.command import make_speed_error
 from spike4dgs.benchmark.reports.speed_error.measurement import GROUPS, MS, Measurement, Point, Request, Series
+from spike4dgs.benchmark.reports.speed_error.runner import measured_from_to
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 
@@ -72,3 +73,11 @@ def test_what_was_measured_is_measured_again_where_that_is_asked(
     for again, kept in ((False, False), (False, True), (True, False)):
         command(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
         assert ("one: kept" in capsys.readouterr().out) == kept
+
+
+def test_the_page_says_when_kept_measurements_were_made() -> None:
+    results = [
+        {"measured": "2026-01-31T12:00:00Z", "seconds": 61.0},
+        {"measured": "2026-01-31T13:00:10Z", "seconds": 5000.0},
+    ]
+    assert measured_from_to(results) == ("2026-01-31T11:36:50Z", "2026-01-31T13:00:10Z")
