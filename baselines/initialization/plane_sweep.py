@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.kernels.threads import get_threads
 
@@ -149,8 +148,9 @@ def sweep(
             warped = cv2.warpPerspective(
                 images[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
             )
-            moments = _box(warped, window), _box(warped * warped, window), _box(reference * warped, window)
-            add_correlation(total, seen, mean, variance, warped, *moments, np.float32(settings.noise))
+            inside = warped >= 0
+            total += np.maximum(_correlation(reference, mean, variance, warped, settings), 0) * inside
+            seen += inside
         total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
     found = _peak(scores, planes)
     whole = DepthMap(np.zeros(images.shape[1:], np.float32), np.full(images.shape[1:], -1, np.float32))
@@ -171,31 +171,12 @@ def _box(image: Float32, window: int) -> Float32:
     return np.asarray(cv2.boxFilter(image, -1, (window, window), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-@kernel
-def add_correlation(
-    total: Float32,
-    seen: Float32,
-    mean_a: Float32,
-    variance_a: Float32,
-    b: Float32,
-    mean_b: Float32,
-    square_b: Float32,
-    product: Float32,
-    noise: np.float32,
-) -> None:
-    """Add to `total` [H, W] the positive part of the windows' correlation, and 1 to `seen`, where b is in its image.
-
-    Means are over windows: of the images a and b, of b^2 and of a b. Outside of its image b is negative.
-    """
-    none, one = np.float32(0), np.float32(1)
-    for y in range(total.shape[0]):
-        for x in range(total.shape[1]):
-            m = mean_b[y, x]
-            spread = (variance_a[y, x] + noise) * ((square_b[y, x] - m * m) + noise)
-            score = (product[y, x] - mean_a[y, x] * m) / np.sqrt(spread)
-            inside = b[y, x] >= none
-            total[y, x] += score if inside and score > none else none
-            seen[y, x] += one if inside else none
+def _correlation(a: Float32, mean_a: Float32, variance_a: Float32, b: Float32, settings: SweepSettings) -> Float32:
+    window, noise = settings.window_px, settings.noise
+    mean_b = _box(b, window)
+    variance_b = _box(b * b, window) - mean_b * mean_b
+    both = _box(a * b, window) - mean_a * mean_b
+    return np.asarray(both / np.sqrt((variance_a + noise) * (variance_b + noise)), np.float32)
 
 
 def _peak(scores: Float32, planes: Float64) -> DepthMap:

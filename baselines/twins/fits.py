@@ -106,13 +106,13 @@ def _budgets(request: Request) -> Iterator[Series]:
 
 
 def _caps(request: Request) -> Iterator[Series]:
-    usual, most = DensitySettings(), X_RECIPE.settings["density.max_gaussians"]
+    usual, own = DensitySettings(), X_RECIPE.settings
     trials = []
     for factor, role in ((1 / 16, ""), (1 / 4, ""), (1.0, "chosen"), (100.0, "exact")):
         limits = {
             "density.max_per_pixel": factor * usual.max_per_pixel,
-            "density.max_moving_per_pixel": factor * usual.max_moving_per_pixel,
-            "density.max_gaussians": most if factor <= 1 else usual.max_gaussians,
+            "density.max_moving_per_pixel": factor * own["density.max_moving_per_pixel"],
+            "density.max_gaussians": own["density.max_gaussians"] if factor <= 1 else usual.max_gaussians,
         }
         name = f"{factor * usual.max_per_pixel:g} a pixel" if factor <= 1 else "no limit"
         trials.append(Trial(name, limits, _steps(request), role=role))

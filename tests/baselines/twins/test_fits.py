@@ -43,7 +43,8 @@ def test_a_clip_is_cut_as_asked_whatever_its_length(pieces: int) -> None:
 def test_the_chosen_settings_are_the_recipes() -> None:
     """The page marks what the recipe has; where the recipe changes, this says so."""
     assert X_RECIPE.settings["density.max_gaussians"] == 36_000
-    assert (DensitySettings.max_per_pixel, DensitySettings.max_moving_per_pixel) == (0.8, 0.4)
+    assert X_RECIPE.settings["density.max_moving_per_pixel"] == 0.5
+    assert "density.max_per_pixel" not in X_RECIPE.settings and DensitySettings.max_per_pixel == 0.8
     assert X_RECIPE.settings["trainer.moving_change"] == 0.012
     hexplane = METHODS["tfp+4dgs"].settings["motion"]  # type: ignore[attr-defined]
     assert (hexplane.mlp_width, hexplane.features) == (32, 16)
