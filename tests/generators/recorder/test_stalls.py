@@ -7,6 +7,7 @@ sink would lose bytes unseen, which the emulated cameras count.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 import time
@@ -160,4 +161,5 @@ def test_a_disk_that_stalls_within_a_write(
     assert main(["record", "--emulate", str(scene.root), "--out", str(tmp_path / "clip"), "--continuous"]) == 0
     check_identical(tmp_path / "clip", scene)
     shown = capsys.readouterr().out
-    assert "of all cameras while the disk stalls" in shown and f"the disk took {stall_s:.1g}" in shown
+    assert "of all cameras while the disk stalls" in shown
+    assert (took := re.search(r"the disk took ([\d.]+)", shown)) and float(took[1]) >= stall_s  # longer under load
