@@ -118,7 +118,7 @@ class _Fused(torch.autograd.Function):
         b = np.ascontiguousarray(target.numpy(), dtype=np.float32)
         sums = np.empty((batch, 2), np.float64)
         gradient = np.empty_like(a) if image.requires_grad else np.empty((0, 0, 0), np.float32)
-        announce_compilation(_kernel, "SSIM")
+        announce_compilation(_loss_kernel, "SSIM")
         workers = min(threads.get_threads(), batch)
         scratch = [
             (
@@ -128,8 +128,8 @@ class _Fused(torch.autograd.Function):
             )
             for _ in range(workers)
         ]
-        shares = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size)
-        threads.run(_kernel, (a, b, _HALF, shares, sums, gradient), scratch)
+        weights = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size)
+        threads.run(_loss_kernel, (a, b, _HALF, weights, sums, gradient), scratch)
         if image.requires_grad:
             ctx.save_for_backward(torch.from_numpy(gradient))
             ctx.dtype = image.dtype
@@ -193,13 +193,15 @@ def _row_sum(row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _kernel(images, targets, half, shares, sums, gradients, counter, rows, line, maps):  # type: ignore[no-untyped-def]
-    """Sums of SSIM and |image - target| of each image, and their gradient with the weights `shares`, if it is wanted.
+def _loss_kernel(  # type: ignore[no-untyped-def]
+    images, targets, half, weights, sums, gradients, counter, rows, line, maps
+):
+    """Sums of SSIM and |image - target| of each image, and their gradient with the `weights`, if it is wanted.
 
     `gradients` is empty where it is not.
     """
     batch, height, width = images.shape
-    scale, edge = shares
+    of_ssim, of_l1 = weights
     m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
     while True:
         i = fetch_add(counter, 0, 1)
@@ -229,9 +231,9 @@ def _kernel(images, targets, half, shares, sums, gradients, counter, rows, line,
                 C, D = uu + vv + _C1, (q1[y, x] - uu) + (q2[y, x] - vv) + _C2
                 inverse = np.float32(1) / (C * D)
                 S = A * B * inverse
-                q1[y, x] = -S * C * inverse * scale
-                q12[y, x] = _TWO * A * inverse * scale
-                m1[y, x] = _TWO * (v * (B - A) + S * u * (C - D)) * inverse * scale
+                q1[y, x] = -S * C * inverse * of_ssim
+                q12[y, x] = _TWO * A * inverse * of_ssim
+                m1[y, x] = _TWO * (v * (B - A) + S * u * (C - D)) * inverse * of_ssim
                 q2[y, x] = S
             total += _row_sum(q2[y])
         sums[i, 0] = total
@@ -243,5 +245,5 @@ def _kernel(images, targets, half, shares, sums, gradients, counter, rows, line,
             for y in range(height):
                 for x in range(width):
                     d = a[y, x] - b[y, x]
-                    slope = edge if d > 0 else (-edge if d < 0 else np.float32(0))
+                    slope = of_l1 if d > 0 else (-of_l1 if d < 0 else np.float32(0))
                     g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + slope

@@ -162,4 +162,5 @@ def test_a_disk_that_stalls_within_a_write(
     check_identical(tmp_path / "clip", scene)
     shown = capsys.readouterr().out
     assert "of all cameras while the disk stalls" in shown
-    assert (took := re.search(r"the disk took ([\d.]+)", shown)) and float(took[1]) >= stall_s  # longer under load
+    took = re.search(r"the disk took ([\d.]+)", shown)
+    assert took and stall_s <= float(took[1]) < 3 * stall_s  # one write, longer on a busy machine
