@@ -23,7 +23,7 @@ from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
 from spike4dgs.method.observations.pinholes import through_lens
 from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.splat.background import join
+from spike4dgs.method.splat.background import Repeated, join
 from spike4dgs.method.splat.types import PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 
@@ -92,7 +92,14 @@ class FittedModel:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
         views = Views.from_cameras([camera], device=self.device)
         with one_torch_thread():
-            return self.rendered(self.splats(t_us), views)[0].clamp(min=0).cpu().numpy()
+            return self._render(views, t_us)[0].clamp(min=0).cpu().numpy()
+
+    def _render(self, view: Views, t_us: float) -> Tensor:
+        """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
+        still = self._repeated.in_view(view) if len(self.background) and self.device == "cpu" else None
+        if still is None:
+            return self.rendered(self.splats(t_us), view)
+        return self.image(still.render(self._moving(t_us), [0]).image, view)
 
     def rendered(self, splats: Splats, views: Views) -> Tensor:
         """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
@@ -101,16 +108,17 @@ class FittedModel:
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
+        moving = self._moving(t_us)
+        return join(self._repeated.splats, moving) if len(self.background) else moving
+
+    def _moving(self, t_us: float) -> Splats:
         t, count = min(max(t_us / self.duration_us, 0.0), 1.0), len(self.pieces)
         piece = min(int(t * count), count - 1)
-        moving = self.motion.splats(self.pieces[piece], t * count - piece)
-        if not len(self.background):
-            return moving
-        return join(self._static_splats, moving)
+        return self.motion.splats(self.pieces[piece], t * count - piece)
 
     @cached_property
-    def _static_splats(self) -> Splats:
-        return self.background.splats()
+    def _repeated(self) -> Repeated:
+        return Repeated(self.background.splats(), self.pixel_filter)
 
     def image(self, image: Tensor, views: Views) -> Tensor:
         """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""

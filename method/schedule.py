@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
+from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer_settings import TrainerSettings
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
@@ -37,6 +40,10 @@ class Stage:
     def renewals(self) -> tuple[int, ...]:
         """At which of the stage's steps means over time are corrected anew; nothing moves in a static one."""
         return tuple(round(share * self.steps) for share in RENEWED if self.deforms)
+
+    def renewed_after(self, step: int) -> int:
+        """Return the next step after one at which corrections are renewed, or the stage ends."""
+        return self.first + min((r for r in self.renewals if self.first + r > step), default=self.steps)
 
     def within(self, t: float) -> float:
         """Return a time of the clip as a time of the stage's span, which is [0, 1]."""
@@ -75,3 +82,10 @@ def choose_time(settings: TrainerSettings, stage: Stage, step: int, times: int) 
     low, high = (a + (b - a) * opened for a, b in zip(stage.begin, stage.span, strict=True))
     at = low + (high - low) * ((step * GOLDEN) % 1.0)
     return min(times - 1, int(at * times))
+
+
+def choose_views(settings: TrainerSettings, step: int, count: int, seed: int) -> list[int]:
+    """Return a step's views among `count`, ascending."""
+    if settings.views_per_step >= count:
+        return list(range(count))
+    return sorted(torch.randperm(count, generator=seeded(seed, step))[: settings.views_per_step].tolist())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import torch
@@ -32,7 +33,7 @@ from spike4dgs.method.observations.instants import Corrections, RenderViews
 from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.pose_refinement import Poses
-from spike4dgs.method.schedule import Stage, choose_time, stages
+from spike4dgs.method.schedule import Stage, choose_time, choose_views, stages
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.supervision.base import Sample, Supervision
@@ -83,6 +84,7 @@ class Trainer:
     def _begin(self, stage: Stage) -> None:
         """Start a stage as 4DGS does: a fresh optimiser, and nothing gathered for densification."""
         s = self.settings
+        self.close()
         self.snapshot = self.corrections = None
         own = {**self.supervision.groups(), **(self.motion.groups() if stage.deforms else {})}
         if s.refine_poses:
@@ -124,24 +126,20 @@ class Trainer:
         self.gaussians = self.gaussians.rows(moves).trainable()
 
     def _set_background(self, background: Gaussians) -> None:
-        self.background, self.projected = (
-            background,
-            Background(background.splats(), self.training_images.views, self.settings.pixel_filter),
-        )
+        self.background = background
+        self.projected = Background(background.splats(), self.training_images.views, self.settings.pixel_filter)
 
     def sample(self) -> Sample:
         """Return the current step's views and time."""
-        training, count = self.training_images, len(self.training_images.views)
-        index = choose_time(self.settings, self.stage, self.step, len(training.ticks))
-        views = torch.arange(count)
-        if self.settings.views_per_step < count:
-            order = torch.randperm(count, generator=seeded(self.seed, self.step))
-            views = order[: self.settings.views_per_step].sort().values
-        tick = training.ticks[index]
-        images = training.measured(index)[views]
+        training, (index, views) = self.training_images, self._choose(self.stage, self.step)
+        tick, images = training.ticks[index], training.measured(index)[views]
         if self.corrections:
-            images = images + self.corrections.at(index, views.tolist())
-        return Sample(tick / training.n_ticks, tick, tuple(views.tolist()), images, self.step)
+            images = images + self.corrections.at(index, views)
+        return Sample(tick / training.n_ticks, tick, tuple(views), images, self.step)
+
+    def _choose(self, stage: Stage, step: int) -> tuple[int, list[int]]:
+        times, count = self.training_images.images.shape[:2]
+        return choose_time(self.settings, stage, step, times), choose_views(self.settings, step, count, self.seed)
 
     def train_step(self) -> Tensor:
         """Take one step; return the loss."""
@@ -199,7 +197,15 @@ class Trainer:
 
             return render_views
 
+        self.close()
         self.snapshot, self.corrections = snapshot, Corrections(training.spans, around)
+        if snapshot.means.device.type == "cpu":
+            self.corrections.begin(self._choose(stage, s) for s in range(self.step, stage.renewed_after(self.step)))
+
+    def close(self) -> None:
+        """Stop what works beside the fit's own thread."""
+        if self.corrections:
+            self.corrections.stop()
 
     def _image(self, splats: Splats, chosen: Sequence[int], views: Views) -> RenderOutput:
         """Render into the chosen views, over the background where there is one."""
@@ -243,7 +249,7 @@ class Trainer:
         if saved:
             self.restore(saved)
         written = time.monotonic()
-        with one_torch_thread():
+        with one_torch_thread(), closing(self):
             while self.step < self.total:
                 loss = self.train_step()
                 if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == self.total):

@@ -50,6 +50,28 @@ class Background:
         return cpu.rasterize(Splats(*splats.geometry, splats.colors.float()), views, settings, torch.float32, layer)
 
 
+class Repeated:
+    """The same Gaussians behind others, in views that may come back: a view that does gets a `Background` of its own.
+
+    A test camera is rendered at hundreds of times; on a camera path no view comes back.
+    """
+
+    MOST = 9  # views that are remembered: an array's
+
+    def __init__(self, splats: Splats, pixel_filter: PixelFilter) -> None:
+        self.splats, self.pixel_filter = splats, pixel_filter
+        self._kept: dict[bytes, Background | None] = {}  # the latest last; None: seen once
+
+    def in_view(self, view: Views) -> Background | None:
+        """Return the background in a single view, or None where it was not rendered lately."""
+        key = b"".join(t.cpu().numpy().tobytes() for t in (view.w2c, view.K)) + f"{view.width}x{view.height}".encode()
+        again, known = key in self._kept, self._kept.pop(key, None)
+        self._kept[key] = known or (Background(self.splats, view, self.pixel_filter) if again else None)
+        if len(self._kept) > self.MOST:
+            self._kept.pop(next(iter(self._kept)))
+        return self._kept[key]
+
+
 def join(a: Splats, b: Splats) -> Splats:
     """Return the Gaussians of `a` followed by those of `b`."""
     return Splats(*(torch.cat(pair) for pair in zip(_tensors(a), _tensors(b), strict=True)))
@@ -65,9 +87,8 @@ def _make_layer(splats: Splats, views: Views, s: cpu.Settings) -> Layer:
     cameras = s.cameras(cpu.camera_entries(views.w2c, views.K))
     sides = len(views), len(splats)
     colors = cpu.pack_colors(splats.colors.float().numpy(), None)
-    with cpu.busy:
-        p = cpu.project_views(geometry, cameras, s, np.empty((*sides, 2), np.float32), np.empty(sides, np.float32))
-        frames = cpu.composite(p, colors, cpu.chunking(splats.colors.shape[1])[0], cpu.no_layer(), s)
+    p = cpu.project_views(geometry, cameras, s, np.empty((*sides, 2), np.float32), np.empty(sides, np.float32))
+    frames = cpu.composite(p, colors, cpu.chunking(splats.colors.shape[1])[0], cpu.no_layer(), s)
     view = np.repeat(np.arange(len(views)), np.diff(p.offsets[:: s.tiles[0] * s.tiles[1]]))
     records, _, _, order, offsets = frames.lists
     return Layer(

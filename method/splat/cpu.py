@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,16 @@ from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
 
 Array = np.ndarray
-busy = threading.Lock()  # the scratch memory is shared by all renders of the process
+
+
+class _Scratch(threading.local):
+    """The scratch memory of a caller's threads: several callers may render at once."""
+
+    def __init__(self) -> None:
+        self.by_thread: dict[int, tuple[Array, ...]] = {}
+
+
+_scratch = _Scratch()
 
 
 @dataclass(frozen=True)
@@ -79,8 +87,15 @@ class Frames:
     alpha: Array  # [V, H, W] float32
 
 
-@cache
 def _thread_memory(thread: int) -> tuple[Array, ...]:
+    """Return the scratch of one of the threads that work for this caller, kept for the next call."""
+    kept = _scratch.by_thread
+    if thread not in kept:
+        kept[thread] = _new_memory()
+    return kept[thread]
+
+
+def _new_memory() -> tuple[Array, ...]:
     """Return a thread's scratch: projection rows, lanes, tile planes, block list, digits."""
     rows = max(project_kernels.ROWS, project_gradient.ROWS) * project_kernels.BLOCK
     planes = 8 * PLANE  # T, R, alpha gradient and up to 4 colours, and room for a vector that overhangs the last
@@ -204,10 +219,9 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         geometry = Geometry(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities)))
         cameras, layers = settings.cameras(camera_entries(w2c, K)), colors.shape[1] + settings.depth
-        with busy:
-            p = project_views(geometry, cameras, settings, probe.detach().numpy(), radii.numpy())
-            packed = pack_colors(colors.detach().numpy(), p.depths if settings.depth else None)
-            frames = composite(p, packed, chunking(layers)[0], layer, settings)
+        p = project_views(geometry, cameras, settings, probe.detach().numpy(), radii.numpy())
+        packed = pack_colors(colors.detach().numpy(), p.depths if settings.depth else None)
+        frames = composite(p, packed, chunking(layers)[0], layer, settings)
         ctx.frames, ctx.geometry, ctx.settings = frames, geometry, settings
         ctx.pose_dtype, ctx.colors_dtype, ctx.channels = w2c.dtype, colors.dtype, colors.shape[1]
         return torch.from_numpy(frames.image[:, :layers]), torch.from_numpy(frames.alpha)
@@ -220,8 +234,7 @@ class _Rasterize(torch.autograd.Function):
             layers = np.zeros(frames.image.shape, np.float32)
             layers[:, : d_image.shape[1]] = d_image.numpy()
         images = np.ascontiguousarray(layers), np.ascontiguousarray(d_alpha.numpy())
-        with busy:
-            total = differentiate(frames, ctx.geometry, ctx.channels, ctx.settings, *images, posed)
+        total = differentiate(frames, ctx.geometry, ctx.channels, ctx.settings, *images, posed)
         means, quats, scales, opacities, colors, centers, poses = (torch.from_numpy(a) for a in total)
         d_w2c = None
         if posed:

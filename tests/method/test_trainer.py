@@ -1,3 +1,4 @@
+import threading
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -14,7 +15,7 @@ from spike4dgs.method.gaussians.density import DensitySettings, GradientStatisti
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.observations.instants import correction, node
+from spike4dgs.method.observations.instants import Corrections, correction, node
 from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.training_images import Spans, TrainingImages
 from spike4dgs.method.schedule import Stage, choose_time, stages
@@ -133,6 +134,33 @@ def test_means_over_time_are_corrected_by_snapshots_of_the_stage() -> None:
     expected = correction(light(-far), light(0.0), light(far), spans)
     torch.testing.assert_close(fit.corrections.at(index, views), expected, atol=1e-3, rtol=0)
     assert expected.abs().max() > 0.01, "things move"
+
+
+def test_corrections_made_ahead_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fit() -> Trainer:
+        made = trainer(40, motion="paths", spans=wide_spans)
+        made.run(silent)
+        assert not any(t.name == "corrections" for t in threading.enumerate()), "nothing works on after a fit"
+        return made
+
+    ahead = fit()
+    monkeypatch.setattr(Corrections, "begin", lambda *_: None)
+    alone = fit()
+    for name, leaf in ahead.gaussians.tensors().items():
+        assert torch.equal(leaf, alone.gaussians.tensors()[name]), name
+    assert ahead.corrections._made.keys() == alone.corrections._made.keys(), "what no step asks for is not made"
+
+
+def test_a_fit_that_is_interrupted_leaves_nothing_working() -> None:
+    fit = trainer(40, motion="paths", spans=wide_spans)
+
+    def interrupt(done: int, total: int, note: str) -> None:
+        if fit.corrections:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit.run(interrupt)
+    assert not any(t.name == "corrections" for t in threading.enumerate())
 
 
 def test_a_motion_with_a_network_corrects_nothing() -> None:

@@ -19,6 +19,7 @@ from spike4dgs.benchmark.errors import problem
 _threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
 _pool: ThreadPoolExecutor | None = None
 _lock = threading.Lock()
+_caller = threading.local()
 
 
 def set_threads(count: int) -> None:
@@ -36,13 +37,18 @@ def set_threads(count: int) -> None:
 
 
 def get_threads() -> int:
-    """Return the number of threads that the CPU kernels use."""
-    return _threads
+    """Return the number of threads that the CPU kernels use when called from this thread."""
+    return 1 if getattr(_caller, "works_alone", False) else _threads
+
+
+def work_alone() -> None:
+    """Let kernels that this thread calls from now on run on it alone: for work beside a thread that has helpers."""
+    _caller.works_alone = True
 
 
 def useful_threads(items: int, each: int) -> int:
     """Return how many threads to use for `items` small pieces of work: one for every `each`, which pay its start."""
-    return max(1, min(_threads, items // each))
+    return max(1, min(get_threads(), items // each))
 
 
 def work_counter() -> np.ndarray:

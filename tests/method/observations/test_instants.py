@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
+
 import pytest
 import torch
 from torch import Tensor
@@ -113,3 +116,73 @@ def test_corrections_are_made_once_for_each_image() -> None:
     corrections.at(1, [2, 3])
     assert [views for _, views in asked] == [(0, 2)] * 3 + [(3,)] * 3
     assert sorted({ticks for ticks, _ in asked}) == [-node(5.0), 0.0, node(5.0)]
+
+
+def test_corrections_made_ahead_are_those_made_when_asked_for() -> None:
+    """Each image is rendered once, by whichever thread comes to it first."""
+    rendered: list[tuple[int, int, float]] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            rendered.extend((index, v, ticks) for v in chosen)
+            return torch.stack([torch.full((2, 2), (index + 2.0) * (v + 1) + 0.01 * ticks**2) for v in chosen])
+
+        return views
+
+    def corrections() -> Corrections:
+        lengths = torch.arange(40 * 4 * 2 * 4).view(40, 4, 2, 2, 2) % 13 - 6.0
+        return Corrections(Spans(lengths, 5.0, 99), around)
+
+    asked = [(7 * k % 40, [k % 4, (k + 1 + k % 3) % 4]) for k in range(300)]
+    alone = corrections()
+    expected = [alone.at(*request) for request in asked]
+    rendered.clear()
+    ahead = corrections()
+    ahead.begin(iter(asked))
+    assert all(torch.equal(ahead.at(*r), e) for r, e in zip(asked, expected, strict=True))
+    ahead.stop()
+    assert len(rendered) == len(set(rendered)) == 3 * len({(index, v) for index, views in asked for v in views})
+
+
+def test_no_more_is_made_ahead_once_stopped() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    rendered: list[int] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            rendered.append(index)
+            begun.set()
+            go_on.wait(60)
+            return torch.zeros(len(chosen), 2, 2)
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(9, 1, 2, 2, 2), 5.0, 99), around)
+    corrections.begin((index, [0]) for index in range(9))
+    begun.wait(60)
+    stopping = threading.Thread(target=corrections.stop)
+    stopping.start()
+    while not corrections._stopped.is_set():
+        pass
+    go_on.set()
+    stopping.join(60)
+    assert rendered == [0, 0, 0], "the one that was begun"
+    assert corrections.at(4, [0]).shape == (1, 2, 2), "what was not made ahead is made when asked for"
+
+
+def test_a_render_that_fails_ahead_fails_where_it_is_asked_for() -> None:
+    failed: list[int] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            failed.append(index)
+            raise ArithmeticError("no such render")
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(3, 1, 2, 2, 2), 5.0, 99), around)
+    corrections.begin([(1, [0])])
+    corrections._thread.join(60)
+    assert failed == [1]
+    with pytest.raises(ArithmeticError, match="no such render"):
+        corrections.at(1, [0])

@@ -11,7 +11,7 @@ from torch import Tensor
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.hard_cases.splat_scenes import HARD, random_splats, views
 from spike4dgs.method.splat import PixelFilter, Splats, Views, render
-from spike4dgs.method.splat.background import Background
+from spike4dgs.method.splat.background import Background, Repeated, join
 from spike4dgs.method.splat.types import CUSTOMARY
 
 
@@ -64,6 +64,21 @@ def test_a_background_serves_many_renders() -> None:
     first = [background.render(rows(random_splats(30, seed=s), torch.arange(30)), [0, 1]).image for s in (1, 2, 1)]
     assert torch.equal(first[0], first[2]) and not torch.equal(first[0], first[1])
     assert len(background) == 60
+
+
+def test_a_view_that_comes_back_gets_a_background_of_its_own() -> None:
+    splats, v = rows(random_splats(60, seed=5), torch.arange(60)), views(Repeated.MOST + 1)
+    one = [Views(v.w2c[[i]], v.K[[i]], v.width, v.height) for i in range(len(v))]
+    repeated = Repeated(splats, BOX)
+    assert repeated.in_view(one[0]) is None
+    kept = repeated.in_view(Views(v.w2c[:1].clone(), v.K[:1].clone(), v.width, v.height))
+    assert kept is not None and repeated.in_view(one[0]) is kept, "the same camera, whichever object says so"
+    moving = rows(random_splats(30, seed=1), torch.arange(30))
+    expected = render(join(splats, moving), one[0], eps2d=BOX.variance, antialiased=BOX.compensated, backend="cpu")
+    assert torch.equal(kept.render(moving, [0]).image, expected.image)
+    assert repeated.in_view(Views(v.w2c[:1], v.K[:1], v.width, v.height - 1)) is None, "another size"
+    assert all(repeated.in_view(view) is None for view in one[1:]), "each of them is seen once"
+    assert repeated.in_view(one[0]) is None, "too long ago"
 
 
 def test_values_that_are_not_finite_are_refused() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import splat_parity
@@ -16,6 +17,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.hard_cases.splat import differentiate
 from spike4dgs.method.hard_cases.splat_scenes import HARD, changed, far_origin, random_splats, views
 from spike4dgs.method.splat import Splats, Views, cpu, render, set_threads
+from spike4dgs.method.splat.kernels.threads import work_alone
 
 
 def compare(splats: Splats, v: Views, **options: bool) -> None:
@@ -76,6 +78,25 @@ def test_same_bits_with_one_and_two_threads(restore_threads: None) -> None:
         results.append([out.image, out.alpha, out.depth, out.radii, *grads.values()])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_threads_that_render_at_once_do_not_disturb_one_another() -> None:
+    """One of them with helpers, the others alone, as a fit's corrections are made."""
+    scenes, v = [random_splats(400, seed=s) for s in range(4)], views()
+
+    def values(k: int) -> list[torch.Tensor]:
+        out, grads = differentiate(scenes[k], v, "cpu", torch.ones(2, v.height, v.width), True)
+        return [out.image, out.alpha, out.depth, *grads.values()]
+
+    expected = [values(k) for k in range(4)]
+
+    def same(k: int) -> bool:
+        if k:
+            work_alone()
+        return all(torch.equal(a, b) for _ in range(20) for a, b in zip(values(k), expected[k], strict=True))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(same, range(4)))
 
 
 def test_background_shows_through() -> None:
