@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from weakref import proxy
 
 import torch
 from torch import Tensor
@@ -109,8 +110,7 @@ class Trainer:
             if stage.deforms and self.settings.freeze_background:
                 self._freeze()
             return
-        before = self.plan[self.plan.index(stage) - 1]
-        self.ended[before.piece] = self.gaussians.detached()
+        self.ended[self.plan[self.plan.index(stage) - 1].piece] = self.gaussians.detached()
         first = self.motion.continued(self.ended[stage.neighbour], forward=stage.piece > stage.neighbour)
         self.gaussians = first.trainable()
 
@@ -185,15 +185,16 @@ class Trainer:
     def _correct_by(self, snapshot: Gaussians) -> None:
         """Correct values that are means over spans of time by a snapshot of the stage's model from now on."""
         stage, training = self.stage, self.training_images
-        if training.spans is None:
+        # A motion's parameters would go on learning; the snapshot's Gaussians do not.
+        if training.spans is None or any(True for _ in self.motion.parameters()):
             return
-        if any(True for _ in self.motion.parameters()):  # they would go on learning; the snapshot's Gaussians do not
-            return
+
+        fit = proxy(self)  # else a cycle would keep a fit's memory long after its end
 
         def around(index: int) -> RenderViews:
             def render_views(ticks: float, chosen: Sequence[int]) -> Tensor:
-                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), self._views(chosen)
-                return self.motion.image(self._image(self.motion.splats(snapshot, t), chosen, views).image, views)
+                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), fit._views(chosen)
+                return fit.motion.image(fit._image(fit.motion.splats(snapshot, t), chosen, views).image, views)
 
             return render_views
 

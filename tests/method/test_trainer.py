@@ -1,4 +1,6 @@
+import gc
 import threading
+import weakref
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -149,6 +151,20 @@ def test_corrections_made_ahead_change_no_bit(monkeypatch: pytest.MonkeyPatch) -
     for name, leaf in ahead.gaussians.tensors().items():
         assert torch.equal(leaf, alone.gaussians.tensors()[name]), name
     assert ahead.corrections._made.keys() == alone.corrections._made.keys(), "what no step asks for is not made"
+
+
+def test_a_fit_is_freed_at_its_end() -> None:
+    """Without the garbage collector, which may not come round for many fits."""
+    gc.collect()
+    gc.disable()
+    try:
+        fit = trainer(40, motion="paths", spans=wide_spans)
+        fit.run(silent)
+        freed = weakref.ref(fit)
+        del fit
+        assert freed() is None
+    finally:
+        gc.enable()
 
 
 def test_a_fit_that_is_interrupted_leaves_nothing_working() -> None:
