@@ -153,7 +153,7 @@ BEYOND = (
             "trainer.moving_change": 0.012,
             "trainer.initial_scale": 0.5,
             "trainer.coarse_steps": 600,
-            "trainer.fine_steps": 1300,
+            "trainer.fine_steps": 1200,
             "trainer.views_per_step": 2,
             "trainer.average": 0.2,
             "density.max_moving_per_pixel": 0.5,

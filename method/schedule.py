@@ -15,7 +15,7 @@ from spike4dgs.method.trainer_settings import TrainerSettings
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly at every length
 
-RENEWED = (0.3, 0.5, 0.7, 0.85)  # shares of a deforming stage: first when it sees its whole span
+RENEWED = (0.3, 0.5, 0.75)  # shares of a deforming stage: first when it sees its whole span
 
 Interval = tuple[float, float]  # of the clip, which is [0, 1]
 
