@@ -65,11 +65,13 @@ class Repeated:
     def in_view(self, view: Views) -> Background | None:
         """Return the background in a single view, or None where it was not rendered lately."""
         key = b"".join(t.cpu().numpy().tobytes() for t in (view.w2c, view.K)) + f"{view.width}x{view.height}".encode()
-        again, known = key in self._kept, self._kept.pop(key, None)
-        self._kept[key] = known or (Background(self.splats, view, self.pixel_filter) if again else None)
-        if len(self._kept) > self.MOST:
-            self._kept.pop(next(iter(self._kept)))
-        return self._kept[key]
+        again, kept = key in self._kept, self._kept.pop(key, None)
+        if again and kept is None:
+            kept = Background(self.splats, view, self.pixel_filter)
+        self._kept[key] = kept
+        for oldest in list(self._kept)[: -self.MOST]:  # a copy: a viewer renders from several threads
+            self._kept.pop(oldest, None)
+        return kept
 
 
 def join(a: Splats, b: Splats) -> Splats:
