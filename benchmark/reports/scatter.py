@@ -128,12 +128,12 @@ def _panel(axes: Axes, metric: str, points: Sequence[Point], markers: Mapping[st
         for scene, (x, y) in point.scenes.items():
             axes.plot(x, y, markers[scene], color=point.color, ms=4, alpha=strength, mew=0)
         axes.plot(point.x, point.y, "o", color=point.color, ms=9, mec="white", mew=0.7)
-    labels = [(p.x, p.y, p.label) for p in inside]
+    labels, tips = [(p.x, p.y, p.label) for p in inside], []
     for point in far:
         labels.append((*_edge(axes, point), _far_label(point, metric)))
         axes.plot(*labels[-1][:2], "o", color=point.color, ms=6, mec="white", mew=0.7, clip_on=False)
-        _arrow(axes, point)
-    label_points(axes, labels, [xy for p in inside for xy in p.scenes.values()])
+        tips.append(_arrow(axes, point))
+    label_points(axes, labels, [*(xy for p in inside for xy in p.scenes.values()), *tips])
 
 
 def _limits(axes: Axes, inside: Sequence[Point], timed: Sequence[Point], room: bool) -> None:
@@ -154,13 +154,14 @@ def _edge(axes: Axes, point: Point) -> tuple[float, float]:
     return tuple(axes.transData.inverted().transform(axes.transAxes.transform((max(x, 0.045), max(y, 0.06)))))
 
 
-def _arrow(axes: Axes, point: Point) -> None:
-    """Draw an arrow from a shown point towards where it is."""
+def _arrow(axes: Axes, point: Point) -> tuple[float, float]:
+    """Draw an arrow from a shown point towards where it is; return its tip."""
     x, y = axes.transAxes.inverted().transform(axes.transData.transform((point.x, point.y)))
     start = (max(x, 0.045), max(y, 0.06))
     to = (start[0] - 0.04 * (x < start[0]), start[1] - 0.055 * (y < start[1]))
     style = {"arrowstyle": "-|>", "color": point.color, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9}
     axes.annotate("", to, xytext=start, xycoords="axes fraction", textcoords="axes fraction", arrowprops=style)
+    return tuple(axes.transData.inverted().transform(axes.transAxes.transform(to)))
 
 
 def _far_label(point: Point, metric: str) -> str:
