@@ -6,9 +6,13 @@ So
     (j - i) / (t_j - t_i)    is the mean rate over    [t_i + 1/2, t_j + 1/2],
 
 up to half a tick at either end: a standard error of sqrt(2 / 12) / (t_j - t_i) of itself, and shot noise. It is no
-estimate of an instant, and a fit that compares it with its own mean over that span has no reason to make the span
-short. Of each pixel the spikes nearest to tick - half and tick + half are taken, if light changes within `half` ticks;
-where it does not, the longer window that `adaptive` finds, whose rate is that of any part of it.
+estimate of an instant: a fit compares it with its own mean over that span. The fit averages the noise of many short
+spans; what it cannot undo is that a span hides detail. So spans are short. Of each pixel the spikes nearest to
+tick - h and tick + h are taken, where h is one step below the window that `adaptive` finds, within limits: the sooner
+light changes, the shorter its span.
+
+A window that no change ends soon may still hide one of less than a spike: a faint texture that moves. So `adaptive`'s
+rate over the whole window is taken only where light is constant for much longer than a span.
 """
 
 from __future__ import annotations
@@ -25,16 +29,24 @@ from spike4dgs.baselines.spike_to_image.adaptive import (
     shared_levels,
 )
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
-from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel
+from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import spike_times
 
 
 @dataclass(frozen=True)
 class IntervalSettings(AdaptiveSettings):
-    """The windows of `adaptive`, and the span where light changes."""
+    """The windows of `adaptive`, and the spans where light changes."""
 
-    half: float = 10.0  # ticks on either side: a fit follows what moves about two pixels in twice that
+    half: float = 6.0  # ticks on either side, at most: in twice that, what is fast moves about a pixel
+    still: float = 80.0  # ticks on either side for which light must be constant to be taken as such
+
+
+def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:
+    """Return half the span in ticks of a pixel for each of `half_windows`; infinite where light is constant."""
+    s, halves = settings, half_windows(n_ticks, settings)
+    spans = (halves / s.growth).clip(s.shortest, s.half)
+    return np.where((halves >= s.still) | (halves == halves[-1]), np.inf, spans).astype(np.float32)
 
 
 def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
@@ -47,10 +59,10 @@ def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None 
     s = settings or IntervalSettings()
     spikes, pixels = spike_times(stream), stream.height * stream.width
     levels = shared_levels(stream, tick, s)
-    rate, changing = rates(stream, tick, s, levels), half_windows(stream.n_ticks, s)[levels] < s.half
+    rate, halves = rates(stream, tick, s, levels), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
-    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, s.half, changing, rate, spans)
+    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, halves, rate, spans)
     image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
     return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
 
@@ -69,8 +81,7 @@ def _measure(
     ticks: NDArray[np.int32],
     starts: NDArray[np.int64],
     tick: int,
-    half: float,
-    changing: UInt8,
+    halves: Float32,
     rate: Float32,
     spans: Float32,
     start: int,
@@ -79,9 +90,9 @@ def _measure(
     """Set rate and span of the pixels that change, from the spikes nearest to either end."""
     for p in range(start, stop):
         times = ticks[starts[p] : starts[p + 1]]
-        if not changing[p] or len(times) < 2:
+        if halves[p] == np.inf or len(times) < 2:
             continue
-        i, j = _nearest(times, tick - half), _nearest(times, tick + half)
+        i, j = _nearest(times, tick - halves[p]), _nearest(times, tick + halves[p])
         if i == j:  # one spike is nearest to both: the interval on the side where the tick lies
             i, j = (i - 1, j) if (times[i] >= tick and i > 0) or j + 1 == len(times) else (i, j + 1)
         rate[p] = np.float32((j - i) / (times[j] - times[i]))
@@ -90,8 +101,9 @@ def _measure(
 
 INTERVALS = ImageMaker(
     name="intervals",
-    definition="spikes / ticks from the spike nearest to tick - half to the one nearest to tick + half where light "
-    "changes, with its span of time; elsewhere as adaptive",
+    definition="spikes / ticks from the spike nearest to tick - h to the one nearest to tick + h, with this span of "
+    "time; h = adaptive's half window / growth, within [shortest, half]; as adaptive where its half window is at least "
+    "`still` or the longest",
     source="this project",
     rate=interval_image,
     rate_over=intervals,

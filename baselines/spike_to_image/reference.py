@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, half_windows
+from spike4dgs.baselines.spike_to_image.intervals import IntervalSettings
 
 Float64 = NDArray[np.float64]
 Spikes = NDArray[np.generic]
@@ -47,24 +48,24 @@ def slow_tfi(spikes: Spikes, tick: int) -> Float64:
     return image
 
 
-def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None = None) -> Float64:
-    """Return the rate over the longest window that a constant rate explains, pixel by pixel, window by window."""
+def _window(spikes: Spikes, tick: int, half: float) -> tuple[float | None, NDArray[np.int64]]:
+    """Return the rate of one pixel [T] over a window, None with fewer than two spikes, and the window's spikes."""
+    t = np.flatnonzero(spikes)
+    near = (t >= tick - half) & (t < tick + half)
+    near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=len(spikes)))
+    t = t[near]
+    return (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else None, t
+
+
+def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings) -> NDArray[np.int64]:
+    """Return each pixel's longest window that a constant rate explains, [H, W]; of neighbours, the shortest."""
     n, height, width = spikes.shape
-    settings = settings or AdaptiveSettings()
     halves, reach = half_windows(n, settings), settings.shared_px // 2
-
-    def window(y: int, x: int, half: float) -> tuple[float | None, NDArray[np.int64]]:
-        t = np.flatnonzero(spikes[:, y, x])
-        near = (t >= tick - half) & (t < tick + half)
-        near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=n))
-        t = t[near]
-        return (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else None, t
-
     level = np.full((height, width), len(halves) - 1)
     for y, x in np.ndindex(height, width):
         known = []
         for s, half in enumerate(halves):
-            rate, t = window(y, x, half)
+            rate, t = _window(spikes[:, y, x], tick, half)
             if rate is None:
                 continue
             k, length = len(t) - 1, t[-1] - t[0]
@@ -72,15 +73,39 @@ def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None =
             if max(a for a, _ in known) > min(b for _, b in known):
                 level[y, x] = s - 1
                 break
-    image = np.asarray(spikes.astype(np.float64).sum(axis=0) / n)
+    shared = np.empty_like(level)
     for y, x in np.ndindex(height, width):
-        s = level[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].min()
-        rates = [window(y, x, half)[0] for half in halves[s:]]
+        shared[y, x] = level[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].min()
+    return shared
+
+
+def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None = None) -> Float64:
+    """Return the rate over the longest window that a constant rate explains, pixel by pixel, window by window."""
+    settings = settings or AdaptiveSettings()
+    halves, level = half_windows(len(spikes), settings), slow_levels(spikes, tick, settings)
+    image = np.asarray(spikes.astype(np.float64).sum(axis=0) / len(spikes))
+    for y, x in np.ndindex(image.shape):
+        rates = [_window(spikes[:, y, x], tick, half)[0] for half in halves[level[y, x] :]]
         image[y, x] = next((r for r in rates if r is not None), image[y, x])
     return image
 
 
-def slow_intervals(spikes: Spikes, tick: int, half: float) -> tuple[float, float, float] | None:
+def slow_intervals(spikes: Spikes, tick: int, settings: IntervalSettings | None = None) -> tuple[Float64, Float64]:
+    """Return the rates and the first and last instants of their spans [2, H, W] in ticks from `tick`."""
+    s = settings or IntervalSettings()
+    halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s)
+    image, spans = slow_adaptive(spikes, tick, s), np.empty((2, *spikes.shape[1:]))
+    spans[0], spans[1] = -s.half, s.half
+    for y, x in np.ndindex(image.shape):
+        window = float(halves[level[y, x]])
+        if window >= s.still or level[y, x] == len(halves) - 1:
+            continue
+        if found := _between_spikes(spikes[:, y, x], tick, min(s.half, max(s.shortest, window / s.growth))):
+            image[y, x], spans[:, y, x] = found[0], found[1:]
+    return image, spans
+
+
+def _between_spikes(spikes: Spikes, tick: int, half: float) -> tuple[float, float, float] | None:
     """Return rate, first and last instant of one pixel [T] between the spikes nearest to tick -+ half.
 
     None with fewer than two spikes.
