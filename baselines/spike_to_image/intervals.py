@@ -46,6 +46,7 @@ def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:
     """Return half the span in ticks of a pixel for each of `half_windows`; infinite where light is constant."""
     s, halves = settings, half_windows(n_ticks, settings)
     spans = (halves / s.growth).clip(s.shortest, s.half)
+    # float32: 4.000000000000001 would tell apart two spikes that are equally near.
     return np.where((halves >= s.still) | (halves == halves[-1]), np.inf, spans).astype(np.float32)
 
 

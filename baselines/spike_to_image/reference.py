@@ -100,7 +100,9 @@ def slow_intervals(spikes: Spikes, tick: int, settings: IntervalSettings | None 
         window = float(halves[level[y, x]])
         if window >= s.still or level[y, x] == len(halves) - 1:
             continue
-        if found := _between_spikes(spikes[:, y, x], tick, min(s.half, max(s.shortest, window / s.growth))):
+        # Half a span is a float32 number: 4.000000000000001 would tell apart two spikes that are equally near.
+        half = float(np.float32(min(s.half, max(s.shortest, window / s.growth))))
+        if found := _between_spikes(spikes[:, y, x], tick, half):
             image[y, x], spans[:, y, x] = found[0], found[1:]
     return image, spans
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adaptive_image
@@ -34,6 +34,7 @@ def sweeping(n, height, width, px_per_tick, seed=0):
 
 
 @settings(max_examples=30, deadline=None)
+@example(105, False, 9.7, 30.0, 105)  # two spikes that are equally near
 @given(
     st.integers(30, 120),
     st.booleans(),
