@@ -82,7 +82,11 @@ def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings) -> NDArra
 def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None = None) -> Float64:
     """Return the rate over the longest window that a constant rate explains, pixel by pixel, window by window."""
     settings = settings or AdaptiveSettings()
-    halves, level = half_windows(len(spikes), settings), slow_levels(spikes, tick, settings)
+    return _slow_rates(spikes, tick, half_windows(len(spikes), settings), slow_levels(spikes, tick, settings))
+
+
+def _slow_rates(spikes: Spikes, tick: int, halves: Float64, level: NDArray[np.int64]) -> Float64:
+    """Return each pixel's rate over its window, or over the next longer one that has two spikes."""
     image = np.asarray(spikes.astype(np.float64).sum(axis=0) / len(spikes))
     for y, x in np.ndindex(image.shape):
         rates = [_window(spikes[:, y, x], tick, half)[0] for half in halves[level[y, x] :]]
@@ -94,7 +98,7 @@ def slow_intervals(spikes: Spikes, tick: int, settings: IntervalSettings | None 
     """Return the rates and the first and last instants of their spans [2, H, W] in ticks from `tick`."""
     s = settings or IntervalSettings()
     halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s)
-    image, spans = slow_adaptive(spikes, tick, s), np.empty((2, *spikes.shape[1:]))
+    image, spans = _slow_rates(spikes, tick, halves, level), np.empty((2, *spikes.shape[1:]))
     spans[0], spans[1] = -s.half, s.half
     for y, x in np.ndindex(image.shape):
         window = float(halves[level[y, x]])
