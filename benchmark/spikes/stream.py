@@ -7,6 +7,7 @@ multiple of 8 the last byte of a tick is padded with zero bits. Nothing here eve
 
 from __future__ import annotations
 
+import mmap
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,12 @@ class SpikeStream:
         return self._upright(
             count_bits(self.packed[start:stop], self.width * self.height).reshape(self.height, self.width)
         )
+
+    def release(self) -> None:
+        """Give back the memory of a mapped file's pages; what is read again comes from the file again."""
+        mapped = self.packed.base
+        if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            mapped.madvise(mmap.MADV_DONTNEED)
 
     def _upright(self, images: NDArray[T]) -> NDArray[T]:
         return images[..., ::-1, :] if self.rows_bottom_up else images

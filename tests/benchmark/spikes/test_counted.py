@@ -27,7 +27,7 @@ from spike4dgs.benchmark.spikes.counted import (
 )
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.repair import fill_pixels
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 
 WIDTH, HEIGHT = 11, 6  # 66 pixels: rows do not begin on whole bytes
 
@@ -169,3 +169,23 @@ def test_a_foreign_file_is_named(tmp_path: Path) -> None:
     np.savez(path, first=np.zeros(3))
     with pytest.raises(UserError, match="found the arrays first"):
         open_counted(path, WIDTH, HEIGHT, 260)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="Linux says how much of a file is in memory")
+def test_a_calibration_leaves_no_pages_of_its_recordings_in_memory(tmp_path: Path) -> None:
+    def in_memory() -> int:
+        status = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * int(next(line for line in status if line.startswith("RssFile")).split()[1])
+
+    width, height, ticks = 256, 128, 4000  # 16 MB each
+    paths = tmp_path / "flat.dat", tmp_path / "dark.dat"
+    size = ticks * width * height // 8
+    paths[0].write_bytes(np.random.default_rng(0).bytes(size))
+    paths[1].write_bytes(bytes(size))
+    flat, dark = (open_stream(path, width, height, 20000.0) for path in paths)
+    first = estimate(Recordings(flat, dark, 0.5))  # compiles, too
+    before = in_memory()
+    again = estimate(Recordings(flat, dark, 0.5))
+    assert in_memory() - before < 4_000_000
+    assert np.array_equal(first.gain, again.gain) and np.array_equal(first.dark, again.dark)
+    assert int(flat.packed.sum(dtype=np.int64)) and in_memory() - before > 12_000_000, "what is read counts"
