@@ -28,10 +28,11 @@ _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
 _MODULES = re.compile(r"^<!-- modules of (\w+) -->$", re.MULTILINE)
 
 
-def on_config(config: Any, **kwargs: Any) -> Any:
+def on_startup(**kwargs: Any) -> None:
     """Link each room into one folder `spike4dgs`, where mkdocstrings looks for it.
 
-    The rooms are top-level folders; only an installation knows that they form one package.
+    The rooms are top-level folders; only an installation knows that they form one package. mkdocstrings leaves out a
+    folder that is not there yet when it is configured.
     """
     SOURCES.mkdir(parents=True, exist_ok=True)
     for room in ROOMS:
@@ -41,7 +42,6 @@ def on_config(config: Any, **kwargs: Any) -> Any:
             link.symlink_to(ROOT / room, target_is_directory=True)
     # The folder of scripts is on the path, and its program `spike4dgs` would be taken for the package.
     sys.path[:] = [path for path in sys.path if not (Path(path) / "spike4dgs").is_file()]
-    return config
 
 
 def on_post_build(config: Any, **kwargs: Any) -> None:
