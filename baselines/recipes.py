@@ -91,10 +91,9 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"trainer.coarse_steps": 1500}),
 )
 
-# The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s. Half as many images
-# would cost 2.7 dB on the turntable (1150 steps, `adaptive` images). Its images have little noise, so it takes a
-# pixel's own filter, and many steps of two views, averaged at the end. HexPlane's cells of 16 ticks can show more noise
-# than motion, those of 64 can not.
+# The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s; half as many would
+# cost 2.7 dB on the turntable (1150 steps, `adaptive` images). They have little noise, so the fit takes a pixel's own
+# filter and many steps of two views, averaged at the end. HexPlane's cells of 16 ticks would fit noise.
 _MSDI: dict[str, Any] = {
     "images.flat_field": True,
     "images.time_spacing_ticks": 10,
