@@ -91,20 +91,25 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"trainer.coarse_steps": 1500}),
 )
 
-# The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s; half as many would
-# cost 2.7 dB on the turntable (1150 steps, `adaptive` images). They have little noise, so the fit takes a pixel's own
-# filter and many steps of two views, averaged at the end. HexPlane's cells of 16 ticks would fit noise.
-_MSDI: dict[str, Any] = {
-    "images.flat_field": True,
-    "images.time_spacing_ticks": 10,
-    "motion.cell_ticks": 64.0,
+# For images with little noise: a pixel's own filter, first Gaussians half as wide, and many steps of two views, whose
+# last parameters are averaged.
+_CLEAN: dict[str, Any] = {
     "trainer.filter_variance": 1 / 12,
     "trainer.filter_compensated": True,
     "trainer.initial_scale": 0.5,
-    "trainer.coarse_steps": 400,
-    "trainer.fine_steps": 1300,
     "trainer.views_per_step": 2,
     "trainer.average": 0.2,
+}
+
+# The reference method, and with less of it. MSDI's images take about a third of a quick fit's 90 s; half as many would
+# cost 2.7 dB on the turntable (1150 steps, `adaptive` images). HexPlane's cells of 16 ticks would fit noise.
+_MSDI: dict[str, Any] = {
+    **_CLEAN,
+    "images.flat_field": True,
+    "images.time_spacing_ticks": 10,
+    "motion.cell_ticks": 64.0,
+    "trainer.coarse_steps": 400,
+    "trainer.fine_steps": 1300,
 }
 SPIKE4DGS = (
     Recipe("spike4dgs", "msdi", "msdi", "hexplane", "spss", _MSDI),
@@ -151,18 +156,14 @@ BEYOND = (
         "pixel",
         {
             **_FLAT,
+            **_CLEAN,
             **_FAST,
             # Corrected means of a clip have hardly any noise: a road's grain is enough to find its depth.
             "initialization.noise": 3e-5,
-            "trainer.filter_variance": 1 / 12,
-            "trainer.filter_compensated": True,
             "trainer.freeze_background": True,
             "trainer.moving_change": 0.012,
-            "trainer.initial_scale": 0.5,
             "trainer.coarse_steps": 600,
             "trainer.fine_steps": 1200,
-            "trainer.views_per_step": 2,
-            "trainer.average": 0.2,
             "density.max_moving_per_pixel": 0.5,
             "density.max_gaussians": 36_000,
         },
