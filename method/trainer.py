@@ -28,10 +28,11 @@ from spike4dgs.method.gaussians.optimizer import (
     make_adam,
     set_learning_rates,
 )
-from spike4dgs.method.gaussians.parameters import Edit, Gaussians
+from spike4dgs.method.gaussians.parameters import Gaussians, appended
 from spike4dgs.method.motion.base import Motion
+from spike4dgs.method.motion.coherence import Coherence
+from spike4dgs.method.observations.foreground import moving_points
 from spike4dgs.method.observations.instants import Corrections, RenderViews
-from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.pose_refinement import Poses
 from spike4dgs.method.schedule import Stage, choose_time, choose_views, stages
@@ -75,6 +76,7 @@ class Trainer:
         self.snapshot: Gaussians | None = None  # the model that corrects means over time
         self.corrections: Corrections | None = None
         self.poses = Poses(images.views, scale)
+        self.coherence = Coherence(motion.coherence, images.views)
         self._begin(self.plan[0])
 
     @property
@@ -87,6 +89,7 @@ class Trainer:
         s = self.settings
         self.close()
         self.snapshot = self.corrections = None
+        self.coherence.forget()
         own = {**self.supervision.groups(), **(self.motion.groups() if stage.deforms else {})}
         if s.refine_poses:
             own["poses"] = [self.poses.xi], Decay(s.lr_poses, s.lr_poses_last)
@@ -120,8 +123,8 @@ class Trainer:
         return tuple(fitted[piece] for piece in sorted(fitted))
 
     def _freeze(self) -> None:
-        """Make a background of the Gaussians at whose positions no view sees a change."""
-        moves = variation_at(self.gaussians.means.detach(), self.training_images) > self.settings.moving_change
+        """Make a background of the Gaussians that do not move."""
+        moves = moving_points(self.gaussians.means.detach(), self.training_images, self.settings.moving_change)
         self._set_background(self.gaussians.rows(~moves))
         self.gaussians = self.gaussians.rows(moves).trainable()
 
@@ -163,7 +166,7 @@ class Trainer:
         set_learning_rates(self.adam, self.learning_rates, stage.fraction(self.step))
         self.adam.zero_grad(set_to_none=True)
         loss = self.supervision(render_at, sample)
-        (loss + self.motion.regularizer() if stage.deforms else loss).backward()
+        (loss + self.motion.regularizer() + self.coherence(self.gaussians) if stage.deforms else loss).backward()
         self.adam.step()
         self.step += 1
         if self.density.ahead(self.step - stage.first, stage.steps):
@@ -217,26 +220,21 @@ class Trainer:
         return render(splats, views, eps2d=s.filter_variance, antialiased=s.filter_compensated)
 
     def _views(self, chosen: Sequence[int]) -> Views:
-        all_views, rows = self.training_images.views, list(chosen)
-        return Views(all_views.w2c[rows], all_views.K[rows], *self._size())
-
-    def _size(self) -> tuple[int, int]:
-        return self.training_images.views.width, self.training_images.views.height
+        v, rows = self.training_images.views, list(chosen)
+        return Views(v.w2c[rows], v.K[rows], v.width, v.height)
 
     def _adapt_density(self, stage: Stage) -> None:
-        s, done = self.density, self.step - stage.first
+        s, done, views = self.density, self.step - stage.first, self.training_images.views
         if not s.due(done, stage.steps):
             return
-        limit = s.limit(*self._size(), background=bool(self.projected))
+        limit = s.limit(views.width, views.height, background=bool(self.projected))
         rng = seeded(self.seed, self.step)
         for edit in adapt_density(self.gaussians, self.statistics, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
         if stage.deforms and 2 <= done // s.every < 2 + self.motion.guided_rounds:
-            before = len(self.gaussians)
             more = self.motion.guide(self.gaussians, self.training_images, rng)
-            index = torch.arange(len(more), device=more.means.device)
-            if len(more) > before:
-                self.gaussians = apply_edit(self.adam, Edit(more, torch.where(index < before, index, -1)))
+            self.gaussians = apply_edit(self.adam, appended(more, len(self.gaussians)))
+        self.coherence.forget()
         self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)
 
     def run(
@@ -271,6 +269,7 @@ class Trainer:
             "poses": self.poses.state_dict(),
             "adam": export_state(self.adam),
             "average": self.averages.means,
+            "coherence": self.coherence.state(),
             "statistics": {"gradient": self.statistics.gradient, "seen": self.statistics.seen},
         }
         return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
@@ -295,6 +294,7 @@ class Trainer:
         self._begin(stage)
         if snapshot := saved.part("snapshot"):
             self._correct_by(Gaussians.from_tensors({k: v.to(device) for k, v in snapshot.items()}))
+        self.coherence.restore({k: v.to(device) for k, v in saved.part("coherence").items()})
         import_state(self.adam, saved.part("adam"))
         self.averages.means = {k: v.to(device) for k, v in saved.part("average").items()}
         self.statistics = GradientStatistics(on["statistics"]["gradient"], on["statistics"]["seen"])

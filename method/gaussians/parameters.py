@@ -128,6 +128,12 @@ def from_points(
     )
 
 
+def appended(gaussians: Gaussians, before: int) -> Edit:
+    """Return the edit that made Gaussians of the `before` first ones, which are unchanged."""
+    index = torch.arange(len(gaussians), device=gaussians.means.device)
+    return Edit(gaussians, torch.where(index < before, index, -1))
+
+
 def prune(gaussians: Gaussians, keep: Tensor) -> Edit:
     """Keep the Gaussians of the mask `keep` [N]."""
     index = torch.nonzero(keep)[:, 0]

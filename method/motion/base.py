@@ -47,6 +47,11 @@ class Motion(nn.Module):
         return 1
 
     @property
+    def coherence(self) -> float:
+        """Weight of `coherence.Coherence`, for a motion whose Gaussians have `coefficients` of cubic paths."""
+        return 0.0
+
+    @property
     def guided_rounds(self) -> int:
         """Number of times in a fit that the trainer asks for `guide`."""
         return 0

@@ -29,6 +29,7 @@ class PathSettings(PolynomialSettings):
 
     lr_coefficients: float = 1.4e-3  # of the polynomials, in scene scales a clip
     lr_coefficients_last: float = 1.4e-4
+    coherence: float = 0.02  # of neighbours' paths: white a pixel, for a departure of one pixel at the clip's ends
 
 
 class Paths(PolynomialMotion):
@@ -44,6 +45,11 @@ class Paths(PolynomialMotion):
         The cost of rendering does not grow with the clip.
         """
         return 2 * round((min(self.extent.n_ticks / PIECE_TICKS, self.extent.images / PIECE_IMAGES) - 1) / 2) + 1
+
+    @property
+    def coherence(self) -> float:
+        """See the base."""
+        return self.settings.coherence
 
     def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
         """Return the Gaussians as they are at the piece's end, or beginning, going straight on at their velocities."""

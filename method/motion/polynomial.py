@@ -20,11 +20,10 @@ from torch import Tensor
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.motion.coherence import CUBIC
 from spike4dgs.method.motion.polynomial_cpu import at_time_cpu
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats
-
-CUBIC = 9  # m1, m2, m3
 
 
 @dataclass(frozen=True)

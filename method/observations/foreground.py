@@ -17,7 +17,9 @@ from scipy.ndimage import binary_fill_holes
 from torch import Tensor
 
 from spike4dgs.method.observations.changes import MASKS, changing, without_specks
+from spike4dgs.method.observations.lookup import variation_at
 from spike4dgs.method.observations.projection import project
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import Views
 
 SMALLEST_PX = 20  # pixels of a part; noise makes smaller ones
@@ -55,6 +57,15 @@ def foreground_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:
     """
     hits, seen = _votes(points, views, masks)
     return (seen > 0) & (hits > MOST_VIEWS * seen)
+
+
+def moving_points(points: Tensor, images: TrainingImages, limit: float) -> Tensor:
+    """Return which points [N, 3] m move, bool [N]: those whose value varies by more than `limit` over the clip (white).
+
+    And those in the foreground: light is constant inside of a uniform surface, though it moves.
+    """
+    masks = foreground_masks(images.images)
+    return (variation_at(points, images) > limit) | foreground_points(points, images.views, masks)
 
 
 def stray_points(points: Tensor, views: Views, masks: Tensor) -> Tensor:

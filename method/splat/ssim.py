@@ -1,4 +1,4 @@
-"""Fused SSIM and L1 for training: value and gradient in one pass of numba kernels, with their plain torch twins.
+"""Fused SSIM and L1 or Huber's loss: value and gradient in one pass of numba kernels, with their twins in plain torch.
 
 SSIM (Wang et al. 2004) with the metric's Gaussian window (`ssim_window`), zero padding, data range 1, averaged over
 all pixels and images. The window is separable; the gradient needs three more blurs:
@@ -34,6 +34,7 @@ _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SSIM_SIGMA) ** 2)
 _WINDOW /= _WINDOW.sum()
 # From the window's edge to its middle. An argument of the kernel: numba's cache would keep constants of another module.
 _HALF = tuple(np.float32(w) for w in _WINDOW[: RADIUS + 1])
+_SHARP = 2.0**-100  # an ease at which Huber's loss is |d|, bit for bit
 _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 
 
@@ -46,17 +47,26 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     _check("ssim", image, target)
     if image.device.type != "cpu":
         return _mean_ssim(image, target, _banded)
-    value: Tensor = _Fused.apply(image, target, 1.0, 0.0)  # type: ignore[no-untyped-call]
+    value: Tensor = _Fused.apply(image, target, 1.0, 0.0, _SHARP)  # type: ignore[no-untyped-call]
     return value
 
 
-def l1_and_ssim(image: Tensor, target: Tensor, w: float) -> Tensor:
-    """Return (1 - w) mean |image - target| + w (1 - SSIM), the loss of 3DGS; images and errors as `ssim`."""
+def l1_and_ssim(image: Tensor, target: Tensor, w: float, ease: float = 0.0) -> Tensor:
+    """Return (1 - w) mean h(image - target) + w (1 - SSIM); images and errors as `ssim`.
+
+    h is |d|, which makes it the loss of 3DGS, or with an `ease` above 0 Huber's: d^2 / 2 ease up to it, |d| - ease / 2
+    beyond.
+    """
     _check("l1_and_ssim", image, target)
     if image.device.type != "cpu":
-        return (1 - w) * (image - target).abs().mean() + w * (1 - _mean_ssim(image, target, _banded))
-    value: Tensor = _Fused.apply(image, target, -w, 1 - w)  # type: ignore[no-untyped-call]
+        return (1 - w) * huber(image, target, ease) + w * (1 - _mean_ssim(image, target, _banded))
+    value: Tensor = _Fused.apply(image, target, -w, 1 - w, max(ease, _SHARP))  # type: ignore[no-untyped-call]
     return w + value
+
+
+def huber(image: Tensor, target: Tensor, ease: float) -> Tensor:
+    """Return the mean of h, see `l1_and_ssim`, by torch."""
+    return functional.huber_loss(image, target, delta=ease) / ease if ease else (image - target).abs().mean()
 
 
 def _check(name: str, image: Tensor, target: Tensor) -> None:
@@ -106,13 +116,13 @@ def _mean_ssim(image: Tensor, target: Tensor, blur: Callable[[Tensor], Tensor]) 
 
 
 class _Fused(torch.autograd.Function):
-    """`of_ssim` x mean SSIM + `of_l1` x mean |image - target|.
+    """`of_ssim` x mean SSIM + `of_l1` x mean h(image - target), |d| but for an `ease`.
 
     The gradient is computed with the value, while the blurred images are at hand.
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, of_ssim: float, of_l1: float) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, of_ssim: float, of_l1: float, ease: float) -> Tensor:
         batch, height, width = image.shape
         a = np.ascontiguousarray(image.detach().numpy(), dtype=np.float32)
         b = np.ascontiguousarray(target.numpy(), dtype=np.float32)
@@ -128,7 +138,7 @@ class _Fused(torch.autograd.Function):
             )
             for _ in range(workers)
         ]
-        weights = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size)
+        weights = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size), np.float32(ease), np.float32(1 / ease)
         threads.run(_loss_kernel, (a, b, _HALF, weights, sums, gradient), scratch)
         if image.requires_grad:
             ctx.save_for_backward(torch.from_numpy(gradient))
@@ -137,9 +147,9 @@ class _Fused(torch.autograd.Function):
         return torch.as_tensor((of_ssim * total[0] + of_l1 * total[1]) / a.size, dtype=image.dtype)
 
     @staticmethod
-    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return (gradient * outer[0]).to(ctx.dtype), None, None, None
+        return (gradient * outer[0]).to(ctx.dtype), None, None, None, None
 
 
 @helper
@@ -196,12 +206,13 @@ def _row_sum(row):  # type: ignore[no-untyped-def]
 def _loss_kernel(  # type: ignore[no-untyped-def]
     images, targets, half, weights, sums, gradients, counter, rows, line, maps
 ):
-    """Sums of SSIM and |image - target| of each image, and their gradient with the `weights`, if it is wanted.
+    """Sums of SSIM and h(image - target) of each image, and their gradient with the `weights`, if it is wanted.
 
-    `gradients` is empty where it is not.
+    `gradients` is empty where it is not. The last of the weights are the ease of h and its inverse.
     """
     batch, height, width = images.shape
-    of_ssim, of_l1 = weights
+    of_ssim, of_l1, ease, steep = weights
+    one, half_of = np.float32(1), np.float32(0.5)
     m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
     while True:
         i = fetch_add(counter, 0, 1)
@@ -214,7 +225,9 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
                 q1[y, x] = a[y, x] * a[y, x]
                 q2[y, x] = b[y, x] * b[y, x]
                 q12[y, x] = a[y, x] * b[y, x]
-                m1[y, x] = abs(a[y, x] - b[y, x])
+                far = abs(a[y, x] - b[y, x])
+                near = min(far, ease)
+                m1[y, x] = near * steep * (far - half_of * near)
             total += _row_sum(m1[y])
         sums[i, 1] = total
         _blur(a, m1, half, rows, line)
@@ -245,5 +258,5 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
             for y in range(height):
                 for x in range(width):
                     d = a[y, x] - b[y, x]
-                    slope = of_l1 if d > 0 else (-of_l1 if d < 0 else np.float32(0))
-                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + slope
+                    slope = max(-one, min(one, d * steep))
+                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + of_l1 * slope

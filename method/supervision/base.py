@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
-from spike4dgs.method.splat.ssim import l1_and_ssim
+from spike4dgs.method.splat.ssim import huber, l1_and_ssim
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +47,12 @@ class Supervision(nn.Module):
         return {}
 
 
-def difference(rendered: Tensor, image: Tensor, w: float) -> Tensor:
-    """Return (1 - w) mean |rendered - image| + w (1 - SSIM) of batches [V, H, W].
+def difference(rendered: Tensor, image: Tensor, w: float, ease: float = 0.0) -> Tensor:
+    """Return (1 - w) mean h(rendered - image) + w (1 - SSIM) of batches [V, H, W]; h is |d|, eased Huber's loss.
 
     A pixel of `image` that is no number counts as met, and has no gradient.
     """
     if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
         rendered = torch.where(finite, rendered, rendered.detach())
         image = known(image, rendered)
-    return l1_and_ssim(rendered, image, w) if w else (rendered - image).abs().mean()
+    return l1_and_ssim(rendered, image, w, ease) if w else huber(rendered, image, ease)

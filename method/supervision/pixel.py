@@ -13,23 +13,24 @@ from spike4dgs.method.supervision.base import Render, Sample, Supervision, diffe
 
 @dataclass(frozen=True)
 class PixelSettings(Settings):
-    """The weight of the supervision `pixel` (prefix `supervision`)."""
+    """Numbers of the supervision `pixel` (prefix `supervision`)."""
 
     ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs
+    ease: float = 0.0  # white, below which differences count squared: their mean counts, not their median
 
 
 class Pixel(Supervision):
     """(1 - w) mean |I - P| + w (1 - SSIM(I, P)), the loss of 3DGS.
 
-    w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14).
+    w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14). An `ease` makes |d| Huber's loss.
     """
 
     defaults = PixelSettings()
 
     def __init__(self, settings: PixelSettings, scene: TrainingScene) -> None:
         super().__init__()
-        self.ssim_weight = settings.ssim_weight
+        self.settings = settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """Return the loss of one rendered sample."""
-        return difference(render(sample.t), sample.images, self.ssim_weight)
+        return difference(render(sample.t), sample.images, self.settings.ssim_weight, self.settings.ease)

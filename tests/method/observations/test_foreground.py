@@ -13,9 +13,12 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.observations.foreground import (
     foreground_masks,
     foreground_points,
+    moving_points,
     moving_window,
     stray_points,
 )
+from spike4dgs.method.observations.lookup import variation_at
+from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import Views
 
 WORLD = ToyWorld(width=64, height=40, travel=0.3)
@@ -76,6 +79,18 @@ def test_points_of_the_board_move_and_those_of_wall_and_floor_do_not() -> None:
     assert moving[truth].mean() > 0.97
     assert moving[~truth].mean() < 0.15  # what the board's rim passes over
     assert np.array_equal(stray_points(points, Views.from_cameras(WORLD.cameras), masks).numpy(), ~moving)
+
+
+def test_points_inside_of_a_uniform_object_move_though_their_light_does_not_change() -> None:
+    view = Views(torch.eye(4)[None], torch.tensor([[[40.0, 0, 25], [0, 40, 15], [0, 0, 1]]]), 50, 30)
+    images = flat(0.005)[:, :1]
+    for t in range(len(images)):
+        images[t, :, 3 + t : 19 + t, 10 + t : 36 + t] = 0.9
+    seen = TrainingImages(view, tuple(range(9)), images, n_ticks=9)
+    inside, rim, outside = ((x, y) for x, y in ((27.5, 15.5), (36.5, 15.5), (5.5, 5.5)))
+    points = torch.tensor([[(x - 25) / 40, (y - 15) / 40, 1.0] for x, y in (inside, rim, outside)])
+    assert moving_points(points, seen, limit=0.03).tolist() == [True, True, False]
+    assert variation_at(points, seen)[0] < 0.01  # by itself it would be taken as still
 
 
 def test_points_outside_all_images_neither_move_nor_stray() -> None:

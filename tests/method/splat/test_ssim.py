@@ -10,6 +10,7 @@ from skimage.metrics import structural_similarity
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import set_threads
 from spike4dgs.method.splat.ssim import C1, _banded, _convolved, l1_and_ssim, ssim, ssim_reference
+from spike4dgs.method.supervision.base import difference
 
 
 def images(batch: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -43,6 +44,22 @@ def test_the_loss_equals_its_two_terms(shape: tuple[int, int, int], w: float) ->
     assert value.item() == pytest.approx(expected.item(), abs=1e-6)
     assert fast.grad is not None and slow.grad is not None
     assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm() + 1e-6
+
+
+@pytest.mark.parametrize("ease", [1e-3, 0.02, 0.1, 10.0])
+@pytest.mark.parametrize("w", [0.0, 0.2])
+def test_with_an_ease_it_is_hubers_loss(w: float, ease: float) -> None:
+    a, b = images(2, 30, 40)
+    fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
+    value = difference(fast, b, w, ease)
+    d = (slow - b.double()).abs()
+    huber = torch.where(d < ease, d * d / (2 * ease), d - ease / 2).mean()
+    expected = (1 - w) * huber + w * (1 - ssim_reference(slow, b.double()))
+    value.backward()
+    expected.backward()
+    assert value.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert fast.grad is not None and slow.grad is not None
+    assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm()
 
 
 @pytest.mark.parametrize("shape", [(1, 125, 200), (2, 7, 5), (1, 1, 1)])
