@@ -164,6 +164,7 @@ BEYOND = (
             "trainer.moving_change": 0.012,
             "trainer.coarse_steps": 500,
             "trainer.fine_steps": 1200,
+            "trainer.piece_steps": 400,  # as motion begins with the neighbouring piece's
             "density.max_moving_per_pixel": 0.5,
             "density.max_gaussians": 36_000,
             "supervision.ease": 0.02,  # a span's noise, which is off by up to a spike: the median of few is one of them
