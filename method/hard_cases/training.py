@@ -12,11 +12,13 @@ from torch import Tensor
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, worst
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.cameras import look_at
+from spike4dgs.method.motion.coherence import incoherence, incoherence_reference, neighbours
 from spike4dgs.method.motion.hexplane import sample_level
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.pose import solve_poses
 from spike4dgs.method.observations.instants import correction, node
 from spike4dgs.method.observations.training_images import Spans
+from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.ssim import ssim, ssim_reference
 from spike4dgs.method.supervision.spike_neuron import encode, firing_rate
 from spike4dgs.method.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
@@ -47,6 +49,8 @@ def cases() -> list[Case]:
               "bilinear lookups by torch, float64", "relative L2", 2e-5, _hexplane),
         _case("motion/tracking", "rigidity, rotation and isometry of points that coincide, or lie 1 km away",
               "plain torch, float64", "of the largest", 2e-3, _tracking),
+        _case("motion/coherence", "pulls on paths that are equal, 1e-6 m apart or 1 km; half of the points coincide",
+              "plain torch, float64", "of the largest", 1e-4, _coherence),
         _case("poses/pnp-scale", "poses from exact points in units of 1 mm, 1 m and 10 km", "the true poses", "degrees",
               1e-4, _pnp_scales),
         _case("poses/pnp-degenerate", "points that are NaN, equal, on a line, nonsense, infinite; no confidence",
@@ -151,6 +155,25 @@ def _hexplane(setting: Setting) -> Outcome:
         results.append([out.detach(), *(x.grad for x in leaves[1:])])
     names = ("features", "gradient of planes", "gradient of lines")
     return worst({n: compare(a, b, relative=True) for n, a, b in zip(names, *results, strict=True)})
+
+
+def _coherence(setting: Setting) -> Outcome:
+    rng, outcomes = setting.rng(), {}
+    means = torch.tensor(rng.uniform(-1, 1, (400, 3)) + [0, 0, 5], dtype=torch.float32)
+    means[200:] = means[:200]
+    views = Views(torch.eye(4)[None], torch.tensor([[[200.0, 0, 100], [0, 200, 60], [0, 0, 1]]]), 200, 120)
+    near = neighbours(means, views)
+    for name, spread in (("equal", 0.0), ("1e-6 m", 1e-6), ("1 km", 1e3)):
+        fast = torch.tensor(
+            rng.normal(size=9) + spread * rng.normal(size=(400, 9)), dtype=torch.float32
+        ).requires_grad_()
+        slow = fast.detach().double().requires_grad_()
+        incoherence(fast, near).backward()
+        incoherence_reference(slow, near).backward()
+        assert fast.grad is not None and slow.grad is not None
+        largest = float(near.pixels.max()) / 2
+        outcomes[name] = compare(fast.grad.numpy() / largest, slow.grad.numpy() / largest)
+    return worst(outcomes)
 
 
 def _tracking(setting: Setting) -> Outcome:

@@ -36,7 +36,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbors:
+class Neighbours:
     """The neighbours of Gaussians and what a metre is in pixels."""
 
     index: Tensor  # int64 [N, K]; K = 0 where there are too few Gaussians
@@ -48,14 +48,14 @@ class Coherence:
 
     def __init__(self, weight: float, views: Views) -> None:
         self.weight, self.views = weight / (views.width * views.height), views
-        self.near: Neighbors | None = None
+        self.near: Neighbours | None = None
 
     def __call__(self, gaussians: Gaussians) -> Tensor:
         """Return the term. The neighbours are those of the first call, until they are forgotten."""
         if not self.weight:
             return torch.zeros(())
         if self.near is None:
-            self.near = neighbors(gaussians.means, self.views)
+            self.near = neighbours(gaussians.means, self.views)
         return self.weight * incoherence(gaussians.extra["coefficients"], self.near)
 
     def forget(self) -> None:
@@ -68,21 +68,21 @@ class Coherence:
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on with the neighbours of a `state`."""
-        self.near = Neighbors(**state) if state else None
+        self.near = Neighbours(**state) if state else None
 
 
-def neighbors(means: Tensor, views: Views) -> Neighbors:
+def neighbours(means: Tensor, views: Views) -> Neighbours:
     """Return the `NEAREST` neighbours of Gaussians at `means` [N, 3]; none where there are no more than these."""
     x = means.detach()
     depth = x @ views.w2c[0, 2, :3].to(x) + views.w2c[0, 2, 3].to(x)
     pixels = torch.where(depth > 0, views.K[0, 0, 0].to(x) / depth, 0.0)  # behind the view: as if it were far away
     if len(x) <= NEAREST:
-        return Neighbors(torch.zeros(len(x), 0, dtype=torch.int64, device=x.device), pixels)
+        return Neighbours(torch.zeros(len(x), 0, dtype=torch.int64, device=x.device), pixels)
     found = cKDTree(x.cpu().numpy()).query(x.cpu().numpy(), k=NEAREST + 1)[1][:, 1:]
-    return Neighbors(torch.from_numpy(np.ascontiguousarray(found)).to(x.device), pixels)
+    return Neighbours(torch.from_numpy(np.ascontiguousarray(found)).to(x.device), pixels)
 
 
-def incoherence(coefficients: Tensor, near: Neighbors) -> Tensor:
+def incoherence(coefficients: Tensor, near: Neighbours) -> Tensor:
     """Return the sum of the module's text, in pixels, for the coefficients [N, 9] of cubic paths; differentiable."""
     if near.index.shape[1] == 0:
         return coefficients.sum() * 0.0
@@ -92,7 +92,7 @@ def incoherence(coefficients: Tensor, near: Neighbors) -> Tensor:
     return value
 
 
-def incoherence_reference(coefficients: Tensor, near: Neighbors) -> Tensor:
+def incoherence_reference(coefficients: Tensor, near: Neighbours) -> Tensor:
     """Return the same by plain torch, in the precision of the input: the twin of the kernel."""
     shares = torch.tensor(SHARES).to(coefficients)
     departure = (coefficients - coefficients[near.index].mean(1)) * shares * near.pixels.to(coefficients)[:, None]
@@ -103,7 +103,7 @@ class _Incoherence(torch.autograd.Function):
     """The gradient is computed with the value: they share the neighbours' means."""
 
     @staticmethod
-    def forward(ctx: Any, coefficients: Tensor, near: Neighbors) -> Tensor:
+    def forward(ctx: Any, coefficients: Tensor, near: Neighbours) -> Tensor:
         gradient = np.zeros(coefficients.shape, np.float32)
         given = coefficients.detach().contiguous().numpy(), near.index.numpy(), near.pixels.numpy()
         value = _sum(*given, np.asarray(SHARES, np.float32), np.float32(EASE), gradient)

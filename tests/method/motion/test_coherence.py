@@ -13,10 +13,10 @@ from spike4dgs.method.motion.coherence import (
     EASE,
     NEAREST,
     Coherence,
-    Neighbors,
+    Neighbours,
     incoherence,
     incoherence_reference,
-    neighbors,
+    neighbours,
 )
 from spike4dgs.method.splat import Views
 
@@ -49,7 +49,7 @@ def gaussians(means: Tensor, coefficients: Tensor) -> Gaussians:
 @pytest.mark.parametrize("n", [NEAREST + 1, 50, 3000])
 def test_value_and_gradient_are_those_of_the_twin(n: int, spread: float) -> None:
     means = torch.rand(n, 3, generator=torch.Generator().manual_seed(n)) + torch.tensor([0, 0, DEPTH])
-    near = neighbors(means, VIEWS)
+    near = neighbours(means, VIEWS)
     fast = paths(n, spread=spread).requires_grad_()
     slow = fast.detach().double().requires_grad_()
     found, expected = incoherence(fast, near), incoherence_reference(slow, near)
@@ -64,7 +64,7 @@ def test_value_and_gradient_are_those_of_the_twin(n: int, spread: float) -> None
 @pytest.mark.parametrize("n", [0, 1, NEAREST])
 def test_few_gaussians_have_no_neighbours(n: int) -> None:
     own = paths(n).requires_grad_()
-    value = incoherence(own, neighbors(torch.rand(n, 3) + DEPTH, VIEWS))
+    value = incoherence(own, neighbours(torch.rand(n, 3) + DEPTH, VIEWS))
     value.backward()
     assert value.item() == 0 and own.grad is not None and not own.grad.any()
 
@@ -72,7 +72,7 @@ def test_few_gaussians_have_no_neighbours(n: int) -> None:
 def test_what_moves_as_one_pays_nothing() -> None:
     means = cube()
     own = paths(1).expand(len(means), 9).contiguous().requires_grad_()
-    value = incoherence(own, neighbors(means, VIEWS))
+    value = incoherence(own, neighbours(means, VIEWS))
     value.backward()
     assert abs(value.item()) < 1e-4
     assert own.grad is not None and own.grad.abs().max() < 1e-2  # of float32's 1e-7 m, in pixels, over the ease
@@ -81,9 +81,9 @@ def test_what_moves_as_one_pays_nothing() -> None:
 def test_velocities_of_a_rotation_and_a_stretch_pay_nothing_inside() -> None:
     means = cube()
     spin, stretch = torch.tensor([[0.0, -2, 0], [2, 0, 1], [0, -1, 0]]), torch.diag(torch.tensor([0.3, 0, -0.2]))
-    near = neighbors(means, VIEWS)
+    near = neighbours(means, VIEWS)
     middle = ((means - means.mean(0)).abs() < (INNER + 0.1) * 0.02).all(1)
-    inside = Neighbors(near.index, near.pixels * middle)  # weighs the others with nothing
+    inside = Neighbours(near.index, near.pixels * middle)  # weighs the others with nothing
     linear = velocities((means - means.mean(0)) @ (spin + stretch).T)
     assert incoherence(linear, near).item() > 10
     assert incoherence(linear, inside).item() < 1e-3
@@ -92,7 +92,7 @@ def test_velocities_of_a_rotation_and_a_stretch_pay_nothing_inside() -> None:
 def test_one_that_departs_pays_for_itself_and_its_neighbours() -> None:
     means = cube()
     middle = int((means - means.mean(0)).norm(dim=1).argmin())
-    near = neighbors(means, VIEWS)
+    near = neighbours(means, VIEWS)
     own = torch.zeros(len(means), 9)
     own[middle, 3] = 0.4  # m2 along x: a quarter of it at the clip's ends
     at = means[:, 2]
@@ -109,7 +109,7 @@ def test_one_that_departs_pays_for_itself_and_its_neighbours() -> None:
 def test_a_gaussian_behind_the_view_does_not_count() -> None:
     means = cube()
     means[:, 2] -= 2 * DEPTH
-    assert incoherence(paths(len(means)), neighbors(means, VIEWS)).item() == 0
+    assert incoherence(paths(len(means)), neighbours(means, VIEWS)).item() == 0
 
 
 def test_neighbours_stay_until_they_are_forgotten_and_pass_through_a_state() -> None:
@@ -118,7 +118,7 @@ def test_neighbours_stay_until_they_are_forgotten_and_pass_through_a_state() -> 
     first, second = Coherence(2.0, VIEWS), Coherence(2.0, VIEWS)
     assert first.state() == {}
     value = first(gaussians(means, own))
-    assert value.item() == pytest.approx(2 / 4800 * incoherence_reference(own, neighbors(means, VIEWS)).item())
+    assert value.item() == pytest.approx(2 / 4800 * incoherence_reference(own, neighbours(means, VIEWS)).item())
     assert torch.equal(first(gaussians(moved, own)), value)
     second.restore(first.state())
     assert torch.equal(second(gaussians(moved, own)), value)
@@ -146,7 +146,7 @@ def test_motion_spreads_from_the_rim_over_a_flat_surface() -> None:
     truth = torch.zeros(2 * n, 9)
     truth[:n, 0], truth[n:, 1] = 0.2, -0.1
     own = torch.where(known[:, None], truth, 0.0).requires_grad_()
-    near = neighbors(everything, VIEWS)
+    near = neighbours(everything, VIEWS)
     adam = torch.optim.Adam([own], lr=0.01)
     for _ in range(400):
         adam.zero_grad()
