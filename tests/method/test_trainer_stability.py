@@ -29,7 +29,7 @@ class PixelTwin(Pixel):
     """The pixel loss in the precision of its inputs."""
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
-        image, w = render(sample.t), self.ssim_weight
+        image, w = render(sample.t), self.settings.ssim_weight
         return (1 - w) * (image - sample.images).abs().mean() + w * (1 - ssim_reference(image, sample.images))
 
 
@@ -84,8 +84,8 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 
 @pytest.mark.slow
 def test_three_seeds_agree() -> None:
-    """With as many steps as a fit has: after a quarter of them they are 0.3 dB apart."""
+    """With as many steps as a fit has. Eight seeds have a standard deviation of 0.2 dB, so three are hardly 0.7 apart."""
     long = method("paths", {"trainer.fine_steps": 900})
     fits = [long.fit(WORLD.training, request(seed)) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
-    assert max(scores) - min(scores) < 0.3
+    assert max(scores) - min(scores) < 0.7
