@@ -84,7 +84,7 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 
 @pytest.mark.slow
 def test_three_seeds_agree() -> None:
-    """With as many steps as a fit has. Eight seeds have a standard deviation of 0.2 dB, so three are hardly 0.7 apart."""
+    """With as many steps as a fit has. Eight seeds have a standard deviation of 0.2 dB: three are hardly 0.7 apart."""
     long = method("paths", {"trainer.fine_steps": 900})
     fits = [long.fit(WORLD.training, request(seed)) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
