@@ -140,6 +140,20 @@ _FAST: dict[str, Any] = {
     "motion.lr_temporal_scales": 0.01,
 }
 
+# What `spike4dgs-x` takes with and without calibrations.
+_PATHS: dict[str, Any] = {
+    **_CLEAN,
+    **_FAST,
+    "images.max_times": 100,  # of a clip of 100 ms: twice as many make its fit no better
+    "trainer.freeze_background": True,
+    "trainer.moving_change": 0.012,
+    "trainer.coarse_steps": 500,
+    "trainer.fine_steps": 1200,
+    "trainer.piece_steps": 400,  # as motion begins with the neighbouring piece's
+    "density.max_moving_per_pixel": 0.5,
+    "density.max_gaussians": 36_000,
+}
+
 # Beyond the paper. `spike4dgs-x`: every pixel's rate over the longest window of the clip that constant light explains,
 # and where light changes the mean over a known span, which the fit's own model makes an instant; corrected by the
 # cameras' calibration; what does not move is fitted first and becomes a background; what moves follows paths of its
@@ -156,34 +170,16 @@ BEYOND = (
         "pixel",
         {
             **_FLAT,
-            **_CLEAN,
-            **_FAST,
-            "images.max_times": 100,  # of a clip of 100 ms: twice as many make its fit no better
+            **_PATHS,
             # Corrected means of a clip have hardly any noise: a road's grain is enough to find its depth.
             "initialization.noise": 3e-5,
-            "trainer.freeze_background": True,
-            "trainer.moving_change": 0.012,
-            "trainer.coarse_steps": 500,
-            "trainer.fine_steps": 1200,
-            "trainer.piece_steps": 400,  # as motion begins with the neighbouring piece's
-            "density.max_moving_per_pixel": 0.5,
-            "density.max_gaussians": 36_000,
             "supervision.ease": 0.02,  # a span's noise, which is off by up to a spike: the median of few is one of them
         },
     ),
 )
 # The same without the calibrations: it estimates the cameras' fixed patterns from the clip, beside the scene. Its first
 # points come from images with these patterns in them.
-SELF_CALIBRATED = replace(
-    BEYOND[-1],
-    name="spike4dgs-x+self-calibrated",
-    supervision="fixed-pattern",
-    settings={
-        **{name: value for name, value in BEYOND[-1].settings.items() if not name.startswith("supervision.")},
-        "images.flat_field": False,
-        "initialization.noise": RigSettings().noise,
-    },
-)
+SELF_CALIBRATED = Recipe("spike4dgs-x+self-calibrated", "intervals", "rig", "paths", "fixed-pattern", _PATHS)
 
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
 SUPERVISED = tuple(

@@ -164,9 +164,8 @@ def _coherence(setting: Setting) -> Outcome:
     views = Views(torch.eye(4)[None], torch.tensor([[[200.0, 0, 100], [0, 200, 60], [0, 0, 1]]]), 200, 120)
     near = neighbours(means, views)
     for name, spread in (("equal", 0.0), ("1e-6 m", 1e-6), ("1 km", 1e3)):
-        fast = torch.tensor(
-            rng.normal(size=9) + spread * rng.normal(size=(400, 9)), dtype=torch.float32
-        ).requires_grad_()
+        paths = rng.normal(size=9) + spread * rng.normal(size=(400, 9))
+        fast = torch.tensor(paths, dtype=torch.float32).requires_grad_()
         slow = fast.detach().double().requires_grad_()
         incoherence(fast, near).backward()
         incoherence_reference(slow, near).backward()
