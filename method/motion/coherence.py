@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from spike4dgs.method.gaussians.neighbours import nearest
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.kernels.jit import kernel
@@ -78,8 +78,7 @@ def neighbours(means: Tensor, views: Views) -> Neighbours:
     pixels = torch.where(depth > 0, views.K[0, 0, 0].to(x) / depth, 0.0)  # behind the view: as if it were far away
     if len(x) <= NEAREST:
         return Neighbours(torch.zeros(len(x), 0, dtype=torch.int64, device=x.device), pixels)
-    found = cKDTree(x.cpu().numpy()).query(x.cpu().numpy(), k=NEAREST + 1)[1][:, 1:]
-    return Neighbours(torch.from_numpy(np.ascontiguousarray(found)).to(x.device), pixels)
+    return Neighbours(nearest(x, NEAREST)[0], pixels)
 
 
 def incoherence(coefficients: Tensor, near: Neighbours) -> Tensor:

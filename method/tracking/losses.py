@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.gaussians.neighbours import nearest
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.tracking.losses_cpu import weighted_terms
 
@@ -44,23 +45,14 @@ def find_neighbours(points: Tensor, k: int) -> Neighbours:
 
     Raises UserError for fewer than two points, and where most neighbours coincide.
     """
-    from scipy.spatial import cKDTree
-
     if len(points) < 2:
         raise problem("tracking", "at least 2 moving Gaussians", str(len(points)), "use a recipe for static scenes")
-    at = points.detach().cpu().double().numpy()
-    k = min(k, len(points) - 1)
-    distance, index = cKDTree(at).query(at, k=k + 1)
-    # A point is not always its own first neighbour: coincident points come in any order.
-    itself = torch.as_tensor(index) == torch.arange(len(points))[:, None]  # [N, k + 1]
-    itself[:, -1] |= ~itself.any(dim=1)
-    order = torch.as_tensor(index)[~itself].view(-1, k)
-    lengths = torch.as_tensor(distance)[~itself].view(-1, k)
+    order, lengths = nearest(points, min(k, len(points) - 1))
     unit = float(lengths.median()) * math.sqrt(SHARPNESS)
     if unit == 0:
         raise problem("tracking", "Gaussians at different positions", "coincident ones", "correct the initialization")
     rest = (lengths / unit).to(points)
-    return Neighbours(order.to(points.device), torch.exp(-0.5 * SHARPNESS * rest**2), rest, unit)
+    return Neighbours(order, torch.exp(-0.5 * SHARPNESS * rest**2), rest, unit)
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
