@@ -185,7 +185,7 @@ SELF_CALIBRATED = Recipe(
     "rig",
     "paths",
     "fixed-pattern",
-    {**_PATHS, "initialization.noise": 1e-4, "trainer.coarse_steps": 800},
+    {**_PATHS, "initialization.noise": 1e-4, "trainer.coarse_steps": 800, "motion.coherence": 0.005},
 )
 
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.

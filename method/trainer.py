@@ -58,9 +58,9 @@ class Trainer:
         scale: float,
         seed: int,
     ) -> None:
-        if settings.refine_poses and settings.freeze_background:
-            fix = "choose one of them: a background is projected once"
-            raise problem("settings", "trainer.refine_poses or trainer.freeze_background", "both", fix)
+        if settings.refine_poses and (settings.freeze_background or images.spans is not None):
+            expected = "either trainer.refine_poses, or trainer.freeze_background and images of known spans"
+            raise problem("settings", expected, "both", "choose one: the latter are rendered from the given poses")
         if settings.average > 1 - density.until:
             expected = f"trainer.average of at most {1 - density.until:g}, as density.until is {density.until:g}"
             raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")

@@ -29,6 +29,7 @@ from spike4dgs.baselines.spike_to_image.adaptive import (
     shared_levels,
 )
 from spike4dgs.baselines.spike_to_image.base import Float32, ImageMaker
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import spike_times
@@ -40,6 +41,11 @@ class IntervalSettings(AdaptiveSettings):
 
     half: float = 6.0  # ticks on either side, at most: in twice that, what is fast moves about a pixel
     still: float = 80.0  # ticks on either side for which light must be constant to be taken as such
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.half >= self.shortest and self.still > 0):
+            raise problem("intervals", "half not below shortest, still above 0", str(self), "correct the settings")
 
 
 def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:

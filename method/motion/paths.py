@@ -29,7 +29,7 @@ class PathSettings(PolynomialSettings):
 
     lr_coefficients: float = 1.4e-3  # of the polynomials, in scene scales a clip
     lr_coefficients_last: float = 1.4e-4
-    coherence: float = 0.005  # of neighbours' paths: white a pixel, for a departure of one pixel at the clip's ends
+    coherence: float = 0.01  # of neighbours' paths: white a pixel, for a departure of one pixel at the clip's ends
 
 
 class Paths(PolynomialMotion):

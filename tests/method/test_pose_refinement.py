@@ -118,6 +118,21 @@ def test_a_resumed_fit_has_the_same_poses(tmp_path: Path) -> None:
         assert a.id == "cam_00" or not np.array_equal(a.w2c, start.w2c)
 
 
-def test_a_background_has_fixed_poses() -> None:
-    with pytest.raises(UserError, match="expected trainer.refine_poses or trainer.freeze_background, found both"):
-        method(freeze_background=True).fit(SCENE, FitRequest())
+class Spanned:
+    """A stand-in for the images part whose values are means over ten ticks."""
+
+    def __call__(self, *args: object) -> np.ndarray:
+        raise AssertionError("asked for images without their spans")
+
+    def with_spans(self, stream: object, ticks: list[int], *_: object) -> tuple[np.ndarray, np.ndarray]:
+        images = truth(stream, ticks, 1.0)
+        ends = np.array([-5, 5], np.float32)[None, :, None, None]
+        return images, np.broadcast_to(ends, (len(ticks), 2, *images.shape[1:]))
+
+
+@pytest.mark.parametrize(("images", "freeze"), [("truth", True), ("spanned", False)])
+def test_backgrounds_and_means_over_time_have_fixed_poses(images: str, freeze: bool) -> None:
+    recipe = method(freeze_background=freeze).recipe
+    parts = replace(PARTS, images={"truth": truth, "spanned": Spanned()})
+    with pytest.raises(UserError, match="either trainer.refine_poses, or .* found both"):
+        RecipeMethod(replace(recipe, images=images), parts).fit(SCENE, FitRequest())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -10,6 +11,7 @@ from spike4dgs.baselines.spike_to_image.adaptive import AdaptiveSettings, adapti
 from spike4dgs.baselines.spike_to_image.intervals import IntervalSettings, intervals
 from spike4dgs.baselines.spike_to_image.reference import slow_intervals
 from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 
@@ -51,6 +53,12 @@ def test_rates_and_spans_are_those_of_the_definition(n, bottom_up, half, still, 
     slow_rate, slow_spans = slow_intervals(spikes, tick, s)
     np.testing.assert_allclose(rate, slow_rate, rtol=1e-6)
     np.testing.assert_allclose(spans, slow_spans, rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"half": 1.9}, {"half": -6.0}, {"still": 0.0}, {"shortest": 7.0}, {"growth": 1.0}])
+def test_settings_without_a_meaning_are_refused(wrong):
+    with pytest.raises(UserError, match="correct the settings"):
+        IntervalSettings(**wrong)
 
 
 def test_constant_light_keeps_the_long_windows_of_adaptive():
