@@ -32,7 +32,7 @@ def set_threads(count: int) -> None:
         raise problem("set_threads", "at least 1", str(count), "pass the number of cores to use")
     with _lock:
         if _tasks is not None:
-            for _ in range(max(_threads - 1, 1)):
+            for _ in range(_threads - 1):
                 _tasks.put(None)
         _threads, _tasks = count, None
 
@@ -117,7 +117,7 @@ def _helpers() -> SimpleQueue[_Task | None]:
     with _lock:
         if _tasks is None:
             _tasks = SimpleQueue()
-            for t in range(max(_threads - 1, 1)):
+            for t in range(_threads - 1):
                 threading.Thread(target=_serve, args=(_tasks,), name=f"splat_{t}", daemon=True).start()
         return _tasks
 
