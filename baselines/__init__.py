@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from spike4dgs.benchmark.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from spike4dgs.baselines.images.table import IMAGES, ImageMaker, make_image
     from spike4dgs.baselines.recipes import METHODS
-    from spike4dgs.baselines.spike_to_image.table import IMAGES, ImageMaker, make_image
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "recipes": ("METHODS",),
-            "spike_to_image.table": ("IMAGES", "ImageMaker", "make_image"),
+            "images.table": ("IMAGES", "ImageMaker", "make_image"),
         },
     )
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.array.shared_time import local_ticks
 from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.images import ImageMaker
+from spike4dgs.benchmark.scene.shared_time import local_ticks
+from spike4dgs.method.images.training import ImageMaker
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,16 +12,26 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from spike4dgs.baselines.descriptions import describe
-from spike4dgs.baselines.held_out_pose import PosedRecipe
-from spike4dgs.baselines.initialization.colmap import (
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.nearest_view import NearestView
+from spike4dgs.baselines.radiance_field import RADIANCE_FIELD
+from spike4dgs.baselines.starts.colmap import (
     ColmapSettings,
     UncalibratedSettings,
     colmap,
     colmap_uncalibrated,
 )
-from spike4dgs.baselines.initialization.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.initialization.msdi import (
+from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
+from spike4dgs.baselines.tracking.fit import TRACKING
+from spike4dgs.benchmark.method import GIVEN, Method, Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.descriptions import describe
+from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
+from spike4dgs.method.held_out_pose import PosedRecipe
+from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.settings import S
+from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.starts.msdi import (
     MsdiMatchedSettings,
     MsdiSettings,
     MsdiUncalibratedSettings,
@@ -29,18 +39,8 @@ from spike4dgs.baselines.initialization.msdi import (
     msdi_matched,
     msdi_uncalibrated,
 )
-from spike4dgs.baselines.initialization.rig import RigSettings, rig
-from spike4dgs.baselines.nearest_view import NearestView
-from spike4dgs.baselines.spike_to_image.table import IMAGES
-from spike4dgs.benchmark.method import GIVEN, Method, Recipe
-from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
-from spike4dgs.method.initialization import Initialization, Start
-from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.radiance_field import RADIANCE_FIELD
-from spike4dgs.method.settings import S
+from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.tracking.fit import TRACKING
 
 
 def _seeded(start: Callable[[TrainingScene, int, S], Start], settings: S) -> Initialization:

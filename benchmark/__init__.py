@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Recipe, find_methods, get_method
     from spike4dgs.benchmark.metrics.measure import score_image
     from spike4dgs.benchmark.metrics.table import METRICS
-    from spike4dgs.benchmark.results.dataframe import records_to_dataframe
-    from spike4dgs.benchmark.results.record import read_record
-    from spike4dgs.benchmark.results.score import score_predictions
+    from spike4dgs.benchmark.runs.dataframe import records_to_dataframe
+    from spike4dgs.benchmark.runs.record import read_record
+    from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.cameras import Camera
     from spike4dgs.benchmark.scene.scene import Scene, Target, TrainingScene, open_scene
     from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
@@ -23,9 +23,9 @@ else:
             "method": ("Budget", "FitRequest", "Method", "Model", "Recipe", "find_methods", "get_method"),
             "metrics.measure": ("score_image",),
             "metrics.table": ("METRICS",),
-            "results.dataframe": ("records_to_dataframe",),
-            "results.record": ("read_record",),
-            "results.score": ("score_predictions",),
+            "runs.dataframe": ("records_to_dataframe",),
+            "runs.record": ("read_record",),
+            "runs.score": ("score_predictions",),
             "scene.cameras": ("Camera",),
             "scene.scene": ("Scene", "Target", "TrainingScene", "open_scene"),
             "spikes.stream": ("SpikeStream", "open_stream"),

@@ -13,13 +13,13 @@ from typing import Any
 from mkdocs.exceptions import PluginError
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard")
+ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard", "cli", "studies")
 SOURCES = ROOT / "build" / "docs" / "spike4dgs"  # links to the rooms, under the name that they are imported by
 PAGES = {  # files outside docs/ that have a page on the site
     "CONTRIBUTING.md": "docs/contributing.md",
     "examples/README.md": "docs/external_methods.md",
     "method/msdi/README.md": "docs/methods/msdi_card.md",
-    "baselines/spike_to_image/spk2img/README.md": "docs/methods/spk2img_card.md",
+    "baselines/images/spk2img/README.md": "docs/methods/spk2img_card.md",
 }
 _TEXT_ONLY = "    options: {members: false, show_root_heading: false, show_root_toc_entry: false}\n"
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)

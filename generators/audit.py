@@ -17,10 +17,10 @@ from spike4dgs.benchmark.scene.images import read_exr, read_mask
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.generators.ground_truth import mask_file
 from spike4dgs.generators.profiles import RATE_HZ, Job
+from spike4dgs.generators.render_tasks import cameras_of, held_out_view, world_of
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.tasks import cameras_of, held_out_view, world_of
 
 _TICKS, _VIEWS, _FRAMES = 4, 3, 3
 _MORE = 4  # times the samples of a key or of ground truth

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation, binary_opening
 from spike4dgs.benchmark.scene.images import gray, write_exr, write_geometry, write_mask
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.tasks import Truth
+from spike4dgs.generators.render_tasks import Truth
 
 _MASK_GROW_PX = 2
 _MASK_CHANGE = 0.1  # relative change of radiance that counts as moving light

@@ -85,8 +85,8 @@ def make_dataset(
     from spike4dgs.benchmark.runs.executors import executor
     from spike4dgs.benchmark.scene.cameras import check_lens
     from spike4dgs.generators.check.check import check_scenes, find_references
+    from spike4dgs.generators.render_tasks import cameras_of
     from spike4dgs.generators.rendering.mitsuba_variant import choose_device, pick_variant
-    from spike4dgs.generators.tasks import cameras_of
 
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:
@@ -166,7 +166,7 @@ def _job(world: str, profile: str, seed: int, variant: int, seconds: float | Non
 
 def _lens(values: tuple[float, ...], audit: bool) -> tuple[float, ...]:
     """Return the five coefficients of a lens, none for a pinhole. Raises UserError for others than numbers."""
-    from spike4dgs.benchmark.array.lens import NAMES, make_distortion
+    from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 
     if len(values) > len(NAMES) or not all(map(math.isfinite, values)):
         raise problem("--lens", f"at most {len(NAMES)} numbers: {', '.join(NAMES)}", str(values), "correct it")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from spike4dgs.benchmark.array.lens import Distortion
+from spike4dgs.benchmark.scene.lens import Distortion
 
 RATE_HZ = 20_000
 TARGET_EVERY = RATE_HZ // 1000  # ticks between ground-truth frames: 1 ms

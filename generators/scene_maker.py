@@ -33,16 +33,16 @@ from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
-from spike4dgs.generators import streams, tasks
+from spike4dgs.generators import render_tasks, streams
 from spike4dgs.generators.audit import audit
+from spike4dgs.generators.contact_sheet import contact_sheet
 from spike4dgs.generators.ground_truth import mask_file, write_truth
+from spike4dgs.generators.preview import preview
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import StaticViews
-from spike4dgs.generators.reports.contact_sheet import contact_sheet
-from spike4dgs.generators.reports.preview import preview
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 LICENCE = "CC0-1.0"
@@ -93,17 +93,17 @@ class Maker:
     @cached_property
     def world(self) -> WorldScene:
         """The world as this job builds it."""
-        return tasks.world_of(self.job)
+        return render_tasks.world_of(self.job)
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras of the profile."""
-        return tasks.cameras_of(self.job)
+        return render_tasks.cameras_of(self.job)
 
     @cached_property
     def plan(self) -> KeyPlan:
         """The ticks at which each pixel is rendered."""
-        return tasks.plan_of(self.job)
+        return render_tasks.plan_of(self.job)
 
     @property
     def _work(self) -> Path:
@@ -121,7 +121,7 @@ class Maker:
     @cached_property
     def targets(self) -> tuple[Target, ...]:
         """All ground-truth images: each millisecond at the held-out camera, sparse ticks at the others."""
-        held_out = tasks.held_out_view(self.job)
+        held_out = render_tasks.held_out_view(self.job)
         dense, sparse = self.job.target_ticks, self.job.sparse_ticks
         return tuple(Target(c.id, t) for v, c in enumerate(self.cameras) for t in (dense if v == held_out else sparse))
 
@@ -166,7 +166,7 @@ class Maker:
         if self.store.has_static and path.is_file():
             return
         for _ in self.watch("background", range(1), 1):
-            (static,) = self.run(tasks.RenderStatic(self.job), [None])
+            (static,) = self.run(render_tasks.RenderStatic(self.job), [None])
             self.store.set_static(static.views)
             write_arrays(path, {"first": static.target_first, "points": static.points})
 
@@ -176,7 +176,7 @@ class Maker:
             return
 
         def keys() -> Iterator[int]:
-            for chunk in self.run(tasks.RenderKeys(self.job, self.store.static()), chunked(missing)):
+            for chunk in self.run(render_tasks.RenderKeys(self.job, self.store.static()), chunked(missing)):
                 for tick, arrays in chunk:
                     self.store.put(tick, arrays)
                     yield tick
@@ -193,7 +193,7 @@ class Maker:
 
         def truths() -> Iterator[Target]:
             ticks = chunked(sorted({t.tick for t in missing}), 2)
-            for chunk in self.run(tasks.RenderTargets(self.job, static), ticks):
+            for chunk in self.run(render_tasks.RenderTargets(self.job, static), ticks):
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
                     if target in missing:
@@ -211,7 +211,7 @@ class Maker:
     def _describe(self) -> None:
         for part in self._scene.rglob(".*.part*"):  # left behind by a killed process
             part.unlink()
-        job, held_out = self.job, self.cameras[tasks.held_out_view(self.job)].id
+        job, held_out = self.job, self.cameras[render_tasks.held_out_view(self.job)].id
         splits = standard_splits(self.cameras, held_out)
         scored = {c for split in splits.values() for c in split.test}
         finish_scene(
@@ -239,7 +239,7 @@ class Maker:
                 extras=streams.extras(job) | {"instances": self._object_names},
             ),
         )
-        clip, scene = self.store.instants(tasks.held_out_view(job), self.plan), open_scene(self._scene)
+        clip, scene = self.store.instants(render_tasks.held_out_view(job), self.plan), open_scene(self._scene)
         preview(clip.keys, clip.ticks, scene.stream(held_out), scene.radiance_gain, self._scene / "preview.webp")
         contact_sheet(scene, self._scene / "sheet.png")
         write_manifest(self._scene)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.generators.profiles import RATE_HZ
+from spike4dgs.generators.render_tasks import cameras_of, held_out_view, recorded_job, world_of
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.tasks import cameras_of, held_out_view, recorded_job, world_of
 
 _SEEDS = (1_000_003, 2_000_003)  # added to a scene's seed; its own files use the next few after it
 

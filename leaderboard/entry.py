@@ -20,7 +20,7 @@ from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.locks import locked
-from spike4dgs.benchmark.results.record import Record, check_form, check_method_name, check_record, with_later_metrics
+from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.ledger import NAME as LEDGER
 from spike4dgs.leaderboard.ledger import Ledger, add_line, read_ledger

@@ -19,7 +19,7 @@ from typing import Any
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
-from spike4dgs.benchmark.results.record import COSTS, is_complete
+from spike4dgs.benchmark.runs.record import COSTS, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry, read_entries
 from spike4dgs.leaderboard.flags import flags_of

@@ -14,9 +14,9 @@ from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import PAPER, Budget, Method, get_method
-from spike4dgs.benchmark.results.record import COSTS, Record
-from spike4dgs.benchmark.results.refinement import SUFFIX
 from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.runs.record import COSTS, Record
+from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene
 

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.environment import environment, harness, utc_now
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
-from spike4dgs.benchmark.results.record import Record, read_record
+from spike4dgs.benchmark.runs.record import Record, read_record
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import (
     CLAIMED,

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.results.predictions import Predictions
+from spike4dgs.benchmark.runs.predictions import Predictions
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
 Float64 = NDArray[np.float64]

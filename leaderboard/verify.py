@@ -13,10 +13,10 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.record import COSTS, Cell, Record, same_value
-from spike4dgs.benchmark.results.score import open_for, prediction_folders, score_scene
-from spike4dgs.benchmark.results.sensors import sensor_of
-from spike4dgs.benchmark.results.targets import has_truth
+from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value
+from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
+from spike4dgs.benchmark.runs.sensors import sensor_of
+from spike4dgs.benchmark.runs.targets import has_truth
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings
 

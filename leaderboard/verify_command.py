@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json
-from spike4dgs.benchmark.results.predictions import SUMS
+from spike4dgs.benchmark.runs.predictions import SUMS
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import FOLDERS, Entry, check_folder, read_entries
 from spike4dgs.leaderboard.rank import FILES, make_boards

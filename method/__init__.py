@@ -6,8 +6,8 @@ from spike4dgs.benchmark.lazy import lazy_names
 
 if TYPE_CHECKING:
     from spike4dgs.method.fit import Parts, RecipeMethod
+    from spike4dgs.method.models.saved_model import SavedModel, load_model
     from spike4dgs.method.motion.table import MOTIONS
-    from spike4dgs.method.saved_model import SavedModel, load_model
     from spike4dgs.method.supervision.table import SUPERVISIONS
 else:
     __getattr__, __dir__ = lazy_names(
@@ -15,7 +15,7 @@ else:
         {
             "fit": ("Parts", "RecipeMethod"),
             "motion.table": ("MOTIONS",),
-            "saved_model": ("SavedModel", "load_model"),
+            "models.saved_model": ("SavedModel", "load_model"),
             "supervision.table": ("SUPERVISIONS",),
         },
     )

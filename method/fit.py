@@ -16,10 +16,9 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import GIVEN, FitRequest, Model, Recipe
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images import (
+from spike4dgs.method.images.training import (
     ImageMaker,
     ImageSettings,
     make_training_images,
@@ -27,16 +26,17 @@ from spike4dgs.method.images import (
     wanted_images,
     with_settings,
 )
-from spike4dgs.method.initialization import Initialization, Start, StartRequest
+from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
-from spike4dgs.method.observations.made_scene import made_scene
-from spike4dgs.method.observations.pinholes import as_pinholes, with_lenses
-from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
+from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+from spike4dgs.method.training_views.made_scene import made_scene
+from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow

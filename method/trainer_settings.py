@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from spike4dgs.method.observations.changes import POINTS
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.types import EPS2D, PixelFilter
+from spike4dgs.method.training_views.changes import POINTS
 
 
 @dataclass(frozen=True)

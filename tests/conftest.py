@@ -27,7 +27,7 @@ def small_scene(tmp_path: Path) -> Path:
 def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with car-0-tiny, rendered by Mitsuba in one process of its own, and its report with the audit."""
     out = tmp_path_factory.mktemp("tiny") / "data"
-    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
     command = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), "--audit"]
     done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr

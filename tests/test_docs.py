@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from spike4dgs.benchmark.cli import COMMANDS, SPEED
 from spike4dgs.benchmark.method import FitRequest, check_protocol
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli import COMMANDS, SPEED
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from spike4dgs.benchmark.cli import main
+from spike4dgs.cli import main
 
 TEXT = (Path(__file__).resolve().parents[1] / "docs/snippets/ten_lines.md").read_text(encoding="utf-8")
 

@@ -11,15 +11,15 @@ import safetensors.numpy
 
 from spike4dgs.baselines.hard_cases.images import stream_of
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.self_calibration.clocks import estimate_clocks
 from spike4dgs.benchmark.environment import harness, utc_now
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, refused
 from spike4dgs.benchmark.method import FitRequest, Recipe
-from spike4dgs.benchmark.results.provenance import Provenance
+from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.initialization import Initialization, Start
-from spike4dgs.method.observations.made_scene import made_scene
+from spike4dgs.method.self_calibration.clocks import estimate_clocks
+from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.training_views.made_scene import made_scene
 
 _FEW: dict[str, Any] = {
     "trainer.coarse_steps": 4,

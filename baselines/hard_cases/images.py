@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.spike_to_image.reference import slow_adaptive, slow_intervals, slow_tfi, slow_tfp, slow_tfstp
-from spike4dgs.baselines.spike_to_image.table import IMAGES
-from spike4dgs.baselines.spike_to_image.tfp import TfpSettings
+from spike4dgs.baselines.images.reference import slow_adaptive, slow_intervals, slow_tfi, slow_tfp, slow_tfstp
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.images.tfp import TfpSettings
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.hard_cases.cores import bytes_by_cores

@@ -10,11 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.array.camera_state import Clock
-from spike4dgs.benchmark.array.lens import distort, fold_radius, undistort
-from spike4dgs.benchmark.array.shared_time import local_ticks, local_window
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, angle_deg, pose_errors, umeyama
+from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.scene.cameras import Camera, check_rotation, look_at
 from spike4dgs.benchmark.scene.images import (
     decode_srgb,
@@ -24,6 +22,8 @@ from spike4dgs.benchmark.scene.images import (
     write_exr,
     write_geometry,
 )
+from spike4dgs.benchmark.scene.lens import distort, fold_radius, undistort
+from spike4dgs.benchmark.scene.shared_time import local_ticks, local_window
 
 Float64 = NDArray[np.float64]
 _REFUSAL = "the contract: one clear error each"

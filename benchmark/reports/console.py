@@ -14,7 +14,7 @@ from rich.table import Table
 
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.record import COSTS, Cell, Record
+from spike4dgs.benchmark.runs.record import COSTS, Cell, Record
 
 
 def make_console() -> Console:

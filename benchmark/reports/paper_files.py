@@ -9,7 +9,7 @@ from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
 from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.reports.table_files import write_table
-from spike4dgs.benchmark.results.record import Record, dataset_means
+from spike4dgs.benchmark.runs.record import Record, dataset_means
 from spike4dgs.benchmark.scene.scene import Scene
 
 Run = tuple[Sequence[Scene], Sequence[Record]]  # scenes with one split, and the records of all methods on them

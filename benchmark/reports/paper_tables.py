@@ -19,8 +19,8 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.record import COSTS, Record
-from spike4dgs.benchmark.results.refinement import SUFFIX
+from spike4dgs.benchmark.runs.record import COSTS, Record
+from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.scene.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"

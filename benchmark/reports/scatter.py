@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_with_pdf
 from spike4dgs.benchmark.reports.labels import label_points, log_ticks
-from spike4dgs.benchmark.results.record import Record
+from spike4dgs.benchmark.runs.record import Record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

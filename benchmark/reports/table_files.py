@@ -10,7 +10,7 @@ from typing import Any
 
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.record import COSTS
+from spike4dgs.benchmark.runs.record import COSTS
 
 Table = Mapping[str, Any]  # from `paper_tables.build_table`
 Mark = Callable[[str, int], str]  # text of a value, its rank (0 best, 1 second) -> marked text

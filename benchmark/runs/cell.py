@@ -27,10 +27,10 @@ from spike4dgs.benchmark.environment import (
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Progress, check_protocol, training_for
-from spike4dgs.benchmark.results.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
-from spike4dgs.benchmark.results.provenance import Provenance, Savable
-from spike4dgs.benchmark.results.record import PROTOCOL
-from spike4dgs.benchmark.results.refinement import SUFFIX, Refinable, refined_cameras
+from spike4dgs.benchmark.runs.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
+from spike4dgs.benchmark.runs.provenance import Provenance, Savable
+from spike4dgs.benchmark.runs.record import PROTOCOL
+from spike4dgs.benchmark.runs.refinement import SUFFIX, Refinable, refined_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
 from spike4dgs.benchmark.weights import WeightsError

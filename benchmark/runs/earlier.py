@@ -9,9 +9,9 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_text
-from spike4dgs.benchmark.results.dataframe import SCENE_COLUMNS, scene_rows
-from spike4dgs.benchmark.results.predictions import open_predictions
-from spike4dgs.benchmark.results.record import Record, read_record
+from spike4dgs.benchmark.runs.dataframe import SCENE_COLUMNS, scene_rows
+from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.runs.record import Record, read_record
 from spike4dgs.benchmark.scene.scene import Scene
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.scatter import write_scatter
-from spike4dgs.benchmark.reports.sheets.sheet import write_sheet
-from spike4dgs.benchmark.reports.sheets.sheet_video import write_sheet_video
-from spike4dgs.benchmark.results.record import Record
+from spike4dgs.benchmark.reports.sheet import write_sheet
+from spike4dgs.benchmark.reports.sheet_video import write_sheet_video
 from spike4dgs.benchmark.runs.earlier import is_shown
+from spike4dgs.benchmark.runs.record import Record
 from spike4dgs.benchmark.runs.run import predictions_folder
 from spike4dgs.benchmark.scene.scene import Scene
 

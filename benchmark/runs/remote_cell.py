@@ -22,8 +22,8 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_bytes
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.method import Budget, Method, find_methods, get_method, no_progress
-from spike4dgs.benchmark.results.predictions import PredictionWriter
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, run_job
+from spike4dgs.benchmark.runs.predictions import PredictionWriter
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
 

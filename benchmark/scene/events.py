@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.inputs.npz import Expected, read_npz
 from spike4dgs.benchmark.scene.manifest import Manifest
+from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
 
 _AGAIN = "restore it or make the scene again"
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.inputs.npz import read_npz
 from spike4dgs.benchmark.spikes.bits import kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.untrusted.npz import read_npz
 
 WINDOW_TICKS = 50  # of a flickering pixel's counts: a state that holds for a few milliseconds shows
 _AGAIN = "restore it or make the scene again"

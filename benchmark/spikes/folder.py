@@ -11,10 +11,10 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.inputs.names import check_ids, inside
-from spike4dgs.benchmark.inputs.numbers import MAX_HZ, MAX_SIDE, MAX_TICKS, positive, whole
 from spike4dgs.benchmark.spikes.gaps import read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
+from spike4dgs.benchmark.untrusted.names import check_ids, inside
+from spike4dgs.benchmark.untrusted.numbers import MAX_HZ, MAX_SIDE, MAX_TICKS, positive, whole
 
 NAME = "stream.json"
 _SCHEMA = "spike4dgs-streams/1"

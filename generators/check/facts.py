@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.inputs.npz import read_npz
 from spike4dgs.benchmark.scene.cameras import camera_facts
 from spike4dgs.benchmark.scene.images import Geometry, read_geometry
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.counted import counted
+from spike4dgs.benchmark.untrusted.npz import read_npz
 
 _ROUNDING = 1e-9  # relative, of facts in float64
 _MAP_ROUNDING = 1e-5  # relative, of the sensors' maps, which are float32

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.profile.profile import RigProfile
+from spike4dgs.generators.recorder.clips.layouts import make_layout
+from spike4dgs.generators.recorder.rig_profile import RigProfile
 
 MEMINFO = Path("/proc/meminfo")
 

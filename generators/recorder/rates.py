@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.recorder.frames.layouts import Layout
-from spike4dgs.generators.recorder.frames.ring import Block
+from spike4dgs.generators.recorder.clips.layouts import Layout
+from spike4dgs.generators.recorder.clips.ring import Block
 from spike4dgs.generators.recorder.usb.reader import Reader
 
 _EVERY_S = 0.2

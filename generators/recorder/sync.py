@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.frames.clip import Clip
+from spike4dgs.generators.recorder.clips.clip import Clip
 
 SUSPECT_PPM = 100.0  # crystals keep 50 ppm each: more means a rate that differs from the profile's, or lost data
 _MOST_READS = 400  # of each camera that are used: all pairs of them are compared

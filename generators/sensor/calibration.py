@@ -14,11 +14,11 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.inputs.npz import Expected, read_npz
-from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.benchmark.spikes.calibration import Calibration, estimate
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
 from spike4dgs.generators.sensor.maps import write_maps
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 

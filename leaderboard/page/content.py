@@ -11,7 +11,7 @@ import numpy as np
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import published
-from spike4dgs.benchmark.results.record import COSTS
+from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.leaderboard.page.intervals import Comparison
 from spike4dgs.leaderboard.page.rows import Board, Row
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded

@@ -10,7 +10,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.reports.console import seeds_of_methods
-from spike4dgs.benchmark.results.record import Record, is_complete, read_record
+from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.leaderboard.entry import Entry, read_entries
 from spike4dgs.leaderboard.rank import make_boards, reason
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of, short

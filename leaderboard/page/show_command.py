@@ -13,7 +13,7 @@ from rich.text import Text
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
-from spike4dgs.benchmark.results.record import COSTS
+from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.leaderboard.page.intervals import LEVEL
 from spike4dgs.leaderboard.page.rows import Board, find_board, gather
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores

@@ -12,8 +12,8 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
-from spike4dgs.benchmark.identity.verify import verify_content
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.benchmark.scene.verify import verify_content
 from spike4dgs.leaderboard.season import opening
 from spike4dgs.leaderboard.season.opening import Seed, read_opening
 from spike4dgs.leaderboard.season.results import TABLE, read_result, read_results, result_path, table_text

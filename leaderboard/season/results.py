@@ -11,7 +11,7 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
-from spike4dgs.benchmark.results.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
+from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import check_no_oracle
 from spike4dgs.leaderboard.season.season_file import Season, season_folder

@@ -11,8 +11,8 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
 from spike4dgs.benchmark.reports.console import make_console, results_table
-from spike4dgs.benchmark.results.score import score_predictions
 from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.leaderboard.season.predict_command import find_chosen, predict_all
 from spike4dgs.leaderboard.season.results import (
     METHOD,

@@ -17,28 +17,28 @@ from spike4dgs.benchmark.environment import harness, utc_now
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare
 from spike4dgs.benchmark.hard_cases.cores import core_counts, equal_bytes
 from spike4dgs.benchmark.method import FitRequest, Recipe
-from spike4dgs.benchmark.results.provenance import Provenance
+from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod, measure
-from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.hard_cases.splat import differentiate
 from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
-from spike4dgs.method.images import ImageSettings, make_training_images
-from spike4dgs.method.initialization import Initialization, Start
+from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
+from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.observations.made_scene import made_scene, radiance_of
-from spike4dgs.method.saved_model import load_model
 from spike4dgs.method.splat import set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
 from spike4dgs.method.splat.ssim import ssim
+from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+from spike4dgs.method.training_views.made_scene import made_scene, radiance_of
 
 STOPS = (10, 20, 30)  # steps after which a fit is interrupted
 _STEPS = TrainerSettings(coarse_steps=15, fine_steps=25, piece_steps=10, views_per_step=3)

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.baselines.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, worst
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.cameras import look_at
@@ -16,12 +17,11 @@ from spike4dgs.method.motion.coherence import incoherence, incoherence_reference
 from spike4dgs.method.motion.hexplane import sample_level
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.pose import solve_poses
-from spike4dgs.method.observations.instants import correction, node
-from spike4dgs.method.observations.training_images import Spans
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.ssim import ssim, ssim_reference
 from spike4dgs.method.supervision.spike_neuron import encode, firing_rate
-from spike4dgs.method.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
+from spike4dgs.method.training_views.instants import correction, node
+from spike4dgs.method.training_views.training_images import Spans
 
 Float64 = NDArray[np.float64]
 _SSIM_PAIRS: dict[str, tuple[str, Callable[[torch.Generator], tuple[Tensor, Tensor]]]] = {

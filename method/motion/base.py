@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
-from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats, Views
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import torch
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSettings, at_time, move_to
-from spike4dgs.method.observations.training_images import TrainingImages
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 PIECE_TICKS = 400  # 20 ms at 20 kHz
 PIECE_IMAGES = 20  # at least about as many times of a view in each

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from spike4dgs.baselines.stg.spacetime import Spacetime, SpacetimeLite
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.hexplane import HexPlaneMotion
 from spike4dgs.method.motion.paths import Paths
-from spike4dgs.method.motion.spacetime import Spacetime, SpacetimeLite
 from spike4dgs.method.motion.static import Static
 
 MOTIONS: dict[str, type[Motion]] = {

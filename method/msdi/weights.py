@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.model_files.network_weights import WeightKind, fill_network, read_weights_card, write_weights
+from spike4dgs.method.models.network_weights import WeightKind, fill_network, read_weights_card, write_weights
 from spike4dgs.method.msdi.config import CONFIGS
 
 if TYPE_CHECKING:

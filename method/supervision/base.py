@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
-from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.ssim import huber, l1_and_ssim
+from spike4dgs.method.training_views.training_images import known
 
 
 @dataclass(frozen=True, eq=False)

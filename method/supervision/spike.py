@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, random_charge, recorded
 from spike4dgs.method.supervision.spike_neuron import firing_rate, spike_loss
+from spike4dgs.method.training_views.training_images import known
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,10 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
-from spike4dgs.method.observations.training_images import known
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.spike import SpikeSettings
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, fire, random_charge, recorded
+from spike4dgs.method.training_views.training_images import known
 
 FLOOR = 1e-6  # of variances: a deviation of 1/1000, where one spike in 40 ticks makes 0.16
 # Of phi_s at first, per step between two thresholds. Sigmoids lower the window's variance by 1 / (STEEPNESS Gamma),

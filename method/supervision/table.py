@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from spike4dgs.baselines.spike_render import SpikeRender
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.fixed_pattern import FixedPattern
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.supervision.spike import SpikeRate, SpikeSettings
-from spike4dgs.method.supervision.spike_render import SpikeRender
 from spike4dgs.method.supervision.spss import SpikeVariation, SpikeVariationSettings
 
 

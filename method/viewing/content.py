@@ -15,7 +15,7 @@ from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32, UInt8, encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
-from spike4dgs.method.saved_model import SavedModel
+from spike4dgs.method.models.saved_model import SavedModel
 
 Mode = Literal["rendered", "spike rate", "error"]
 MODES: tuple[Mode, ...] = get_args(Mode)

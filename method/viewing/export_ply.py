@@ -19,13 +19,13 @@ import torch
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
+from spike4dgs.baselines.tracking.model import TrackedModel
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_bytes
-from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.splat.types import ALPHA_MIN
-from spike4dgs.method.tracking.model import TrackedModel
 
 Float32 = NDArray[np.float32]
 FIELDS = (

@@ -16,7 +16,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.saved_model import load_model
+from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import fixed, focus, resized
 from spike4dgs.method.viewing.content import Content, free_camera, matching, open_content, padded

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spike4dgs.baselines.images.tfp import tfp_image
 from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS, POSED, RECIPES, SPIKE4DGS, SUPERVISED
-from spike4dgs.baselines.spike_to_image.tfp import tfp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods, get_method
 from spike4dgs.benchmark.reports.paper_tables import published

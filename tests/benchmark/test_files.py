@@ -16,12 +16,12 @@ import pytest
 from dummy_methods import CountMethod, run
 from small_scenes import array_cameras
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import atomic_path, write_json, writing
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.cli import main
 
 BIG = np.random.default_rng(0).random((200, 300)).astype(np.float32)
 

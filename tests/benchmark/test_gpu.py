@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from spike4dgs.baselines.spike_to_image.table import IMAGES
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark import environment, gpu
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.gpu import Missing, missing_rasterizer
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.images import on_device
+from spike4dgs.method.images.training import on_device
 
 # A PyTorch that claims a GPU, in an environment that has no numba-cuda.
 _CLAIM = """
@@ -31,7 +31,7 @@ _RUN = """
 from types import SimpleNamespace
 from spike4dgs.baselines.recipes import METHODS, PARTS
 from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.cli import main
+from spike4dgs.cli import main
 from spike4dgs.benchmark.method import Recipe
 from spike4dgs.method.fit import RecipeMethod
 steps = {"trainer.coarse_steps": 4, "trainer.fine_steps": 4, "images.time_spacing_ticks": 20}

@@ -12,8 +12,8 @@ from dummy_methods import CountMethod, run
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.results.predictions import read_info
 from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.runs.predictions import read_info
 from spike4dgs.benchmark.scene.scene import open_scene
 
 

@@ -20,7 +20,7 @@ from spike4dgs.benchmark.scene.scene import Target, open_scene
 
 
 def start(out, *more):
-    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), *more]
     return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.tasks import cameras_of
+from spike4dgs.generators.render_tasks import cameras_of
 
 
 def test_names_contain_a_length_that_is_not_the_profiles():

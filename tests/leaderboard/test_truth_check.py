@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 from submissions import board, read, release_of
 
 from spike4dgs.benchmark.files import sha256_file, write_text
-from spike4dgs.benchmark.results.record import write_record
-from spike4dgs.benchmark.results.score import score_predictions
+from spike4dgs.benchmark.runs.record import write_record
+from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.scene.images import read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.submit_command import make_submit

@@ -13,9 +13,9 @@ from submissions import Record, board, edit, enter, entry_of, read, submit
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.predictions import INFO, SUMS
-from spike4dgs.benchmark.runs.score_command import score
+from spike4dgs.benchmark.runs.predictions import INFO, SUMS
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE
+from spike4dgs.cli.score import score
 
 
 def better_psnr(record: Record) -> None:

@@ -9,7 +9,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.method import Budget, FitRequest, Model
-from spike4dgs.method.fitted_model import FittedModel
+from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.splat import PixelFilter, set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
 

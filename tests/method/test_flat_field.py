@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras
 
-from spike4dgs.baselines.initialization.rig import RigSettings, rig
-from spike4dgs.baselines.spike_to_image.table import IMAGES
-from spike4dgs.benchmark.scene.calibration import Recordings
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
-from spike4dgs.method.images import ImageSettings, make_training_images
+from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.starts.rig import RigSettings, rig
 
 GAIN, TICKS = 0.6, 200
 

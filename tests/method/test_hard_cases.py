@@ -11,14 +11,14 @@ import torch
 from toy_fits import silent, surfaces
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.spike_to_image.table import IMAGES
-from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images import ImageSettings, make_training_images
+from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.splat import render
 from spike4dgs.method.supervision.table import SUPERVISIONS

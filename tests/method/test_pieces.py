@@ -13,17 +13,17 @@ from toy_world import ToyWorld
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod, at_most, measure
-from spike4dgs.method.fitted_model import FittedModel
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images import ImageSettings, make_training_images, wanted_images
-from spike4dgs.method.initialization import Initialization, Start
+from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.motion import paths as paths_module
 from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS, Extent
-from spike4dgs.method.saved_model import load_model
 from spike4dgs.method.schedule import choose_time, stages
 from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded

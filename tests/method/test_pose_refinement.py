@@ -17,11 +17,11 @@ from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.fitted_model import FittedModel
-from spike4dgs.method.initialization import Initialization, Start
+from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.pose_refinement import Poses, rigid_motion
 from spike4dgs.method.splat import Views
+from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=40, travel=0.0)

@@ -12,7 +12,7 @@ from toy_fits import WORLD, images, method, request, silent, surfaces
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
-from spike4dgs.method.images import ImageSettings, make_training_images
+from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.array.camera_state import Clock
+from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.scene.cameras import Camera
 
 

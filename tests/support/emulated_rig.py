@@ -6,7 +6,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.camera import Fault
-from spike4dgs.generators.recorder.profile.profile import RigProfile
+from spike4dgs.generators.recorder.rig_profile import RigProfile
 
 BLOCK = 1024
 N = 200  # ticks of the clips with faults

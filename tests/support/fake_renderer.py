@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from spike4dgs.benchmark.scene.images import gray
-from spike4dgs.generators import scene_maker, tasks
+from spike4dgs.generators import render_tasks, scene_maker
 from spike4dgs.generators.profiles import PROFILES
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.render import StaticViews
@@ -24,9 +24,9 @@ def car():
 
 def render_fakes(monkeypatch):
     """Let `make-dataset` render scenes of the profile tiny with the FakeRenderer; the rest of it is real."""
-    monkeypatch.setattr(tasks, "world_of", lambda job: car())
-    monkeypatch.setattr(tasks, "plan_of", lambda job: PLAN)
-    monkeypatch.setattr(tasks, "MultiViewRenderer", FakeRenderer)
+    monkeypatch.setattr(render_tasks, "world_of", lambda job: car())
+    monkeypatch.setattr(render_tasks, "plan_of", lambda job: PLAN)
+    monkeypatch.setattr(render_tasks, "MultiViewRenderer", FakeRenderer)
     monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
 
 

@@ -124,7 +124,7 @@ def read_scene(folder: Path, out: Path) -> None:
 
 
 def make_predictions(folder: Path) -> None:
-    from spike4dgs.benchmark.results.predictions import MethodInfo, PredictionInfo, PredictionWriter
+    from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
     from spike4dgs.benchmark.scene.scene import open_scene
 
     make_scene(folder)
@@ -147,7 +147,7 @@ def resum(folder: Path) -> None:
 
 def read_predictions(folder: Path, out: Path) -> None:
     from spike4dgs.benchmark.metrics.selection import select_metrics
-    from spike4dgs.benchmark.results.score import score_predictions
+    from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.scene import open_scene
 
     score_predictions(
@@ -160,8 +160,8 @@ def read_predictions(folder: Path, out: Path) -> None:
 
 def make_record(folder: Path) -> None:
     from spike4dgs.benchmark.metrics.selection import select_metrics
-    from spike4dgs.benchmark.results.record import write_record
-    from spike4dgs.benchmark.results.score import score_predictions
+    from spike4dgs.benchmark.runs.record import write_record
+    from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.scene import open_scene
 
     make_predictions(folder)
@@ -183,8 +183,8 @@ def make_board(folder: Path) -> None:
 def read_record_file(folder: Path, out: Path) -> None:
     from submissions import submit
 
-    from spike4dgs.benchmark.results.dataframe import records_to_dataframe
-    from spike4dgs.benchmark.results.record import read_record
+    from spike4dgs.benchmark.runs.dataframe import records_to_dataframe
+    from spike4dgs.benchmark.runs.record import read_record
 
     record = read_record(folder / "mine.json")
     with contextlib.suppress(ImportError):
@@ -226,7 +226,7 @@ def rehash_model(folder: Path) -> None:
     """Make the models' own hashes agree."""
     import safetensors.torch
 
-    from spike4dgs.method.model_files.tensor_file import _digest
+    from spike4dgs.method.models.tensor_file import _digest
 
     for path in folder.glob("*.safetensors"):
         with contextlib.suppress(Exception):
@@ -249,7 +249,7 @@ def read_models(folder: Path, out: Path) -> None:
     from saved_models import WORLD
 
     from spike4dgs.benchmark.errors import UserError
-    from spike4dgs.method.saved_model import load_model
+    from spike4dgs.method.models.saved_model import load_model
 
     refused = None
     for path in sorted(folder.glob("*.safetensors")):
@@ -282,18 +282,18 @@ def _saved(torch: Any, value: Any) -> bytes:
 
 
 def _shipped() -> Path:
-    from spike4dgs.baselines.spike_to_image.spk2img.weights import WEIGHTS
+    from spike4dgs.baselines.images.spk2img.weights import WEIGHTS
 
     return WEIGHTS.shipped
 
 
 def read_tensors(folder: Path, out: Path) -> None:
-    from spike4dgs.baselines.spike_to_image.spk2img.weights import WEIGHTS
+    from spike4dgs.baselines.images.spk2img.weights import WEIGHTS
     from spike4dgs.benchmark.errors import UserError
-    from spike4dgs.benchmark.scene.bursts import open_bursts
+    from spike4dgs.benchmark.scene.training_bursts import open_bursts
     from spike4dgs.benchmark.weights import read_state
     from spike4dgs.method.checkpoint import load_checkpoint
-    from spike4dgs.method.model_files.network_weights import read_weights_card
+    from spike4dgs.method.models.network_weights import read_weights_card
 
     def bursts() -> None:
         file = open_bursts(folder / "toy-13.safetensors")
@@ -375,8 +375,8 @@ def read_imports(folder: Path, out: Path) -> None:
     from small_scenes import HEIGHT, WIDTH
 
     from spike4dgs.benchmark.errors import UserError
-    from spike4dgs.benchmark.imports.dat import import_dat
-    from spike4dgs.benchmark.scene.spikecv import import_spikecv
+    from spike4dgs.benchmark.exchange.dat import import_dat
+    from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 
     refused = None
     for name in ("colmap", "colmap-text", "opencv.yml", "opencv.xml", "kalibr.yaml", "spikecv"):
@@ -454,7 +454,7 @@ def make_recording(folder: Path) -> None:
 def read_recording(folder: Path, out: Path) -> None:
     from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.spikes.folder import open_stream_folder
-    from spike4dgs.generators.recorder.profile.profile import load_profile
+    from spike4dgs.generators.recorder.rig_profile import load_profile
 
     refused = None
     for read in (lambda: load_profile(folder / "rig.toml"), lambda: open_stream_folder(folder, allow_gaps=True)):

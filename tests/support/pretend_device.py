@@ -19,7 +19,7 @@ from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from spike4dgs.method.model_files import modules
+from spike4dgs.method.models import modules
 from spike4dgs.method.splat.cuda import render
 
 DEVICE = "meta"  # a name that PyTorch has for a device without kernels of its own

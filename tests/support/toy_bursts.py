@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.benchmark.scene.bursts import Burst, BurstFacts, burst_path, stack_bursts, write_bursts
+from spike4dgs.benchmark.scene.training_bursts import Burst, BurstFacts, burst_path, stack_bursts, write_bursts
 
 
 def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:

@@ -12,8 +12,8 @@ from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.initialization import Initialization, Start
 from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)

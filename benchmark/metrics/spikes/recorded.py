@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.scene.calibration import Recordings, estimate
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings
+from spike4dgs.benchmark.spikes.calibration import Recordings, estimate
 from spike4dgs.benchmark.spikes.spans import Spans, is_recorded, spans_around
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.inputs.numbers import MAX_SIDE
 from spike4dgs.benchmark.metrics.pose_error import Sim3
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes, look_at
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -26,6 +25,7 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
 from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64
 from spike4dgs.generators.sensor.maps import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.array.lens import make_distortion
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes
-from spike4dgs.generators.recorder.profile.profile import calibration_toml
+from spike4dgs.benchmark.scene.lens import make_distortion
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
     BoardRecording,
@@ -37,6 +36,7 @@ from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     trimmed,
 )
 from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_rig
+from spike4dgs.generators.recorder.rig_profile import calibration_toml
 
 WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # limits of reprojection error and of rejected corners; beyond, the fit has failed
 

@@ -16,7 +16,7 @@ import usb.core
 import usb.util
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.generators.recorder.profile.profile import CameraProfile, RigProfile
+from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb import queued as libusb
 from spike4dgs.generators.recorder.usb.reads import Completion, SingleReads, Transfers
 

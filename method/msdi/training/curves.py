@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_text
-from spike4dgs.benchmark.scene.bursts import Float64
+from spike4dgs.benchmark.scene.training_bursts import Float64
 
 Row = Mapping[str, float]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.bursts import REACH, Burst, BurstFile, Float32, Float64
+from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, BurstFile, Float32, Float64
 from spike4dgs.method.msdi.training.spikes import Pixels, make_spikes
 
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])

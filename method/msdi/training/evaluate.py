@@ -27,7 +27,7 @@ from torch import Tensor
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.scene.bursts import Float64
+from spike4dgs.benchmark.scene.training_bursts import Float64
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.network import Estimate, Msdi
 from spike4dgs.method.msdi.pose import poses_of

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.scene.bursts import REACH, Float32
+from spike4dgs.benchmark.scene.training_bursts import REACH, Float32
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, charge_after_spike, charge_of_tick
 

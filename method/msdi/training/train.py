@@ -23,7 +23,7 @@ from torch import Tensor
 from spike4dgs.benchmark.environment import choose_device, device_type
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
-from spike4dgs.benchmark.scene.bursts import BurstFile, open_folder
+from spike4dgs.benchmark.scene.training_bursts import BurstFile, open_folder
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.checkpoint import resume_training, save_training

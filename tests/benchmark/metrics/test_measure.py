@@ -19,13 +19,13 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import Measured, measure, scene_means, scene_notes
 from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.results.predictions import MethodInfo, PredictionInfo, PredictionWriter
-from spike4dgs.benchmark.results.record import check_record, read_record
-from spike4dgs.benchmark.results.score import score_predictions
-from spike4dgs.benchmark.runs.score_command import score
+from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
+from spike4dgs.benchmark.runs.record import check_record, read_record
+from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.weights import VARIABLE
+from spike4dgs.cli.score import score
 
 ALWAYS = ("flip", "brisque", "niqe")  # of the sRGB-encoded image, without weights
 

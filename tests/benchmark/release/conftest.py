@@ -8,7 +8,7 @@ import pytest
 from release_scenes import write_release_scenes
 
 from spike4dgs.benchmark.release.index import Release
-from spike4dgs.benchmark.release.packing.pack import pack
+from spike4dgs.benchmark.release.pack import pack
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 

@@ -10,7 +10,7 @@ from dummy_methods import CountMethod, run
 from rich.console import Console
 
 from spike4dgs.benchmark.reports.console import results_table, seeds_of_methods
-from spike4dgs.benchmark.results.record import missing_cell
+from spike4dgs.benchmark.runs.record import missing_cell
 
 
 def printed(records: list[dict[str, Any]]) -> str:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras, write_small_scene
 
+from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.scene.spikecv import export_spikecv, import_spikecv
 
 
 def load(root: Path) -> Any:

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from rich.console import Console
 from small_scenes import array_cameras, write_small_scene
 
-from spike4dgs.benchmark.cli import load, main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget
@@ -25,6 +24,7 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription
+from spike4dgs.cli import load, main
 from spike4dgs.leaderboard.submit_command import submit_all
 
 
@@ -259,7 +259,7 @@ def test_splits_never_mix_in_a_leaderboard(scene: Path, tmp_path: Path, capsys: 
 def test_run_benchmark_keeps_the_splits_apart(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("spike4dgs.benchmark.runs.run_command.find_methods", lambda: {"counts": CountMethod()})
+    monkeypatch.setattr("spike4dgs.cli.run_benchmark.find_methods", lambda: {"counts": CountMethod()})
     for split in (None, "corner"):
         assert load("run-benchmark")((scene,), out=tmp_path / "out", split=split, device="cpu") == 0
     records = {p.parent.parent.name: json.loads(p.read_text()) for p in (tmp_path / "out").rglob("results/counts.json")}

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras, write_small_scene
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.cli import main
 from spike4dgs.generators.recorder import record as command
 from spike4dgs.generators.recorder import sources
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import Fault
-from spike4dgs.generators.recorder.profile.profile import calibration_toml
+from spike4dgs.generators.recorder.rig_profile import calibration_toml
 from spike4dgs.generators.sensor import calibration
 from spike4dgs.generators.sensor.model import Sensor
 

@@ -60,7 +60,7 @@ def test_asking_for_llvm_without_libllvm_is_one_clear_error(tmp_path: Path):
     bogus = tmp_path / "libLLVM.so"
     bogus.write_bytes(b"not a library")
     environment = {"DRJIT_LIBLLVM_PATH": str(bogus), "XDG_CACHE_HOME": str(tmp_path), OVERRIDE: FAST}
-    code = "import sys; from spike4dgs.benchmark.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
     out = tmp_path / "data"
     found = python(code, "make-dataset", "car", "--profile", "tiny", "--out", str(out), **environment)
     assert found.returncode == 2 and "apt-get install libllvm19" in found.stderr.splitlines()[-1]

@@ -15,8 +15,8 @@ import pytest
 from packages import install
 
 from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.cli import main
 from spike4dgs.generators.worlds import OURS, World, Worlds
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spike4dgs.benchmark.cli import main
+from spike4dgs.cli import main
 
 
 def test_a_run_without_its_scenes_gives_a_page_without_images(

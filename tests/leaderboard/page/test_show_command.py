@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from spike4dgs.benchmark.cli import main
+from spike4dgs.cli import main
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 

@@ -11,7 +11,7 @@ from fake_renderer import render_fakes
 from made_season import NUMBER, Made
 
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.results.record import dataset_means
+from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.generators.make_dataset import make_dataset
 from spike4dgs.leaderboard.season.check_command import check

@@ -13,7 +13,7 @@ from made_season import NUMBER, Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget
-from spike4dgs.benchmark.results.predictions import open_predictions
+from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard.season.predict_command import predict_all

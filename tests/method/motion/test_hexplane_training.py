@@ -5,9 +5,9 @@ import pytest
 import torch
 from toy_world import ToyWorld
 
-from spike4dgs.method.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.hexplane import (
     HexPlaneMotion,
     HexPlaneSettings,
@@ -17,12 +17,12 @@ from spike4dgs.method.motion.hexplane import (
 )
 from spike4dgs.method.motion.static import Static
 from spike4dgs.method.motion.table import Extent
-from spike4dgs.method.observations.training_images import TrainingImages
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=32, height=20, side=2)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 3.0, 100, 32)

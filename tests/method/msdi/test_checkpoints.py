@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from spike4dgs.baselines.initialization.dust3r_network import Dust3r, Dust3rShape
+from spike4dgs.baselines.starts.dust3r_network import Dust3r, Dust3rShape
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT

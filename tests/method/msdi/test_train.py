@@ -12,7 +12,7 @@ import torch
 from toy_bursts import write_toy_shard
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.bursts import open_folder
+from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.msdi import TINY, Estimate, Msdi
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.training.curves import Curve

@@ -10,15 +10,15 @@ import pytest
 import torch
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
-from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images import ImageSettings, make_training_images
-from spike4dgs.method.initialization import Start
+from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.motion.static import Static
+from spike4dgs.method.starts.base import Start
 from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded

@@ -8,12 +8,12 @@ import pytest
 import torch
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.array.camera_state import CameraState
+from spike4dgs.baselines.spike_render import SpikeRender
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.supervision.spike import SpikeRate
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, recorded
-from spike4dgs.method.supervision.spike_render import SpikeRender
 from spike4dgs.method.supervision.spss import SpikeVariation
 
 SCENE = ToyWorld(width=24, height=16, side=2, n_ticks=60).training

@@ -9,8 +9,8 @@ import pytest
 import torch
 from saved_models import DURATION_US, WORLD, model, provenance
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.cli import main
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.viewing.export_ply import export_ply, to_ply
 

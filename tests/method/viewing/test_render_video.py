@@ -12,16 +12,16 @@ import torch
 from PIL import Image
 from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.reports.sheets.video import video_writer
+from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.cli import main
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat import render as rasterise
 from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
 from spike4dgs.method.viewing.render_video import frame_times
-from spike4dgs.method.viewing.speed_render import exact_patch
+from spike4dgs.studies.speed.render import exact_patch
 
 S = np.linspace(0, 1, 33)
 UP = np.array([0.0, 0.0, 1.0])

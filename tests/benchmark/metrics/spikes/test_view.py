@@ -15,7 +15,7 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.spikes.recorded import Recorded, Response, record_around, response_of
 from spike4dgs.benchmark.metrics.spikes.view import view_spikes
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.scene.calibration import Recordings
+from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from devtools import Page, browser
 
-from spike4dgs.benchmark.cli import load, main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare
 from spike4dgs.benchmark.reports.hard_cases.command import make_hard_cases
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.cli import load, main
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
 

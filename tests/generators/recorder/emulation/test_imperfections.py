@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras, write_small_scene
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.cli import main
 from spike4dgs.generators.recorder.emulation.array import scene_profile
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections, draw, with_wrong_calibrations
 from spike4dgs.generators.sensor import calibration

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from spike4dgs.benchmark.array.camera_state import Clock
+from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.generators.recorder.emulation.imperfections import BadPixels, WorseCamera
 from spike4dgs.generators.recorder.emulation.retiming import DWELL_TICKS, retimed, telegraph, with_current, worse_stream

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from board_array import BOARD, CAMERAS, HEIGHT, MOTION, WIDTH
 
-from spike4dgs.benchmark.cli import main
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.generators.recorder.profile.profile import read_calibration
+from spike4dgs.cli import main
 from spike4dgs.generators.recorder.rig_calibration.board_clip import write_board_clip
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
     BoardRecording,
@@ -24,6 +23,7 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
     common_cameras,
     make_image,
 )
+from spike4dgs.generators.recorder.rig_profile import read_calibration
 
 
 def stream(n_ticks=50, width=16, gaps=()):

@@ -19,12 +19,12 @@ from toy_world import ToyWorld
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.gpu import missing_rasterizer
 from spike4dgs.benchmark.method import Budget, FitRequest
-from spike4dgs.benchmark.scene.bursts import open_folder
+from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views
+from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.msdi import TINY
 from spike4dgs.method.msdi.training.data import Bursts
 from spike4dgs.method.msdi.training.train import Training, TrainingSettings
-from spike4dgs.method.saved_model import load_model
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.splat.ssim import ssim, ssim_reference

@@ -1,0 +1,51 @@
+"""The image maker `spk2img`: Spk2ImgNet with the weights in use."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from spike4dgs.baselines.images.spk2img.weights import WEIGHTS, load_network, read_card, weights_path
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
+from spike4dgs.method.images.windows import WINDOW, window
+
+if TYPE_CHECKING:
+    from spike4dgs.baselines.images.spk2img.network import Spk2ImgNet
+
+
+def spk2img_image(stream: SpikeStream, tick: int, device: str = "auto") -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use.
+
+    Beyond its ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
+    """
+    return reconstruct(load_network(weights_path(), choose_device(device, rasterizes=False)), stream, tick)
+
+
+def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
+    """Return the estimate of `network` at the start of `tick`: spikes per tick [H, W] float32, not negative."""
+    import torch  # imported where it is used: reading spikes must not wait for it
+
+    device = next(network.parameters()).device
+    with torch.inference_mode():
+        spikes = torch.from_numpy(window(stream, tick)).to(device, torch.float32)[None]
+        spikes = spikes.contiguous(memory_format=torch.channels_last)
+        rate: Float32 = network(spikes).rate[0].clamp(min=0).cpu().numpy()
+    return rate
+
+
+def spk2img_maker(device: str) -> ImageMaker:
+    """Return the image maker whose network runs on `device`."""
+    return ImageMaker(
+        name="spk2img",
+        definition=f"Spk2ImgNet on the {WINDOW} ticks around tick t",
+        source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike "
+        "stream, CVPR 2021",
+        rate=lambda stream, tick, _: spk2img_image(stream, tick, device),
+        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        made_on=spk2img_maker,
+    )
+
+
+SPK2IMG = spk2img_maker("auto")

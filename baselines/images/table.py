@@ -1,0 +1,33 @@
+"""The table of image makers: a recipe names one of them as its `images`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spike4dgs.baselines.images.spk2img.maker import SPK2IMG
+from spike4dgs.baselines.images.tfi import TFI
+from spike4dgs.baselines.images.tfp import TFP
+from spike4dgs.baselines.images.tfstp import TFSTP
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.adaptive import ADAPTIVE
+from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.intervals import INTERVALS
+from spike4dgs.method.images.msdi import MSDI
+
+IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)}
+
+
+def make_image(name: str, stream: SpikeStream, tick: int, gain: float) -> Float32:
+    """Return the image [H, W] of a stream at the start of a tick, by the named image maker.
+
+    Linear radiance, 1.0 = white; gain: spikes per tick of a pixel that sees white, such as `Scene.radiance_gain`.
+    Raises UserError for an unknown name and for a tick outside the clip.
+    """
+    if name not in IMAGES:
+        raise problem("image maker", f"one of {', '.join(IMAGES)}", repr(name), "correct the name")
+    return np.asarray(IMAGES[name](stream, [tick], gain)[0])
+
+
+__all__ = ["IMAGES", "ImageMaker", "make_image"]

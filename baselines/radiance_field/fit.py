@@ -1,0 +1,168 @@
+"""The fitting loop of the motion `radiance-field`: rays of all training views at one time, against recorded spikes.
+
+A step takes random pixels of all views at one time of the clip (the publication: of one image, static scenes), marches
+their rays through the coarse and the fine field, lets the spiking layer fire on both radiances, and compares its rates
+with the recorded mean spikes, which the recipe's images hold: with `tfp` exactly, in a window around the instant.
+
+Everything random comes from generators seeded by (seed, step), as in the trainer of Gaussians: a fit that resumes
+gives the bits of one that never stopped (on the CPU).
+"""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from torch import Tensor
+
+from spike4dgs.baselines.radiance_field.march import Rays, camera_rays
+from spike4dgs.baselines.radiance_field.model import DynamicField, FieldShape, RadianceModel, bounds_of
+from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings, may_move
+from spike4dgs.baselines.radiance_field.settings import PUBLISHED, FieldSpikeSettings, RadianceFieldSettings
+from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.fit import Algorithm, FitJob
+from spike4dgs.method.gaussians.optimizer import Decay, export_state, import_state, make_adam, set_learning_rates
+from spike4dgs.method.images.training import ImageSettings
+from spike4dgs.method.motion.hexplane import (
+    HexPlaneSettings,
+    hexplane_shape,
+    plane_tv,
+    time_smoothness,
+    time_sparsity,
+)
+from spike4dgs.method.schedule import GOLDEN
+from spike4dgs.method.supervision.spike_neuron import firing_rate, spike_loss
+from spike4dgs.method.torch_state import one_torch_thread, seeded
+from spike4dgs.method.training_views.changes import RAYS, changing
+from spike4dgs.method.training_views.training_images import known
+
+
+class Fitter:
+    """A fit in progress."""
+
+    def __init__(self, job: FitJob) -> None:
+        self.job, self.settings, self.step = job, job.settings["motion"], 0
+        self.spiking, self.occupancy = job.settings["supervision"], job.settings["occupancy"]
+        s, extent, start, request = self.settings, job.extent, job.start, job.request
+        planes = hexplane_shape(extent, HexPlaneSettings(features=s.features, mlp_width=s.deformation_width))
+        shape = FieldShape(
+            depth=s.depth,
+            width=s.width,
+            coarse_depth=s.coarse_depth,
+            coarse_width=s.coarse_width,
+            position_frequencies=s.position_frequencies,
+            direction_frequencies=s.direction_frequencies,
+            coarse_samples=s.coarse_samples,
+            fine_samples=s.fine_samples,
+            occupancy_cells=self.occupancy.cells,
+            occupancy_least=self.occupancy.least,
+            deformation=planes,
+        )
+        bounds = bounds_of(start.cameras, start.points, extent.low, extent.high, extent.scale)
+        gain = job.scene.radiance_gain
+        self.field = DynamicField(shape, bounds, 1 / gain, seeded(request.seed, -1)).to(request.device)
+        views = [camera_rays(c, request.device) for c in start.cameras]
+        self.rays = Rays(torch.cat([r.origins for r in views]), torch.cat([r.directions for r in views]))
+        self.recorded = (job.training_images.images * gain).flatten(1)  # [T, C * H * W] mean spikes per tick
+        self._begin_grid()
+        field, grid, mlp = self.field.parameter_groups()
+        self.adam = make_adam({"field": field, "grid": grid, "deformation": mlp}, (s.beta1, s.beta2))
+        self.learning_rates = {
+            "field": Decay(s.lr_field, s.lr_field_last),
+            "grid": Decay(s.lr_grid, s.lr_grid_last),
+            "deformation": Decay(s.lr_deformation, s.lr_deformation_last),
+        }
+
+    def _begin_grid(self) -> None:
+        """Tell the occupancy grid where there are points, and where something may move."""
+        start, shape = self.job.start, self.job.training_images.images.shape
+        moving = changing(self.recorded.unflatten(1, shape[1:]), RAYS).cpu().numpy()
+        points = torch.as_tensor(start.points, device=self.job.request.device)
+        self.field.occupancy.begin(points, may_move(self.field.occupancy, start.cameras, moving))
+
+    def choose_time(self) -> int:
+        """Return the index of the step's time: the middle of the clip first, and then more and more of it."""
+        s, times = self.settings, len(self.job.training_images.ticks)
+        opened = min(1.0, self.step / (s.ramp * s.steps)) if s.ramp else 1.0
+        share = s.first_share + (1 - s.first_share) * opened
+        return min(times - 1, int((0.5 + share * ((self.step * GOLDEN) % 1.0 - 0.5)) * times))
+
+    def loss(self, generator: torch.Generator) -> Tensor:
+        """Return the spike loss of both fields on random rays of one time, and the planes' regulariser."""
+        s, spiking, job = self.settings, self.spiking, self.job
+        index = self.choose_time()
+        pixels = torch.randint(len(self.rays), (s.rays,), generator=generator).to(self.recorded.device)
+        recorded = job.training_images.measured(index).flatten()[pixels] * job.scene.radiance_gain
+        images = self.field.trace(
+            self.rays[pixels], job.training_images.ticks[index] / job.training_images.n_ticks, generator
+        )
+        start = torch.rand(s.rays, generator=generator).to(recorded) * (not spiking.hard_reset)  # published: from 0
+        rates = [firing_rate(job.scene.radiance_gain * x, start, spiking.neuron_ticks, spiking.reset) for x in images]
+        planes = self.field.deformation.planes
+        space, times = list(planes.space), list(planes.time)
+        smooth = s.smooth_weight * time_smoothness(times) + s.sparse_weight * time_sparsity(times)
+        loss = spike_loss(rates[0], known(recorded, rates[0])) + spike_loss(rates[1], known(recorded, rates[1]))
+        return loss + s.tv_weight * plane_tv(space) + smooth
+
+    def train_step(self) -> Tensor:
+        """Take one step; return the loss."""
+        s, grid, generator = self.settings, self.occupancy, seeded(self.job.request.seed, self.step)
+        set_learning_rates(self.adam, self.learning_rates, self.step / s.steps)
+        self.adam.zero_grad(set_to_none=True)
+        loss = self.loss(generator)
+        loss.backward()
+        self.adam.step()
+        self.step += 1
+        if self.step % grid.every == 0 and self.step >= grid.begin * s.steps:
+            at = float(torch.rand((), generator=generator))
+            self.field.update_occupancy(at, grid.share, generator)
+        return loss.detach()
+
+    def run(self, checkpoint_s: float = 15.0) -> None:
+        """Fit to the end, from the job's checkpoint where it exists; it is written every `checkpoint_s` seconds.
+
+        Raises UserError for a damaged checkpoint or one of another fit.
+        """
+        key, checkpoint, total = self.job.key, self.job.request.checkpoint, self.settings.steps
+        saved = load_checkpoint(checkpoint, key) if checkpoint else None
+        if saved:
+            self.restore(saved)
+        written = time.monotonic()
+        with one_torch_thread():
+            while self.step < total:
+                loss = self.train_step()
+                if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == total):
+                    save_checkpoint(checkpoint, self.state(), key)
+                    written = time.monotonic()
+                if self.step % 10 == 0 or self.step == total:
+                    self.job.request.progress(self.step, total, f"loss {loss.item():.4f}")
+
+    def state(self) -> Checkpoint:
+        """Return everything that later steps depend on."""
+        parts = {"field": self.field.state_dict(), "adam": export_state(self.adam)}
+        return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint of the same fit."""
+        self.step = saved.step
+        self.field.load_state_dict(saved.part("field"))
+        import_state(self.adam, saved.part("adam"))
+
+
+def fit_radiance_field(job: FitJob) -> RadianceModel:
+    """Fit a dynamic radiance field to the job's training images; see the module.
+
+    Raises UserError for a damaged checkpoint or one of another fit.
+    """
+    fitter = Fitter(job)
+    fitter.run()
+    return RadianceModel(fitter.field, job.scene.duration_us, job.request.device)
+
+
+SETTINGS = {
+    "images": ImageSettings(),
+    "motion": RadianceFieldSettings(),
+    "supervision": FieldSpikeSettings(),
+    "occupancy": OccupancySettings(),
+}
+RADIANCE_FIELD = Algorithm(SETTINGS, fit_radiance_field, PUBLISHED, ("spike",), rasterizes=False)

@@ -1,0 +1,253 @@
+"""Dynamic 3D Gaussians (Luiten et al. 2024), the motion `tracking`: one time after another, each from the last.
+
+At the first time all Gaussians are optimised and densified by the one trainer. Then sizes and opacities are fixed.
+At each further time the moving ones go on with the velocity that they had, x + (x - x') and likewise the rotations,
+and are optimised against that time's images for a few steps of a fresh Adam, with the terms of `tracking_losses`:
+
+    1.0 image + 3.0 silhouette + 4.0 rigidity + 4.0 rotation + 2.0 isometry + 20 background + 0.01 colour,
+    image = 0.8 mean |I - P| + 0.2 (1 - SSIM(I, P))
+
+Differences from the publication, and why:
+
+- The first time is the middle of the clip and tracking goes outward both ways (`start` 0 is the published order): the
+  initialisation knows moving things best there, and half as many steps add up their errors.
+- Its masks are silhouettes of each instant, ours hold every pixel that a thing passes (`foreground`). So the silhouette
+  term only forbids moving Gaussians to be seen where nothing ever moves.
+- Gaussians of the background are fixed, the limit of an infinite background weight, and only the part of the
+  images in which something moves is rendered again. `freeze_background` False gives the published soft term.
+- A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
+  stays where it was at the time before.
+- Lengths are relative to the Gaussians' spacing (`tracking_losses`), learning rates fall within each time.
+- No exposure per camera (the array is calibrated), and no term for a floor (not every scene has one).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from spike4dgs.baselines.tracking.losses import (
+    background_term,
+    color_term,
+    find_neighbours,
+    physical_loss,
+    remember,
+    unit_quaternions,
+)
+from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
+from spike4dgs.baselines.tracking.settings import PUBLISHED, TrackingSettings
+from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.fit import Algorithm, FitJob
+from spike4dgs.method.gaussians.density import DensitySettings
+from spike4dgs.method.gaussians.optimizer import Decay, make_adam, set_learning_rates
+from spike4dgs.method.gaussians.parameters import Gaussians, from_points
+from spike4dgs.method.images.training import ImageSettings
+from spike4dgs.method.motion.static import Static
+from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.supervision.base import difference
+from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
+from spike4dgs.method.torch_state import one_torch_thread, seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.trainer_settings import TrainerSettings
+from spike4dgs.method.training_views.foreground import foreground_masks, foreground_points, moving_window, stray_points
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A time to track, by its index, from the time before, with the velocity since an earlier one."""
+
+    index: int
+    before: int
+    earlier: int | None
+
+
+def visits(first: int, times: int) -> list[Visit]:
+    """Return the visits from `first` to the last time, then from `first` back to time 0."""
+    forward = [Visit(i, i - 1, i - 2 if i - 2 >= first else None) for i in range(first + 1, times)]
+    backward = [Visit(i, i + 1, i + 2 if i + 2 < times else None) for i in range(first - 1, -1, -1)]
+    return forward + backward
+
+
+def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
+    """Fit Dynamic 3D Gaussians, from the job's checkpoint where it exists; it is written every `checkpoint_s` seconds.
+
+    A killed fit goes on from the last time in the checkpoint and gives the bits of one that never stopped (on the CPU).
+    Raises UserError for a damaged checkpoint or one of another fit.
+    """
+    checkpoint, device = job.request.checkpoint, job.request.device
+    saved = load_checkpoint(checkpoint, job.key) if checkpoint else None
+    masks = foreground_masks(job.training_images.images)
+    if job.settings["motion"].clean_background:
+        images = job.training_images.images
+        clean = torch.where(masks, images, images.mean(0))
+        job = replace(job, training_images=replace(job.training_images, images=clean))
+    if saved:
+        gaussians = Gaussians.from_tensors({k: v.to(device) for k, v in saved.part("gaussians").items()})
+    else:
+        gaussians = fit_first(job)
+    tracker = Tracker(job, gaussians, masks)
+    if saved:
+        tracker.restore(saved)
+    with one_torch_thread():
+        tracker.run(checkpoint_s)
+    return TrackedModel(gaussians, tracker.tracks, job.scene.duration_us)
+
+
+def first_index(job: FitJob) -> int:
+    """Return the index of the time that everything starts from."""
+    last = len(job.training_images.ticks) - 1
+    return min(max(round(job.settings["motion"].start * last), 0), last)
+
+
+def later_total(job: FitJob) -> int:
+    """Return the steps of all further times."""
+    return sum(step_count(job.settings["motion"], v) for v in visits(first_index(job), len(job.training_images.ticks)))
+
+
+def step_count(settings: TrackingSettings, visit: Visit) -> int:
+    """Return the steps of one further time."""
+    return round(settings.later_steps * (settings.first_move if visit.earlier is None else 1))
+
+
+def fit_first(job: FitJob) -> Gaussians:
+    """Optimise and densify Gaussians at the first time, with the one trainer as for a static scene; return them."""
+    s, images, i, request = job.settings["motion"], job.training_images, first_index(job), job.request
+    settings = TrainerSettings(coarse_steps=s.first_steps, views_per_step=s.views_per_step)
+    motion = Static(job.extent, Static.defaults, seeded(request.seed, -1))
+    loss = Pixel(job.settings["supervision"], job.scene)
+    start = from_points(job.start.points, job.start.values, opacity=settings.initial_opacity, device=request.device)
+    scale = job.extent.scale
+    trainer = Trainer(images.at(i), start, motion, loss, settings, DensitySettings(), scale=scale, seed=request.seed)
+    total = s.first_steps + later_total(job)
+    trainer.run(lambda done, _, note="": request.progress(done, total, note))
+    return trainer.gaussians.detached()
+
+
+class Tracker:
+    """The further times. Everything random follows from (seed, time, step), as in the trainer."""
+
+    def __init__(self, job: FitJob, gaussians: Gaussians, masks: Tensor) -> None:
+        self.job, self.gaussians, self.settings = job, gaussians, job.settings["motion"]
+        training_images = job.training_images
+        self.window = moving_window(training_images.views, masks, self.settings.margin_px)
+        self.masks = masks
+        measured = torch.stack([training_images.measured(i) for i in range(len(training_images.ticks))])
+        self.images, self.quiet = self.window.cut(measured), ~self.window.cut(masks)
+        moving = foreground_points(gaussians.means, training_images.views, masks)
+        with torch.no_grad():
+            seen = render(gaussians.splats(), self.window.views).visible.any(0)
+        # The moving Gaussians come first, then what else the window shows.
+        rows = [torch.nonzero(m)[:, 0] for m in (moving, seen & ~moving)]
+        self.count, self.rows = len(rows[0]), torch.cat(rows)
+        free = self.rows[: self.count] if self.settings.freeze_background else self.rows
+        self.tracks = Tracks.start(gaussians, free, self.rows, training_images.ticks, job.scene.rate_hz)
+        self.plan = visits(first_index(job), len(training_images.ticks)) if self.count > 1 else []
+        self.done = 0
+        self.local = gaussians.rows(self.rows)
+        self.flag = torch.zeros(len(self.rows), 1, device=job.request.device)
+        self.flag[: self.count] = 1
+        area = self.window.views.width * self.window.views.height
+        self.share = area / (training_images.views.width * training_images.views.height)
+
+    def run(self, checkpoint_s: float) -> None:
+        """Track the times that are left."""
+        job, request, steps = self.job, self.job.request, [step_count(self.settings, v) for v in self.plan]
+        total, written = self.settings.first_steps + sum(steps), time.monotonic()
+        if self.plan:
+            self.graph = find_neighbours(self.local.means[: self.count], self.settings.neighbours)
+        while True:
+            due = time.monotonic() - written >= checkpoint_s or self.done in (0, len(self.plan))
+            if request.checkpoint and due:
+                save_checkpoint(request.checkpoint, self.state(), job.key)
+                written = time.monotonic()
+            if self.done == len(self.plan):
+                return
+            loss = self.track(self.plan[self.done])
+            self.done += 1
+            note = f"time {self.done + 1} of {len(self.plan) + 1}, loss {loss:.4f}, {self.count} moving Gaussians"
+            request.progress(self.settings.first_steps + sum(steps[: self.done]), total, note)
+
+    def track(self, visit: Visit) -> float:
+        """Optimise one time; return the last loss."""
+        s, tracks, index = self.settings, self.tracks, visit.index
+        old = tracks.at(visit.before)
+        leaves = {name: value.clone() for name, value in old.items()}
+        if visit.earlier is not None:
+            past = tracks.at(visit.earlier)
+            leaves["means"] += old["means"] - past["means"]
+            leaves["quats"] = unit_quaternions(2 * old["quats"] - past["quats"])
+        for leaf in leaves.values():
+            leaf.requires_grad_(True)
+        loss_of = self.loss(index, old)
+        adam = make_adam({name: [leaf] for name, leaf in leaves.items()}, (s.beta1, s.beta2))
+        scale = self.job.extent.scale
+        rates = {
+            "means": Decay(s.lr_means * scale, s.lr_means_last * scale),
+            "quats": Decay(s.lr_quats, s.lr_quats),
+            "colors": Decay(s.lr_colors, s.lr_colors_last),
+        }
+        steps = step_count(s, visit)
+        for step in range(steps):
+            set_learning_rates(adam, rates, step / steps)
+            adam.zero_grad(set_to_none=True)
+            order = torch.randperm(
+                len(self.window.views), generator=seeded(self.job.request.seed, (index + 1) * 1_000_000 + step)
+            )
+            loss = loss_of(leaves, order[: s.views_per_step].sort().values.tolist())
+            loss.backward()
+            adam.step()
+        found = {name: leaf.detach() for name, leaf in leaves.items()}
+        stray = stray_points(found["means"][: self.count], self.job.training_images.views, self.masks)
+        for name in ("means", "quats"):
+            found[name][: self.count][stray] = old[name][: self.count][stray]
+        tracks.put(index, found)
+        return float(loss.detach())
+
+    def loss(self, index: int, old: dict[str, Tensor]) -> Callable[[dict[str, Tensor], list[int]], Tensor]:
+        """Return the loss at a time, of free parameters and views to render; `old` are those of the time before."""
+        s, n, local, every = self.settings, self.count, self.local, self.window.views
+        before = remember(self.graph, old["means"][:n], old["quats"][:n])
+        scales, opacities = local.log_scales.exp(), local.logits.sigmoid()
+        pixel = self.job.settings["supervision"]
+        weights = (s.rigidity_weight, s.rotation_weight, s.isometry_weight)
+        free = len(old["means"])
+
+        def loss(leaves: dict[str, Tensor], chosen: list[int]) -> Tensor:
+            means, quats = leaves["means"], leaves["quats"]
+            everything = torch.cat([means, local.means[free:]]), torch.cat([quats, local.quats[free:]])
+            splats = Splats(*everything, scales, opacities, torch.cat([leaves["colors"], self.flag], 1))
+            views = Views(every.w2c[chosen], every.K[chosen], every.width, every.height)
+            image, silhouette = render(splats, views).image.unbind(-1)
+            total = s.image_weight * difference(image, self.images[index][chosen], pixel.ssim_weight, pixel.ease)
+            total = total + s.silhouette_weight * (silhouette * self.quiet[chosen]).mean()
+            # A mean over whole images, as published: outside of the window nothing changes.
+            total = self.share * total + physical_loss(self.graph, before, means[:n], quats[:n], weights)
+            if not s.freeze_background:
+                rest = (means[n:], quats[n:], local.means[n:], local.quats[n:], self.graph.unit)
+                total = total + s.background_weight * background_term(*rest)
+            return total + s.color_weight * color_term(leaves["colors"], old["colors"])
+
+        return loss
+
+    def state(self) -> Checkpoint:
+        """Return everything that later times depend on."""
+        parts = {"gaussians": self.gaussians.tensors(), "tracks": self.tracks.tensors()}
+        return Checkpoint(self.done, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint of the same fit."""
+        self.done = saved.step
+        self.tracks.load(saved.part("tracks"))
+
+
+SETTINGS = {
+    # Every 0.8 ms at 20 kHz; between times everything is interpolated. The most times bound the time of a fit.
+    "images": ImageSettings(time_spacing_ticks=16, max_times=40),
+    "motion": TrackingSettings(),
+    "supervision": PixelSettings(),
+}
+TRACKING = Algorithm(SETTINGS, fit_tracking, PUBLISHED, ("pixel",))

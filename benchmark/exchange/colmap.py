@@ -1,0 +1,130 @@
+"""Cameras of a COLMAP model, text or binary, read by pycolmap."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.exchange.found_camera import Distort, Float64, FoundCamera, check_size, make_camera
+from spike4dgs.benchmark.scene.lens import NAMES
+from spike4dgs.benchmark.scene.writer import colmap_distortion
+
+_MOST_BYTES = 1 << 28  # of cameras or images, these with their points
+_CAMERA_BYTES = 48  # at least, in cameras.bin
+_POSE_BYTES, _POINT_BYTES = 64, 24  # in images.bin: before the name of an image, and of each of its points
+_SAME = 1e-9  # relative: images of one camera that have the same pose
+
+
+def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int]) -> dict[str, FoundCamera]:
+    """Return the cameras of a model's registered images, by the stream that an image belongs to.
+
+    An image belongs to the stream of its name, with or without suffix, or of its folder: `cam_00`, `cam_00.png`,
+    `cam_00/000120.png`. Images without a stream are left out. Raises UserError where the model cannot be read, and
+    where images of one stream have different cameras.
+    """
+    import pycolmap
+
+    if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
+        raise problem(folder, "a COLMAP model (cameras.bin or cameras.txt, ...)", "none", "give its folder: sparse/0")
+    try:
+        with tempfile.TemporaryDirectory() as lean:
+            _write_cameras_and_poses(folder, Path(lean))
+            model = pycolmap.Reconstruction(lean)
+    except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as e:
+        raise problem(folder, "a whole COLMAP model", f"a damaged one ({str(e)[:200]})", "export it again") from None
+    found: dict[str, FoundCamera] = {}
+    for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
+        name, camera = _stream_of(image.name, names), model.cameras[image.camera_id]
+        if name in names:
+            check_size((camera.width, camera.height), size, name, folder)
+        made = _camera(name, image, camera, folder)
+        first = found.setdefault(name, made)
+        if name in names and not _equal(first, made):
+            fix = "export a model in which each camera stands still and has one set of intrinsics"
+            raise problem(folder, f"one camera and pose for all images of {name}", f"another in {image.name}", fix)
+    return found
+
+
+def _write_cameras_and_poses(folder: Path, out: Path) -> None:
+    """Write a copy of a model without points, rigs and frames: a camera and a pose for each image.
+
+    pycolmap believes the numbers in a file: it would read on for hours, or take memory for points that are not there.
+    Raises ValueError where the files contradict themselves.
+    """
+    kind = "bin" if (folder / "cameras.bin").is_file() else "txt"
+    cameras, images = (folder / f"{name}.{kind}" for name in ("cameras", "images"))
+    if cameras.stat().st_size > _MOST_BYTES or images.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"more than {_MOST_BYTES} bytes of cameras or images")
+    data = cameras.read_bytes()
+    if kind == "bin" and len(data) < 8 + _CAMERA_BYTES * int.from_bytes(data[:8], "little"):
+        raise ValueError(f"{int.from_bytes(data[:8], 'little')} cameras in {len(data)} bytes")
+    (out / cameras.name).write_bytes(data)
+    poses = _binary_poses if kind == "bin" else _text_poses
+    (out / images.name).write_bytes(poses(images.read_bytes()))
+    (out / f"points3D.{kind}").write_bytes(bytes(8) if kind == "bin" else b"")
+
+
+def _binary_poses(data: bytes) -> bytes:
+    """Return the text of images.bin without the images' points."""
+    parts, at = [data[:8]], 8
+    for _ in range(int.from_bytes(data[:8], "little")):
+        end = data.find(b"\0", at + _POSE_BYTES) + 1  # of the name
+        count = int.from_bytes(data[end : end + 8], "little")
+        if end == 0 or (stop := end + 8 + _POINT_BYTES * count) > len(data):
+            raise ValueError("images.bin ends within an image")
+        data[at + _POSE_BYTES : end].decode()  # ValueError for a name that is none
+        parts.append(data[at:end] + bytes(8))
+        at = stop
+    return b"".join(parts)
+
+
+def _text_poses(data: bytes) -> bytes:
+    """Return the text of images.txt without the images' points: of every two lines the second is empty."""
+    lines = [line for line in data.decode().split("\n") if not line.startswith("#")]  # ValueError for other bytes
+    return "".join(line + "\n\n" for line in lines[::2] if line.strip()).encode()
+
+
+def _stream_of(image: str, names: Collection[str]) -> str:
+    """Return the stream of an image; where there is none, the image's folder, or its name without suffix."""
+    path = PurePosixPath(image)
+    candidates = (image, path.with_suffix("").as_posix(), path.stem, path.parts[0])
+    other = path.parts[0] if len(path.parts) > 1 else path.stem
+    return next((name for name in candidates if name in names), other)
+
+
+def _camera(name: str, image: Any, camera: Any, folder: Path) -> FoundCamera:
+    K, pose = camera.calibration_matrix(), image.cam_from_world()
+    intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    size = camera.width, camera.height
+    made = make_camera(name, size, intrinsics, pose.rotation.matrix(), pose.translation, folder)
+    lens = colmap_distortion(camera)
+    if lens is None:
+        return FoundCamera(made, _distortion(camera, intrinsics))
+    return FoundCamera(replace(made, distortion=lens))
+
+
+def _distortion(camera: Any, intrinsics: tuple[float, float, float, float]) -> Distort:
+    fx, fy, cx, cy = intrinsics
+
+    def distort(xy: Float64) -> Float64:
+        uv = np.asarray(camera.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], axis=1)))
+        return np.asarray((uv - (cx, cy)) / (fx, fy))
+
+    return distort
+
+
+def _equal(a: FoundCamera, b: FoundCamera) -> bool:
+    """Return whether two cameras have the same intrinsics and pose, and as much distortion."""
+
+    def numbers(f: FoundCamera) -> Float64:
+        lens = f.camera.distortion or (0.0,) * len(NAMES)
+        return np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), lens, [f.distortion_px]])
+
+    first, second = numbers(a), numbers(b)
+    return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME))

@@ -1,1 +1,0 @@
-"""Download from releases: scenes, parts of them, windows of time, and weight files."""

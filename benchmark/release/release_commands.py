@@ -1,0 +1,80 @@
+"""`release pack` and `release check`: make a release of scenes, and check one before it is uploaded."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.release.check import find_problems
+from spike4dgs.benchmark.release.index import Release, read_release
+from spike4dgs.benchmark.release.pack import pack
+from spike4dgs.benchmark.release.progress import size_text
+from spike4dgs.benchmark.scene.scene import open_scenes
+
+
+def release_pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000) -> int:
+    """Pack scene folders into uncompressed tars with an index, a dataset card, Croissant and sums.
+
+    The same scenes give the same bytes. A killed run resumes.
+
+    Args:
+        scenes: Scene folders.
+        out: Folder of the release.
+        name: Name of the release.
+        shard_mb: Size of a tar in 10^6 bytes; a camera that is larger has a tar of its own.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+        raise problem("--name", "letters, digits, dots, dashes", repr(name), "choose another name")
+    if shard_mb < 1:
+        raise problem("--shard-mb", "at least 1", str(shard_mb), "correct the number")
+    opened = open_scenes(scenes, allow_gaps=True)
+    release = pack(opened, out, name, shard_mb * 1_000_000)
+    _console().print(_costs(release))
+    size = sum(shard.bytes for shard in release.shards)
+    print(f"{out}: {len(release.scenes)} scenes, {size} bytes in {len(release.shards)} shards")
+    print(f"release.json has sha256 {release.sha256}: publish it, and downloads can be pinned with --sha256")
+    return 0
+
+
+def release_check(folder: Positional[Path]) -> int:
+    """Check a release as Hugging Face would limit it, and every byte of it.
+
+    Counts and sizes of files, names, the dataset card, Croissant, all SHA-256, and that the index lists what the tars
+    hold and every file of every scene.
+
+    Args:
+        folder: Folder of the release.
+    """
+    problems = 0
+    for line in find_problems(folder):
+        print(f"error: {line}", file=sys.stderr)
+        problems += 1
+    if not problems:
+        release = read_release(folder)
+        _console().print(_costs(release))
+        print(f"{folder}: good; release.json has sha256 {release.sha256}")
+    return 2 if problems else 0
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=200)
+
+
+def _costs(release: Release) -> Table:
+    """Return what each scene costs, by part."""
+    parts = list(dict.fromkeys(part for scene in release.scenes.values() for part in scene.parts))
+    table = Table(title=f"Release {release.name}", box=None)
+    table.add_column("scene")
+    for part in [*parts, "all"]:
+        table.add_column(part, justify="right")
+    for scene in release.scenes.values():
+        sizes = [size_text(scene.parts.get(part, 0)) for part in parts]
+        table.add_row(scene.id, *sizes, size_text(scene.bytes))
+    return table

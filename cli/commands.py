@@ -1,0 +1,242 @@
+"""The table of commands.
+
+With `measurements` beside it, it is the one place where rooms meet. Import strings name the commands, and the functions
+of other rooms that a command calls; both are loaded only when they run, so `--help` imports nothing heavy and no room
+imports another for the command line's sake.
+"""
+
+from __future__ import annotations
+
+from spike4dgs.cli.command import Command
+from spike4dgs.cli.measurements import MEASUREMENTS
+
+COMMANDS: dict[str, Command] = {
+    "make-dataset": Command(
+        "spike4dgs.generators.make_dataset:make_dataset",
+        "render a world and simulate its spike cameras",
+        "make-dataset --all --profile small --out data",
+    ),
+    "worlds": Command(
+        "spike4dgs.cli.worlds:worlds",
+        "list the worlds: speeds, moving pixels, depths, key spacing",
+        "worlds",
+    ),
+    "calibrate": Command(
+        "spike4dgs.generators.sensor.calibration:calibrate",
+        "estimate gain and dark maps from flat-field and dark recordings",
+        "calibrate data/car-0-small",
+    ),
+    "record": Command(
+        "spike4dgs.generators.recorder.record:record",
+        "record the cameras of an array over USB, or emulated ones, as a scene folder",
+        "record rig.toml --seconds 0.5 --out captures/first",
+    ),
+    "board-clip": Command(
+        "spike4dgs.generators.recorder.rig_calibration.board_clip:board_clip",
+        "simulate a chessboard that moves in front of an array, to record and calibrate with",
+        "board-clip --out runs/board --seconds 1",
+    ),
+    "calibrate-rig": Command(
+        "spike4dgs.generators.recorder.rig_calibration.calibrate_rig:calibrate_rig",
+        "find an array's intrinsics and poses from clips of a moving chessboard",
+        "calibrate-rig captures/board --columns 8 --rows 5 --square-m 0.04 --out rig",
+    ),
+    "train-spk2img": Command(
+        "spike4dgs.baselines.images.spk2img.train:train_spk2img",
+        "train the network of the spk2img images on training variants of the worlds",
+        "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
+    ),
+    "make-msdi-data": Command(
+        "spike4dgs.generators.msdi_data.make_msdi_data:make_msdi_data",
+        "render training data of MSDI: many variants of the worlds, seen by many rigs",
+        "make-msdi-data --variants 40 --out data/msdi",
+    ),
+    "train-msdi": Command(
+        "spike4dgs.method.msdi.training.train:train_msdi",
+        "train the network that estimates points, poses and images from spikes",
+        "train-msdi --data data/msdi --out runs/msdi",
+    ),
+    "run-benchmark": Command(
+        "spike4dgs.cli.run_benchmark:make_run_benchmark",
+        "fit methods on scenes, score them, enter them into a leaderboard",
+        "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
+        needs=(
+            "spike4dgs.leaderboard.submit_command:submit_all",
+            "spike4dgs.studies.speed.images:images",
+            "spike4dgs.leaderboard.tracks:track_scenes",
+            "spike4dgs.studies.oracle.recipes:oracle_ladders",
+            "spike4dgs.studies.oracle.rendering:find_truth",
+        ),
+    ),
+    "methods": Command(
+        "spike4dgs.cli.methods:methods",
+        "list the installed methods: parts, package, description",
+        "methods",
+    ),
+    "fit": Command(
+        "spike4dgs.cli.fit:fit",
+        "fit a model to a recording without ground truth; write a video and a report",
+        "fit captures/turntable --out runs/turntable",
+    ),
+    "fault-table": Command(
+        "spike4dgs.studies.faults:make_fault_table",
+        "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
+        "fault-table data/turntable-0-small --out runs/faults",
+        needs=(
+            "spike4dgs.generators.recorder.record:record",
+            "spike4dgs.generators.recorder.emulation.imperfections:Imperfections",
+        ),
+    ),
+    "score": Command(
+        "spike4dgs.cli.score:score",
+        "score a predictions folder of any program",
+        "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
+    ),
+    "submit": Command(
+        "spike4dgs.leaderboard.submit_command:make_submit",
+        "verify a result record and enter it into the leaderboard",
+        "submit r.json --predictions runs/small/predictions/tfp+4dgs --scenes data/car-0-small data/turntable-0-small",
+        needs=("spike4dgs.generators.second_renderings:second_renderings",),
+    ),
+    "verify-leaderboard": Command(
+        "spike4dgs.leaderboard.verify_command:verify_leaderboard",
+        "check a leaderboard's release, entries and boards",
+        "verify-leaderboard leaderboard",
+    ),
+    "leaderboard": Command(
+        "spike4dgs.leaderboard.page.show_command:show", "print the ranking, with intervals of the ranks", "leaderboard"
+    ),
+    "leaderboard build": Command(
+        "spike4dgs.leaderboard.page.build_command:build", "write the leaderboard as a page", "leaderboard build"
+    ),
+    "season make": Command(
+        "spike4dgs.leaderboard.season.make_command:make_season_make",
+        "draw secret seeds, make hidden scenes, write the commitments to them",
+        "season make 1 --worlds car turntable --secret ~/season-1",
+        needs=("spike4dgs.generators.make_dataset:make_dataset",),
+    ),
+    "season publish": Command(
+        "spike4dgs.leaderboard.season.publish_command:publish",
+        "write what may be public by now as tars: training parts, in the end whole scenes",
+        "season publish 1 --secret ~/season-1 --out public",
+    ),
+    "season predict": Command(
+        "spike4dgs.leaderboard.season.predict_command:predict",
+        "fit methods on published training parts and render the targets, to submit them",
+        "season predict car-9001-small turntable-9001-small --methods tfp+4dgs --out runs/season-1",
+    ),
+    "season score": Command(
+        "spike4dgs.leaderboard.season.score_command:score",
+        "score submitted predictions, or methods that are run first",
+        "season score 1 --secret ~/season-1 --predictions received/theirs --methods tfp+4dgs",
+    ),
+    "season reveal": Command(
+        "spike4dgs.leaderboard.season.reveal_command:reveal",
+        "publish the secret seeds of a season that is over",
+        "season reveal 1 --secret ~/season-1",
+    ),
+    "season check": Command(
+        "spike4dgs.leaderboard.season.check_command:check",
+        "check the seeds, scenes and scores of a season against its commitments",
+        "season check 0",
+    ),
+    "inspect": Command(
+        "spike4dgs.cli.inspect:inspect",
+        "show a scene or a raw spike stream: rates, bad pixels, images",
+        "inspect recording.dat --width 400 --height 250 --fps 20000",
+    ),
+    "render": Command(
+        "spike4dgs.method.viewing.render_video:render",
+        "make a slow-motion video of a fitted model",
+        "render runs/small/models/tfp+4dgs/car-0-small.safetensors --path orbit --slow-motion 1000 --out car.mp4",
+    ),
+    "view": Command(
+        "spike4dgs.method.viewing.viewer:view",
+        "show a fitted model in the browser",
+        "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
+    ),
+    "doctor": Command(
+        "spike4dgs.cli.doctor:make_doctor",
+        "say what this machine has, what it lacks, and what mends it",
+        "doctor",
+        needs=(
+            "spike4dgs.method.splat.kernels.vector_ir:host_lanes",
+            "spike4dgs.method.splat.kernels.threads:get_threads",
+            "spike4dgs.generators.rendering.mitsuba_variant:diagnose",
+            "spike4dgs.method.msdi.weights:check_weights",
+            "spike4dgs.baselines.images.spk2img.weights:check_weights",
+            "spike4dgs.baselines.starts.dust3r:weights_path",
+        ),
+    ),
+    "download": Command(
+        "spike4dgs.benchmark.release.download_command:make_download",
+        "fetch the scenes of a track or a release, or parts of them",
+        "download outdoor-small --from https://example.org/spike4dgs/1 --out data",
+        needs=("spike4dgs.leaderboard.tracks:track_scenes",),
+    ),
+    "download weights": Command(
+        "spike4dgs.benchmark.release.weights_command:make_download_weights",
+        "fetch weight files of metrics and methods, their licences shown first",
+        "download weights lpips",
+        needs=("spike4dgs.baselines.starts.dust3r:weight_file",),
+    ),
+    "release pack": Command(
+        "spike4dgs.benchmark.release.release_commands:release_pack",
+        "pack scenes into a release that people can download",
+        "release pack data/car-0-small data/turntable-0-small --out releases/1",
+    ),
+    "release check": Command(
+        "spike4dgs.benchmark.release.release_commands:release_check",
+        "check a release: a host's limits, its index, every byte",
+        "release check releases/1",
+    ),
+    "verify": Command(
+        "spike4dgs.benchmark.scene.verify:verify",
+        "check every file of a scene against its manifest",
+        "verify data/car-0-small",
+    ),
+    "import-dat": Command(
+        "spike4dgs.benchmark.exchange.dat:import_dat",
+        "make a folder of streams or a scene from bare .dat files, with cameras of COLMAP, OpenCV or Kalibr",
+        "import-dat recordings --width 400 --height 250 --rate-hz 20000 --cameras camchain.yaml --out data/first",
+    ),
+    "import-spikecv": Command(
+        "spike4dgs.benchmark.exchange.spikecv:import_spikecv",
+        "make a scene folder from a SpikeCV folder",
+        "import-spikecv motVidarReal2020/rotation1 --out data/rotation1 --rate-hz 20000",
+    ),
+    "export-spikecv": Command(
+        "spike4dgs.benchmark.exchange.spikecv:export_spikecv",
+        "write a scene's streams as a SpikeCV folder",
+        "export-spikecv data/car-0-small --out car-spikecv",
+    ),
+    "poses": Command(
+        "spike4dgs.studies.poses:poses",
+        "estimate the training cameras' poses and measure their errors",
+        "poses data/car-0-small data/bricks-0-small --initialization colmap",
+    ),
+    "patterns": Command(
+        "spike4dgs.studies.patterns:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
+    ),
+    "export-nerfstudio": Command(
+        "spike4dgs.cli.export_nerfstudio:export_nerfstudio",
+        "write a scene as nerfstudio's D-NeRF data: images, poses, times",
+        "export-nerfstudio data/car-0-small --out car-nerfstudio",
+    ),
+    "export-colmap": Command(
+        "spike4dgs.cli.export_colmap:export_colmap",
+        "write images from a scene's spikes with a COLMAP model beside them",
+        "export-colmap data/car-0-small --out car-colmap",
+    ),
+    "export-ply": Command(
+        "spike4dgs.method.viewing.export_ply:export_ply",
+        "write the Gaussians of a fitted model at several times as .ply files",
+        "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
+    ),
+    **MEASUREMENTS,
+    "completion": Command(
+        "spike4dgs.cli.completion:completion",
+        "print a script that completes commands in bash, zsh or fish",
+        "completion bash",
+    ),
+}

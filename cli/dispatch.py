@@ -1,0 +1,155 @@
+"""From the arguments of `spike4dgs` to the function of a command."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import functools
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.untrusted.numbers import shown
+from spike4dgs.cli.command import Command
+from spike4dgs.cli.commands import COMMANDS
+from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY
+
+_MOST = 1e12  # of a number on the command line
+
+
+def load(name: str) -> Callable[..., Any]:
+    """Return the function of a command, such as "submit"."""
+    return _load(COMMANDS[name])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 3: a recording lost data;
+    130: interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except UserError as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    except SystemExit as e:  # tyro: 0 after --help, 2 after bad arguments, whose message it has printed
+        return e.code if isinstance(e.code, int) else 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _dispatch(arguments: list[str]) -> int:
+    name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    if name in ("-h", "--help"):
+        speed = Command("", SPEED_SUMMARY, "")
+        print(_overview("spike4dgs", COMMANDS | {"speed": speed}))
+        return 0
+    if name == "--version":
+        print(version("spike4dgs"))
+        return 0
+    if name == "speed":
+        return _speed(rest)
+    if verbs := {two: c for two, c in COMMANDS.items() if two.startswith(f"{name} ")}:
+        if rest and f"{name} {rest[0]}" in verbs:
+            name, rest = f"{name} {rest[0]}", rest[1:]
+        elif name not in COMMANDS:
+            return _verbs(name, rest, verbs)
+    command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
+
+    import tyro
+
+    function = _load(command)
+    return int(
+        tyro.cli(_bounded(function), args=rest, prog=f"spike4dgs {name}", description=_description(function, command))
+        or 0
+    )
+
+
+def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
+    """Show the verbs of a command of two words. Raises UserError for one that it has not."""
+    table = {two.removeprefix(f"{name} "): command for two, command in verbs.items()}
+    if rest and rest[0] not in ("-h", "--help"):
+        _find(rest[0], table, f"spike4dgs {name}")
+    print(_overview(f"spike4dgs {name}", table))
+    return 0
+
+
+def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity and 1e300."""
+
+    @functools.wraps(function)
+    def bounded(*args: Any, **kwargs: Any) -> Any:
+        for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
+            _check_numbers(f"--{name.replace('_', '-')}", value)
+        return function(*args, **kwargs)
+
+    return bounded
+
+
+def _check_numbers(option: str, value: Any) -> None:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            _check_numbers(f"{option}.{field.name.replace('_', '-')}", getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for item in value:
+            _check_numbers(option, item)
+    elif isinstance(value, int | float) and not abs(value) <= _MOST:
+        raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", shown(value), "correct it")
+
+
+def _speed(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview("spike4dgs speed", SPEED))
+        return 0
+    for option, text in zip(arguments, arguments[1:], strict=False):
+        with contextlib.suppress(ValueError):
+            if not abs(float(text)) <= _MOST:
+                raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", text[:60], "correct it")
+    return int(_load(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
+
+
+def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
+    if name not in table:
+        near = difflib.get_close_matches(name, table, 1)
+        fix = f"did you mean `{prog} {near[0]}`?" if near else f"see `{prog} --help`"
+        raise problem(prog, f"one of {', '.join(table)}", repr(name), fix)
+    return table[name]
+
+
+def _load(command: Command) -> Callable[..., Any]:
+    function = _import(command.target)
+    if not command.needs:
+        return function
+    made: Callable[..., Any] = function(*map(_imported_when_called, command.needs))
+    return made
+
+
+def _import(target: str) -> Callable[..., Any]:
+    module, _, function = target.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
+
+
+def _imported_when_called(target: str) -> Callable[..., Any]:
+    return lambda *args, **kwargs: _import(target)(*args, **kwargs)
+
+
+def _overview(prog: str, table: Mapping[str, Command]) -> str:
+    width = max(map(len, table))
+    lines = [f"  {name:<{width}}  {command.summary}" for name, command in table.items()]
+    usage = [f"usage: {prog} COMMAND ...", "", "commands:", *lines, ""]
+    return "\n".join([*usage, f"`{prog} COMMAND --help` shows a command's arguments and an example."])
+
+
+def _description(function: Callable[..., Any], command: Command) -> str:
+    """Return the function's docstring without its arguments, which tyro lists itself, and the example."""
+    text = (inspect.getdoc(function) or command.summary).partition("\nArgs:")[0].strip()
+    return f"{text}\n\nExample:\n  spike4dgs {command.example}"

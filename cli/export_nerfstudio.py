@@ -1,0 +1,140 @@
+"""`export-nerfstudio`: a scene as the images, poses and times that nerfstudio's D-NeRF data parser loads.
+
+    OUT/train/CAMERA_TICK.png, OUT/val/..., OUT/test/...
+    OUT/transforms_train.json, OUT/transforms_val.json, OUT/transforms_test.json
+
+Each transforms file has one `camera_angle_x` and frames of `file_path` (without suffix), `time` and `transform_matrix`
+(camera to world, OpenGL axes). Many programs for dynamic scenes read the same layout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tyro.conf import Positional
+
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import check_new, write_json
+from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
+from spike4dgs.benchmark.scene.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.method.images.base import Float32
+
+_TOLERANCE_PX = 0.005  # the most that one focal length and a principal point in the middle may move a pixel
+_VAL_EVERY = 5  # training images for one validation image, at a time between them
+_LOSSES = """lost on the way:
+  - 8-bit sRGB images, clipped at white, for streams and linear radiance
+  - one image per window of spikes (blurred by motion within it) for every tick
+  - one focal length and the middle as principal point for calibrated intrinsics (others are refused)
+  - time as a share of the clip, rounded by readers to float32, for ticks
+  - masks, geometry, calibration recordings, points and the other splits stay behind
+their parser assumes a scene within 1.5 units of the origin: give it a --scale-factor for a larger one"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """An image of the export: linear radiance [H, W] or [H, W, 3]."""
+
+    target: Target
+    radiance: Float32
+
+
+def export_nerfstudio(
+    scene: Positional[Path],
+    out: Path,
+    *,
+    images: str = "tfp",
+    every: int = 20,
+    split: str | None = None,
+    colour: bool = False,
+    allow_gaps: bool = False,
+) -> int:
+    """Write a scene as data for nerfstudio's D-NeRF parser (and others that read this layout).
+
+    Training images are made from the spikes of the training cameras; validation images too, at times between;
+    test images are the ground truth of the held-out cameras. Lossy: 8-bit sRGB images clipped at white, one per
+    window of spikes instead of the stream; one focal length, and the principal point in the middle (other cameras are
+    refused); masks, geometry, calibration and points stay behind. To compare methods, score a predictions folder here.
+
+    Args:
+        scene: Scene folder.
+        out: New folder to write.
+        images: The image maker for training and validation images, such as tfp or tfi.
+        every: Ticks from one training image of a camera to the next; 2 or more.
+        split: Training and held-out cameras; the scene's default split if left out.
+        colour: Test images in colour, where the ground truth has it. Spike cameras, and so the training images,
+            see gray: compare with test images in gray.
+        allow_gaps: Accept a recording with gaps.
+    """
+    opened = open_scene(scene, allow_gaps, split)
+    if images not in IMAGES:
+        raise problem("--images", f"one of {', '.join(IMAGES)}", repr(images), "correct the name")
+    if every < 2:
+        raise problem("--every", "2 ticks or more", str(every), "leave room for the validation images between")
+    used = [opened.cameras[c] for c in (*opened.train, *opened.test)]
+    angle = _angle_x(used, scene)
+    check_new(out)
+    ticks = range(0, opened.n_ticks, every)
+    between = range(every // 2, opened.n_ticks, _VAL_EVERY * every)
+    parts = {
+        "test": _from_truth(opened, colour),
+        "train": _from_spikes(opened, images, ticks),
+        "val": _from_spikes(opened, images, between),
+    }
+    frames = {name: [_write(out, name, opened, image) for image in made] for name, made in parts.items()}
+    for name, of_part in frames.items():  # after all images: what is cut off has no description
+        path = out / f"transforms_{name}.json"
+        print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
+        if of_part:  # the parser opens the first image
+            write_json(path, {"camera_angle_x": angle, "frames": of_part})
+    print(_LOSSES)
+    return 0
+
+
+def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
+    """Return the field of view along x in radians that all cameras share. Raises UserError where they share none."""
+    first = cameras[0]
+    for c in cameras:
+        reach = max(c.width, c.height) / 2
+        off = {
+            "fl_x": abs(c.fx - first.fx) / first.fx * reach,
+            "fl_y": abs(c.fy - first.fx) / first.fx * reach,
+            "cx": abs(c.cx - c.width / 2),
+            "cy": abs(c.cy - c.height / 2),
+            "lens distortion": distortion_px(c),
+        }
+        worst = max(off, key=lambda key: off[key])
+        if off[worst] > _TOLERANCE_PX or (c.width, c.height) != (first.width, first.height):
+            expected = "pinholes of one size and one focal length, their principal points in the middle"
+            found = f"{worst} of {c.id} off by {off[worst]:.3g} px at {c.width}x{c.height}"
+            fix = "this format has no other cameras: rectify the images, or use transforms_*.json of the scene"
+            raise problem(where, expected, found, fix)
+    return 2 * math.atan(0.5 * first.width / first.fx)
+
+
+def _from_spikes(scene: Scene, maker: str, ticks: Iterable[int]) -> Iterable[_Image]:
+    for camera in scene.train:
+        stream = scene.stream(camera)
+        for tick in ticks:
+            yield _Image(Target(camera, tick), IMAGES[maker](stream, [tick], scene.radiance_gain)[0])
+
+
+def _from_truth(scene: Scene, colour: bool) -> Iterable[_Image]:
+    for target in scene.targets:
+        yield _Image(target, scene.ground_truth_rgb(target) if colour else scene.ground_truth(target))
+
+
+def _write(out: Path, part: str, scene: Scene, image: _Image) -> dict[str, Any]:
+    """Write one PNG and return its frame."""
+    target, pixels = image.target, encode_srgb(image.radiance)
+    name = f"{target.camera}_{target.tick:06d}"
+    rgb = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+    write_png(out / part / f"{name}.png", rgb)
+    pose = to_nerfstudio(scene.cameras[target.camera])["transform_matrix"]
+    return {"file_path": f"./{part}/{name}", "time": target.tick / scene.n_ticks, "transform_matrix": pose}

@@ -1,0 +1,41 @@
+"""`score`: score a predictions folder of any program from its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.reports.console import make_console, results_table
+from spike4dgs.benchmark.runs.record import write_record
+from spike4dgs.benchmark.runs.score import score_predictions
+from spike4dgs.benchmark.scene.scene import open_scenes
+
+
+def score(
+    predictions: Positional[Path],
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    out: Path | None = None,
+    metrics: tuple[str, ...] = (AUTO,),
+    split: str | None = None,
+    allow_gaps: bool = False,
+) -> int:
+    """Score predictions, of any program, from their files. A recording without truth is scored by its held-out spikes.
+
+    Args:
+        predictions: Predictions folder (images, SHA256SUMS, prediction.json); for several scenes, the folder that
+            holds one predictions folder per scene id.
+        scenes: Scene folders.
+        out: Write the result record to this file.
+        metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
+            are always computed.
+        split: Split of the scenes that the predictions are for; each scene's default one if left out.
+        allow_gaps: Accept recordings with gaps.
+    """
+    record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
+    make_console().print(results_table([record]))
+    if out:
+        write_record(out, record)
+    return 0

@@ -1,0 +1,177 @@
+"""`make-msdi-data`: training bursts of many variants of the worlds, seen by many rigs, at low resolution.
+
+The format of the shards is in `benchmark.scene.bursts`. A shard is a function of its settings alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.training_bursts import (
+    REACH,
+    Arrays,
+    BurstFacts,
+    burst_path,
+    open_bursts,
+    stack_bursts,
+    write_bursts,
+)
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
+from spike4dgs.generators.profiles import RATE_HZ
+
+if TYPE_CHECKING:
+    from spike4dgs.generators.msdi_data.render import BurstRenderer
+    from spike4dgs.generators.worlds import WorldScene
+
+DURATION_S = 0.1  # of the clips that the instants are drawn from
+VIEWS = 9
+_NEAREST = 0.35  # of the distance to the target: closer static surfaces block a camera's view
+_LEAST_SEEN = 0.5  # least share of a camera's pixels with a surface
+
+
+@dataclass(frozen=True)
+class MakeBursts:
+    """Renders the shard of a (world, variant); can be sent to worker processes."""
+
+    rigs: int
+    instants: int  # of each rig
+    width: int
+    height: int
+    spp: int
+    seed: int
+
+    def facts(self, world: str, variant: int) -> BurstFacts:
+        """Return the metadata of a shard. A hidden one needs fewer rigs: it is scored, not used for training."""
+        rigs = max(1, self.rigs // 2) if variant in HIDDEN_VARIANTS else self.rigs
+        size = self.width, self.height
+        sampling = VIEWS, rigs, self.instants, self.spp
+        return BurstFacts(world, variant, self.seed, *size, *sampling, SENSOR.radiance_gain, SENSOR.photons_per_spike)
+
+    def __call__(self, chunk: tuple[str, int]) -> tuple[BurstFacts, Arrays]:
+        """Return the shard's facts and arrays."""
+        from spike4dgs.generators.worlds import WORLDS
+
+        name, variant = chunk
+        facts = self.facts(name, variant)
+        world = WORLDS[name].build(self.seed, variant, DURATION_S)
+        rng = np.random.default_rng([self.seed, variant, *f"{name} bursts".encode()])
+        map_seed = int(rng.integers(1 << 31))
+        rigs, backgrounds = [], []
+        for _ in range(facts.rigs):
+            renderer = self._renderer(world, rng)
+            rigs.append([renderer.burst(tick, map_seed) for tick in _instants(facts.instants, rng)])
+            backgrounds.append((renderer.background, renderer.background_depth))
+        return facts, stack_bursts(rigs, backgrounds)
+
+    def _renderer(self, world: WorldScene, rng: np.random.Generator) -> BurstRenderer:
+        """Return a renderer for a rig with a free view; each further attempt is closer to the world's own rig."""
+        from spike4dgs.generators.msdi_data.render import BurstRenderer
+        from spike4dgs.generators.msdi_data.rig_jitter import jittered_cameras
+
+        amount = 1.0
+        while True:
+            cameras = jittered_cameras(world, self.width, self.height, rng, amount)
+            renderer = BurstRenderer(world, cameras, seed=int(rng.integers(1 << 31)), spp=self.spp)
+            away = float(np.linalg.norm(cameras[VIEWS // 2].center - np.array(world.rig.target)))
+            near = np.quantile(renderer.background_depth, 0.02, axis=(1, 2), method="lower")
+            seen = np.isfinite(renderer.background_depth).mean(axis=(1, 2))
+            if amount < 0.1 or (near.min() > _NEAREST * away and seen.min() > _LEAST_SEEN):
+                return renderer
+            amount *= 0.8
+
+
+def _instants(count: int, rng: np.random.Generator) -> list[int]:
+    """Return ticks, one drawn from each of `count` equal parts of the clip."""
+    first, last = REACH, round(DURATION_S * RATE_HZ) - REACH
+    edges = np.linspace(first, last, count + 1).astype(int)
+    return [int(rng.integers(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def make_msdi_data(
+    worlds: Positional[tuple[str, ...]] = (),
+    *,
+    out: Path = Path("data/msdi"),
+    variants: int = 40,
+    rigs: int = 6,
+    instants: int = 3,
+    width: int = 104,
+    height: int = 64,
+    spp: int = 32,
+    seed: int = 0,
+    workers: int = 1,
+    scheduler: str | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> int:
+    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
+
+    Existing shards are kept: a killed run resumes, and a larger --variants adds shards. Equal arguments give equal
+    bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
+
+    Args:
+        worlds: Names of worlds; all, if none is named.
+        out: Folder for the shards.
+        variants: Training variants of each world.
+        rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
+        instants: Instants of each rig.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
+        spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.
+        seed: Seed of all random numbers.
+        workers: Processes that render; one uses all cores.
+        scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
+        device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
+    """
+    from spike4dgs.benchmark.runs.executors import executor
+    from spike4dgs.generators.rendering.mitsuba_variant import choose_device
+    from spike4dgs.generators.worlds import WORLDS
+
+    if wrong := [w for w in worlds if w not in WORLDS]:
+        raise problem("worlds", f"some of {', '.join(WORLDS)}", ", ".join(wrong), "correct the names")
+    if min(rigs, instants) < 1 or variants < 0 or min(width, height) < 16:
+        found = f"{variants} variants, {rigs} rigs, {instants} instants, {width}x{height}"
+        raise problem("make-msdi-data", "counts from 1 up and at least 16x16 pixels", found, "correct them")
+    if FIRST_TRAINING_VARIANT + variants > FIRST_SEASON_VARIANT:
+        most = FIRST_SEASON_VARIANT - FIRST_TRAINING_VARIANT
+        fix = f"variants from {FIRST_SEASON_VARIANT} on are kept for hidden seasons"
+        raise problem("--variants", f"at most {most}", str(variants), fix)
+    if spp < 1 or spp & (spp - 1):
+        raise problem("--spp", "a power of two", str(spp), "give 16, 32, 64, ...")
+    choose_device(device)
+    make = MakeBursts(rigs, instants, width, height, spp, seed)
+    numbers = [*HIDDEN_VARIANTS, *range(FIRST_TRAINING_VARIANT, FIRST_TRAINING_VARIANT + variants)]
+    shards = [(world, variant) for variant in numbers for world in dict.fromkeys(worlds) or WORLDS]
+    todo = [shard for shard in shards if not _is_done(out, make.facts(*shard))]
+    print(f"{len(shards)} shards, {len(shards) - len(todo)} of them exist", flush=True)
+    with executor(workers, scheduler) as run:
+        _write_all(run(make, todo), len(todo), out)
+    return 0
+
+
+def _write_all(made: Iterator[tuple[BurstFacts, Arrays]], count: int, out: Path) -> None:
+    start = time.perf_counter()
+    for done, (facts, arrays) in enumerate(made, start=1):
+        path = burst_path(out, facts.world, facts.variant)
+        write_bursts(path, facts, arrays)
+        passed = time.perf_counter() - start
+        left = passed / done * (count - done)
+        size = f"{facts.rigs * facts.instants} bursts, {path.stat().st_size / 1e6:.1f} MB"
+        print(f"{facts.id}: {size}, {done}/{count}, {passed:.0f} s, about {left:.0f} s left", flush=True)
+
+
+def _is_done(out: Path, facts: BurstFacts) -> bool:
+    """Return whether the shard exists. Raises UserError where it was made with other settings."""
+    path = burst_path(out, facts.world, facts.variant)
+    if not path.is_file():
+        return False
+    if (found := open_bursts(path).facts) != facts:
+        raise problem(path, f"a shard with the settings {facts}", str(found), "choose another --out, or remove it")
+    return True

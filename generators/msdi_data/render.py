@@ -1,0 +1,97 @@
+"""Rendering of training bursts: a rig's background once, and around each instant only moving objects, at a few ticks.
+
+Less exact than `rendering.render`, and much cheaper: fewer samples, and without the light that moving objects throw far
+around them. Training is not misled, because truth and spikes come from the same images. As there, pixels that see only
+the shadow of a moving object are the background plus the difference of two renderings with the same random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import gray
+from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, Float32
+from spike4dgs.generators.profiles import RATE_HZ
+from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
+from spike4dgs.generators.rendering.render import make_tracer
+from spike4dgs.generators.rendering.visibility import GROW_PX, Visibility
+from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.worlds import WorldScene
+
+KEY_COUNTS = (3, 7, 15)  # images of a burst: 21, 7 or 3 ticks apart
+BACKGROUND_SAMPLES = 2  # times those of three images: 64 leave 43 dB of noise in a street, 16 only 36 dB
+MOST_PX = 1.0  # largest motion between two of them; the last count serves all faster motion
+_FASTEST = 99.0  # percentile of the moving pixels' speeds: shadows at grazing light have no bound
+
+
+class BurstRenderer(Visibility):
+    """Bursts of `cameras` (one resolution) in a world.
+
+    `spp`, a power of two, is the number of samples per pixel of moving objects; where the motion requires more than
+    three images, each has fewer samples.
+    """
+
+    def __init__(self, world: WorldScene, cameras: Sequence[Camera], *, seed: int, spp: int) -> None:
+        scene = mitsuba_scene(world)
+        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
+        self.spp = spp
+
+    @cached_property
+    def background(self) -> Float32:
+        """Radiance [V, H, W] without moving objects."""
+        every = np.arange(int(np.prod(self.shape)))
+        return self._radiance(every, BACKGROUND_SAMPLES * self.spp, moving=False).reshape(self.shape)
+
+    @cached_property
+    def background_depth(self) -> Float32:
+        """Depth [V, H, W] of the static surfaces along the optical axes, metres; inf: no surface."""
+        forward = np.stack([c.R[2] for c in self.cameras])  # [V, 3]
+        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
+        return (self._static_hits[0].reshape(self.shape) * cosine).astype(np.float32)
+
+    def burst(self, tick: int, map_seed: int) -> Burst:
+        """Return the burst around the start of `tick` with maps of `map_seed`; `tick` is REACH from the clip's ends."""
+        now, reach = tick / RATE_HZ, REACH / RATE_HZ
+        moving = self.traced(now - reach) | self.traced(now + reach) | self.traced(now)
+        depth, motion = self.depths(now), self._motion_px(now)
+        count = next((k for k in KEY_COUNTS if motion <= MOST_PX * (k - 1)), KEY_COUNTS[-1])
+        # Between the three times of `traced`, an object may be further away than the region was grown by.
+        if (missed := int(np.ceil(motion / 4)) - GROW_PX) > 0:
+            moving = maximum_filter(moving, size=(1, 2 * missed + 1, 2 * missed + 1))
+        keys = np.repeat(self.background[None], count, axis=0)
+        self._trace_moving(keys, moving, now + np.linspace(-reach, reach, count))
+        _, height, width = self.shape
+        return Burst(
+            keys=keys,
+            depth=depth,
+            moving=moving,
+            w2c=np.stack([c.w2c for c in self.cameras]),
+            K=np.stack([c.K for c in self.cameras]),
+            gain=np.stack([gain_map(height, width, map_seed, c.id) for c in self.cameras]),
+            dark=np.stack([dark_map(height, width, map_seed, c.id) for c in self.cameras]),
+        )
+
+    def _trace_moving(self, keys: Float32, moving: np.ndarray, times_s: np.ndarray) -> None:
+        """Fill in the pixels `moving` [V, H, W] of the background images `keys` [k, V, H, W] at k times."""
+        where = np.flatnonzero(moving)
+        spp = max(1, 4 * self.spp // (len(keys) + 1))  # all of them, half, a quarter: powers of two
+        first = self._radiance(where, spp, moving=False)
+        for key, t_s in zip(keys, times_s.tolist(), strict=True):
+            seen = self.object_masks(t_s)[moving]
+            traced = self._radiance(where, spp, moving=True)
+            key[moving] = np.where(seen, traced, np.maximum(traced + self.background[moving] - first, 0))
+
+    def _motion_px(self, now: float) -> float:
+        """Return the motion of the fastest parts in the whole burst."""
+        speed = self.speeds(now)
+        return float(np.percentile(speed[speed > 0], _FASTEST)) * 2 * REACH / RATE_HZ if (speed > 0).any() else 0.0
+
+    def _radiance(self, pixels: np.ndarray, spp: int, *, moving: bool) -> Float32:
+        """Return the gray radiance [K] of flat pixels, with or without the moving objects, at the last time set."""
+        rgb = self._tracer.trace(pixels, spp, 0, moving)
+        return gray(np.asarray(rgb * np.float32(self.world.exposure)))

@@ -1,0 +1,126 @@
+"""Conversion of a ring's blocks to frames with true ticks: whole runs at once, as views of the ring where possible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, Gap
+from spike4dgs.generators.recorder.clips.layouts import COUNTER, Layout
+from spike4dgs.generators.recorder.clips.ring import Block, Ring
+from spike4dgs.generators.recorder.clips.ticks import Run, TickCounter
+
+UInt8 = NDArray[np.uint8]
+
+
+class Cutter:
+    """Cuts one camera's blocks into frames, and records which tick was complete when each read ended.
+
+    `origin` is the counter of tick 0 where the cameras have agreed on one. `lead` bytes are dropped first: those of a
+    frame that began before the recording.
+    """
+
+    def __init__(self, camera: str, layout: Layout, ring: Ring, origin: int | None = None, lead: int = 0) -> None:
+        self.next_tick = 0  # after the last frame
+        self._arrival: list[tuple[int, int]] = []
+        self._counter = TickCounter(layout, camera, origin)
+        self._frame_bytes, self._lead = layout.frame_bytes, lead
+        self._flat = ring.memory.reshape(-1)
+        self._base = self._flat.ctypes.data
+
+    def cut(self, blocks: Sequence[Block]) -> list[Run]:
+        """Return the frames that these blocks, the next ones of the stream, complete."""
+        runs: list[Run] = []
+        group: list[Block] = []  # adjacent in the stream and in memory
+        for block in [*blocks, None]:
+            if group and (block is None or block.data is None or _address(block) != _end(group[-1])):
+                runs += self._feed(group)
+                group = []
+            if block is not None and block.data is None:
+                self._counter.skip(block.bytes, OVERFLOW)
+            elif block is not None and block.bytes:
+                group.append(block)
+        return runs
+
+    def finish(self, n_ticks: int, reason: str) -> tuple[Gap, ...]:
+        """Return the gaps of the clip [0, n_ticks); a missing end has the reason `reason`."""
+        return self._counter.finish(n_ticks, reason)
+
+    @property
+    def arrival(self) -> NDArray[np.int64]:
+        """Return [m, 2]: number of complete ticks when a read ended, and its time (CLOCK_MONOTONIC, ns)."""
+        return np.array(self._arrival, np.int64).reshape(-1, 2)
+
+    def _feed(self, group: list[Block]) -> list[Run]:
+        begin, end = _address(group[0]) - self._base, _end(group[-1]) - self._base
+        drop = min(self._lead, end - begin)
+        self._lead -= drop
+        runs = self._counter.feed(self._flat[begin + drop : end])
+        ends = np.array([_end(b) for b in group])
+        complete = np.full(len(group), -1)
+        for run in runs:
+            self.next_tick = run.first_tick + len(run.frames)
+            beyond = ends - run.frames.ctypes.data  # from the run's first byte; meaningless for a frame of two groups
+            within = (beyond >= 0) & (beyond < run.frames.nbytes + self._frame_bytes)
+            complete[within] = run.first_tick + np.minimum(beyond[within] // self._frame_bytes, len(run.frames))
+        self._arrival += [(int(t), b.arrival_ns) for t, b in zip(complete, group, strict=True) if t >= 0]
+        return runs
+
+
+@dataclass(frozen=True)
+class First:
+    """A camera's first whole frame: its position in the stream, the kept bytes before it, its counter (0: has none)."""
+
+    position: int
+    lead: int
+    counter: int
+
+
+def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
+    """Return the first whole frame in these blocks, the first ones kept; None if there is none yet."""
+    if not blocks:
+        return None
+    position = blocks[0].position
+    if not layout.has_tags():  # frames have followed each other since the stream's first byte
+        lead = -position % layout.frame_bytes
+        return First(position + lead, lead, 0)
+    data = np.empty(0, np.uint8)
+    for block in blocks:
+        if block.data is None or len(data) > 3 * layout.frame_bytes:
+            break
+        data = np.concatenate([data, block.data])
+    if (lead := layout.find(data)) < 0:
+        return None
+    frame = data[lead : lead + layout.frame_bytes]
+    return First(position + lead, lead, int(layout.counts(frame[None])[0]))
+
+
+def agree(counters: Sequence[int], most: int) -> int | None:
+    """Return the first counter that every camera has sent, if they differ by no more than `most` frames; else None.
+
+    Counters set to zero by one trigger differ by the frames sent before the recording; others differ by anything.
+    """
+    first = counters[0]
+    ahead = [(c - first + COUNTER // 2) % COUNTER - COUNTER // 2 for c in counters]
+    return (first + max(ahead)) % COUNTER if max(ahead) - min(ahead) <= most else None
+
+
+def joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
+    """Return frames [n, frame_bytes] of all runs within the clip (a view, if there is one run) and their ticks [n]."""
+    cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
+    ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
+    if len(cut) == 1:
+        return cut[0][1], ticks[0]
+    empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
+    return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
+
+
+def _address(block: Block) -> int:
+    return block.data.ctypes.data if block.data is not None else -1
+
+
+def _end(block: Block) -> int:
+    return _address(block) + block.bytes

@@ -1,1 +1,0 @@
-"""Recordings on disk, written during the capture."""

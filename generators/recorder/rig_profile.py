@@ -1,0 +1,284 @@
+"""The rig profile: all facts of an array of cameras that USB does not report, in one TOML file.
+
+docs/rig_profile.md describes every key; docs/rig_example.toml is a whole profile.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
+from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
+from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE, shown
+from spike4dgs.generators.recorder.calibration_maps import read_maps
+from spike4dgs.generators.recorder.clips.layouts import LAYOUTS, make_layout
+from spike4dgs.generators.recorder.toml_table import (
+    FLAG,
+    TEXT,
+    Kind,
+    Table,
+    choice,
+    matching,
+    number,
+    read_toml,
+    tuple_of,
+    whole,
+)
+
+SCHEMA = "spike4dgs-rig/1"
+CALIBRATION_SCHEMA = "spike4dgs-rig-calibration/1"
+PRIMARY, SECONDARY = "primary", "secondary"
+BOTTOM_UP, TOP_DOWN = "bottom-up", "top-down"
+PACKET_BYTES = 1024  # of a SuperSpeed bulk endpoint: a read of another multiple ends in an overflow error
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")  # of a camera and of a scene
+
+_ID = matching("a name of letters, digits, '.', '_' and '-'", NAME.match)
+_POSITIVE = number(0, 1e12, "a positive number")
+_FINITE = number(-1e12, 1e12, "a finite number")
+_VECTOR = tuple_of(_FINITE, "a list of numbers")
+_LENS = Kind(f"a list of {', '.join(NAMES)}, or of the first of them", lambda v: make_distortion(_VECTOR.read(v)))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraProfile:
+    """One camera: how to find, start and stop it, the orientation of its images, and its calibration.
+
+    `start` and `stop` are written to `endpoint_out`, one bulk write for each item. `rows` and `mirrored` state how the
+    camera sends its image; streams on disk are always bottom-up and not mirrored.
+    """
+
+    id: str
+    serial: str
+    vendor_id: int
+    product_id: int
+    interface: int
+    control_interface: int | None  # of endpoint_out, if it is not `interface`
+    endpoint_in: int
+    endpoint_out: int | None
+    start: tuple[bytes, ...]
+    stop: tuple[bytes, ...]
+    role: str  # "primary" (makes the trigger) or "secondary"
+    rows: str  # "bottom-up" or "top-down"
+    mirrored: bool
+    calibration: Camera | None = None  # intrinsics and pose
+    maps: Path | None = None  # .npz with gain [H, W] and dark [H, W] (spikes per tick), as `calibrate` writes it
+
+
+@dataclass(frozen=True, eq=False)
+class RigProfile:
+    """An array of cameras that share size, rate and frame layout, and the facts of the scenes that it records."""
+
+    name: str
+    width: int
+    height: int
+    layout: str  # a name for `make_layout`
+    cameras: tuple[CameraProfile, ...]
+    fps: int = 20000
+    title: str = ""
+    licence: str = "unknown"
+    sensor: str = "unknown"  # sensor.model of scene.json
+    radiance_gain: float = 1.0  # spikes per tick of a pixel that sees white
+    held_out: tuple[str, ...] = ()  # cameras that recordings hold out for testing
+    transfer_bytes: int = 262144  # of one bulk read
+    transfers: int = 16  # reads in flight per camera
+    ring_seconds: float | None = None  # memory per camera in continuous mode; None: chosen from what is free
+    timeout_ms: int = 500  # without any data, after which a camera counts as gone
+
+    def camera(self, id: str) -> CameraProfile:
+        """Return the camera of that name. Raises KeyError where there is none."""
+        return {c.id: c for c in self.cameras}[id]
+
+    @property
+    def calibrated(self) -> bool:
+        """True if every camera has intrinsics and a pose, so that a recording can become a scene."""
+        return all(c.calibration is not None for c in self.cameras)
+
+
+def load_profile(path: Path) -> RigProfile:
+    """Read and validate a rig profile; files that it names are relative to its folder.
+
+    Raises UserError for any error: one line with file, key, expected and found value.
+    """
+    top = read_toml(path, "a rig profile")
+    top.take("schema", choice(SCHEMA))
+    width, height = (top.take(name, whole(1, MAX_SIDE)) for name in ("width", "height"))
+    cameras = _read_cameras(top, width, height)
+    transfer = top.table("transfer") or Table(path, "transfer", {})
+    profile = RigProfile(
+        name=top.take("name", _ID),
+        width=width,
+        height=height,
+        layout=top.take("layout", choice(*LAYOUTS)),
+        cameras=cameras,
+        fps=top.get("fps", whole(1, 1_000_000), RigProfile.fps),
+        title=top.get("title", TEXT, RigProfile.title),
+        licence=top.get("licence", TEXT, RigProfile.licence),
+        sensor=top.get("sensor", TEXT, RigProfile.sensor),
+        radiance_gain=top.get("radiance_gain", number(0, 1, "a number above 0, 1 at most"), RigProfile.radiance_gain),
+        held_out=top.get("held_out", tuple_of(_ID, "a list of cameras"), RigProfile.held_out),
+        transfer_bytes=transfer.get("bytes", _TRANSFER, RigProfile.transfer_bytes),
+        transfers=transfer.get("in_flight", whole(1, 256), RigProfile.transfers),
+        ring_seconds=transfer.get("ring_seconds", number(0, 3600, "seconds, 3600 at most"), RigProfile.ring_seconds),
+        timeout_ms=transfer.get("timeout_ms", whole(1, 600_000), RigProfile.timeout_ms),
+    )
+    transfer.close()
+    top.close()
+    _check_whole(top, profile)
+    return profile
+
+
+def calibration_toml(cameras: Iterable[Camera]) -> str:
+    """Return intrinsics and poses as the file of a profile's key `calibration`; reading it back gives equal numbers."""
+    lines = [f'schema = "{CALIBRATION_SCHEMA}"']
+    for c in cameras:
+        values = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "rotation": c.R.tolist(), "translation": c.t.tolist()}
+        if c.distortion:
+            values["distortion"] = list(c.distortion)
+        # Python writes the shortest digits that give the same number back, and TOML reads them.
+        lines += ["", f'[camera."{c.id}"]', *(f"{key} = {_plain(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n"
+
+
+def read_calibration(path: Path, width: int, height: int) -> dict[str, Camera]:
+    """Return the cameras of a file that `calibration_toml` made, by id. Raises UserError where it is no such file."""
+    top = read_toml(path, "the calibration of a rig")
+    top.take("schema", choice(CALIBRATION_SCHEMA))
+    tables = top.table("camera") or Table(path, "camera", {})
+    top.close()
+    return {id: _read_calibration(table, id, width, height) for id, table in tables.items()}
+
+
+def _plain(value: Any) -> str:
+    return f"[{', '.join(map(_plain, value))}]" if isinstance(value, list) else repr(float(value))
+
+
+def _transfer_bytes(value: Any) -> int:
+    if type(value) is not int or not PACKET_BYTES <= value <= 1 << 26 or value % PACKET_BYTES:
+        raise ValueError
+    return value
+
+
+_TRANSFER = Kind(f"a multiple of {PACKET_BYTES} bytes, 64 MiB at most", _transfer_bytes)
+
+
+# ------------------------------------------------------------ cameras
+
+
+def _read_cameras(top: Table, width: int, height: int) -> tuple[CameraProfile, ...]:
+    folder = top.path.parent
+    defaults = top.table("defaults")
+    shared = defaults.rest() if defaults else {}
+    name = top.get("calibration", TEXT, None)
+    known = read_calibration(folder / name, width, height) if name else {}
+    if unique := {"id", "serial", "calibration", "maps"} & set(shared):
+        raise top.error(f"defaults.{min(unique)}", "common keys of the cameras", "a key of each camera", "move it")
+    tables = top.tables("camera")
+    if not tables:
+        raise top.error("camera", "a table [[camera]] for each camera", "none", "add them")
+    return tuple(_read_camera(table.with_defaults(shared), known, width, height) for table in tables)
+
+
+def _read_camera(table: Table, known: dict[str, Camera], width: int, height: int) -> CameraProfile:
+    id = table.take("id", _ID)
+    own = table.table("calibration")
+    if own and id in known:
+        raise table.error("calibration", "one calibration of a camera", "another in the profile's calibration file")
+    maps = table.get("maps", TEXT, None)
+    camera = CameraProfile(
+        id=id,
+        serial=table.take("serial", TEXT),
+        vendor_id=table.take("vendor_id", whole(0, 0xFFFF)),
+        product_id=table.take("product_id", whole(0, 0xFFFF)),
+        interface=table.get("interface", whole(0, 255), 0),
+        control_interface=table.get("control_interface", whole(0, 255), None),
+        endpoint_in=table.take("endpoint_in", whole(0x81, 0x8F)),
+        endpoint_out=table.get("endpoint_out", whole(0x01, 0x0F), None),
+        start=table.get("start", _COMMANDS, ()),
+        stop=table.get("stop", _COMMANDS, ()),
+        role=table.get("role", choice(PRIMARY, SECONDARY), SECONDARY),
+        rows=table.get("rows", choice(BOTTOM_UP, TOP_DOWN), BOTTOM_UP),
+        mirrored=table.get("mirrored", FLAG, False),
+        calibration=_read_calibration(own, id, width, height) if own else known.get(id),
+        maps=table.path.parent / maps if maps else None,
+    )
+    table.close()
+    if (camera.start or camera.stop) and camera.endpoint_out is None:
+        raise table.error("endpoint_out", "an endpoint for the start and stop sequences", "none", "add it")
+    if camera.maps:
+        read_maps(camera.maps, width, height)
+    return camera
+
+
+def _command(value: Any) -> bytes:
+    if not isinstance(value, str) or not (command := bytes.fromhex(value)):
+        raise ValueError
+    return command
+
+
+_COMMANDS = tuple_of(Kind("hexadecimal digits", _command), 'a list of commands in hexadecimal digits, such as "00 ff"')
+
+
+def _read_calibration(table: Table, id: str, width: int, height: int) -> Camera:
+    fx, fy = (table.take(name, _POSITIVE) for name in ("fx", "fy"))
+    cx, cy = (table.take(name, _FINITE) for name in ("cx", "cy"))
+    rotation = table.take("rotation", Kind("three rows of three numbers", lambda v: _array(v, (3, 3))))
+    translation = table.take("translation", Kind("three numbers", lambda v: _array(v, (3,))))
+    lens = table.get("distortion", _LENS, ())
+    table.close()
+    try:
+        check_rotation(rotation, "")
+    except UserError:
+        raise table.error("rotation", "a rotation matrix (world to camera)", shown(rotation.tolist())) from None
+    camera = Camera(id, width, height, fx, fy, cx, cy, rotation, translation, lens)
+    check_lens(camera, table.path)
+    return camera
+
+
+def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    rows = tuple_of(_VECTOR, "").read(value) if len(shape) == 2 else _VECTOR.read(value)
+    array = np.array(rows, np.float64)  # ValueError where rows differ in length
+    if array.shape != shape:
+        raise ValueError
+    return array
+
+
+# ------------------------------------------------------------ checks across keys
+
+
+def _check_whole(top: Table, p: RigProfile) -> None:
+    """Check facts across keys: names used twice, roles, sizes that do not go together."""
+    try:
+        second = p.fps * make_layout(p.layout, p.width, p.height).frame_bytes
+    except UserError as e:
+        raise UserError(f"{top.path}, key layout: {e}") from None
+    for key, values in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
+        if twice := _twice(values):
+            raise top.error(f"camera.{key}", "another one for each camera", f"{twice!r} twice")
+    if (primaries := [c.id for c in p.cameras if c.role == PRIMARY]) != primaries[:1] or not primaries:
+        found = ", ".join(primaries) or "none"
+        raise top.error("camera.role", "one primary camera", found, 'give role = "primary" to the one that triggers')
+    ids = {c.id for c in p.cameras}
+    if _twice(p.held_out) or not set(p.held_out) < ids:
+        raise top.error("held_out", "some of the cameras, each once, and not all", ", ".join(p.held_out))
+    if bare := [c.id for c in p.cameras if c.calibration is None]:
+        if len(bare) < len(p.cameras):
+            found = f"none of {', '.join(bare)}"
+            raise top.error(
+                "calibration", "intrinsics and poses of all cameras, or of none", found, "calibrate the rig"
+            )
+    if p.ring_seconds is not None and p.ring_seconds * second < p.transfers * p.transfer_bytes:
+        found = f"{p.ring_seconds:g} s, {p.ring_seconds * second / 1e6:.3g} MB"
+        expected = f"room for {p.transfers} reads of {p.transfer_bytes} bytes in flight"
+        raise top.error("transfer.ring_seconds", expected, found, "enlarge it, or have fewer or smaller reads")
+
+
+def _twice(values: Sequence[str]) -> str | None:
+    return next((v for i, v in enumerate(values) if v in values[:i]), None)

@@ -1,0 +1,170 @@
+"""TOML tables, read key by key: any error becomes one UserError that names file, key, found value and fix."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_text
+from spike4dgs.benchmark.untrusted.numbers import shown
+
+T = TypeVar("T")
+D = TypeVar("D")
+_MOST_BYTES = 1 << 18  # a profile of nine cameras has 5 kB
+
+
+@dataclass(frozen=True)
+class Kind(Generic[T]):
+    """A kind of value: its name in messages, and its reader (ValueError or TypeError for values of another kind)."""
+
+    expected: str
+    read: Callable[[Any], T]
+
+
+class Table:
+    """A table of a TOML file. Each key is taken once; `close` refuses the keys that were not."""
+
+    def __init__(self, path: Path, name: str, values: dict[str, Any]) -> None:
+        self.path, self._name, self._left, self._known = path, name, dict(values), set[str]()
+
+    def error(self, key: str, expected: str, found: str, fix: str = "correct the file") -> UserError:
+        """Return the error for a key of this table."""
+        name = f"{self._name}.{key}" if self._name and key else self._name or key
+        return problem(f"{self.path}, key {name}", expected, found, fix)
+
+    def take(self, key: str, kind: Kind[T]) -> T:
+        """Return the value of a required key."""
+        if key not in self._left:
+            raise self.error(key, kind.expected, "no such key", "add it")
+        return self.get(key, kind, None)  # type: ignore[return-value]
+
+    def get(self, key: str, kind: Kind[T], default: D) -> T | D:
+        """Return the value of an optional key."""
+        self._known.add(key)
+        if key not in self._left:
+            return default
+        value = self._left.pop(key)
+        try:
+            return kind.read(value)
+        except (TypeError, ValueError, OverflowError):
+            raise self.error(key, kind.expected, shown(value)) from None
+
+    def tables(self, key: str) -> list[Table]:
+        """Return the tables of an array of tables, [[key]]."""
+        values = self.get(key, Kind(f"tables [[{key}]]", _list_of_tables), [])
+        return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(values)]
+
+    def table(self, key: str) -> Table | None:
+        """Return a table in this one, or None where it is absent."""
+        values = self.get(key, Kind(f"a table [{key}]", _table), None)
+        return None if values is None else Table(self.path, f"{self._name}.{key}".lstrip("."), values)
+
+    def items(self) -> list[tuple[str, Table]]:
+        """Take all remaining keys, each a table, and return them by name."""
+        return [(key, self.table(key)) for key in list(self._left)]  # type: ignore[misc]
+
+    def with_defaults(self, values: dict[str, Any]) -> Table:
+        """Return this table with values for its absent keys."""
+        return Table(self.path, self._name, {**values, **self._left})
+
+    def rest(self) -> dict[str, Any]:
+        """Take all remaining keys and return them."""
+        rest, self._left = self._left, {}
+        return rest
+
+    def close(self) -> None:
+        """Raise UserError for a key that was not taken."""
+        if self._left:
+            raise self.error(next(iter(self._left)), f"keys among {', '.join(sorted(self._known))}", "another key")
+
+
+def read_toml(path: Path, what: str) -> Table:
+    """Read a TOML file. `what` names the kind of file for the error: missing, unreadable, or no TOML."""
+    try:
+        return Table(path, "", tomllib.loads(read_text(path, what, _MOST_BYTES)))
+    except RecursionError:
+        raise problem(path, f"{what} (TOML)", "values nested too deep", "correct the file") from None
+    except ValueError as e:  # bad syntax, bad UTF-8
+        raise problem(path, f"{what} (TOML)", f"damaged text ({str(e)[:200]})", "correct the file") from None
+
+
+def whole(low: int, high: int) -> Kind[int]:
+    """Return the kind of integers of [low, high]."""
+
+    def read(value: Any) -> int:
+        if type(value) is not int or not low <= value <= high:
+            raise ValueError
+        return value
+
+    return Kind(f"a whole number from {low} to {high}", read)
+
+
+def number(low: float, high: float, expected: str) -> Kind[float]:
+    """Return the kind of finite numbers of (low, high]."""
+
+    def read(value: Any) -> float:
+        if type(value) not in (int, float) or not (math.isfinite(value) and low < value <= high):
+            raise ValueError
+        return float(value)
+
+    return Kind(expected, read)
+
+
+def choice(*names: str) -> Kind[str]:
+    """Return the kind of these words."""
+
+    def read(value: Any) -> str:
+        if value not in names:
+            raise ValueError
+        return str(value)
+
+    return Kind(f"one of {', '.join(names)}", read)
+
+
+def matching(expected: str, fits: Callable[[str], object]) -> Kind[str]:
+    """Return the kind of strings that `fits` accepts."""
+
+    def read(value: Any) -> str:
+        if not isinstance(value, str) or not fits(value):
+            raise ValueError
+        return value
+
+    return Kind(expected, read)
+
+
+def tuple_of(kind: Kind[T], expected: str) -> Kind[tuple[T, ...]]:
+    """Return the kind of lists of values of one kind."""
+
+    def read(value: Any) -> tuple[T, ...]:
+        if not isinstance(value, list):
+            raise TypeError
+        return tuple(kind.read(v) for v in value)
+
+    return Kind(expected, read)
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError
+    return value
+
+
+def _table(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError
+    return value
+
+
+def _list_of_tables(value: Any) -> list[dict[str, Any]]:
+    if not isinstance(value, list):
+        raise TypeError
+    return [_table(v) for v in value]
+
+
+FLAG = Kind("true or false", _flag)
+TEXT = matching("a text that is not empty", str.strip)

@@ -1,1 +1,0 @@
-"""Tables and images of scenes and of the cost of making them."""

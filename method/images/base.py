@@ -1,0 +1,122 @@
+"""Image makers, the first of a recipe's four parts: each turns a window of spikes into an image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.spikes.calibration import Calibration
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.weights import FoundWeights
+from spike4dgs.method.settings import Settings
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The weights of a trained part: runs with other weights are other methods."""
+
+    sha256: str  # of the weight file
+    trained_on: tuple[str, ...]  # data sets, such as scenes as ID@REVISION
+
+
+def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], Any]) -> Learned | None:
+    """Return the hash and the training data of the weights in use; None where they are missing or damaged.
+
+    A fit will say which of the two.
+    """
+    try:
+        found = find()
+        return Learned(found.sha256, read_card(found.path).trained_on)
+    except UserError:
+        return None
+
+
+@dataclass(frozen=True)
+class ImageMaker:
+    """A named way from spikes to images.
+
+    `rate` returns spikes per tick [H, W] float32 at the start of a tick. A pixel's own rate can be corrected by its
+    calibration afterwards. A maker that looks at neighbours needs the calibration before: `corrected` returns the rate
+    that an ideal camera's pixels would have.
+
+    >>> from spike4dgs.baselines.images.tfp import TFP, TfpSettings
+    >>> from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+    >>> stream = SpikeStream(pack(np.tile(np.eye(8), (25, 1, 1))), 8, 8, 20_000.0)  # 25 ticks, the diagonal fires
+    >>> TFP(stream, ticks=[10, 12], gain=0.5).shape
+    (2, 8, 8)
+    >>> TFP.with_settings(TfpSettings(half_window=5))(stream, [10], gain=0.5)[0, 0, :2]
+    array([2., 0.], dtype=float32)
+    """
+
+    name: str
+    definition: str  # may refer to fields of the settings by their names
+    source: str
+    rate: Callable[[SpikeStream, int, Any], Float32]  # of a stream, a tick and the settings
+    settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
+    learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
+    corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+    rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
+    made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
+
+    def with_settings(self, settings: Settings) -> ImageMaker:
+        """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""
+        if type(settings) is not type(self.settings):
+            raise TypeError(f"{self.name} has {type(self.settings).__name__}, not {type(settings).__name__}")
+        return replace(self, settings=settings)
+
+    def on(self, device: str) -> ImageMaker:
+        """Return the same maker with its network, if it has one, on `device`."""
+        return self.made_on(device) if self.made_on else self
+
+    def __call__(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> Float32:
+        """Return linear radiance [n, H, W] float32 (1.0 = white) at the starts of `ticks`.
+
+        `gain` is spikes per tick of white. `camera` corrects the images for what its pixels do to light; a dead pixel
+        has seen nothing, which is not black but NaN. Raises UserError for a tick outside the clip.
+        """
+        images = np.empty((len(ticks), stream.height, stream.width), np.float32)
+        for image, tick in zip(images, ticks, strict=True):
+            _require_tick(stream, tick)
+            if self.corrected and camera:
+                image[:] = self.corrected(stream, tick, camera)
+            else:
+                image[:] = self.rate(stream, tick, self.settings)
+        return self._radiance(images, gain, camera)
+
+    def with_spans(
+        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
+    ) -> tuple[Float32, Float32 | None]:
+        """Return the images, and the span that each value is a mean over: [n, 2, H, W] in ticks from each of `ticks`.
+
+        None: the images show instants.
+        """
+        if self.rate_over is None:
+            return self(stream, ticks, gain, camera), None
+        for tick in ticks:
+            _require_tick(stream, tick)
+        found = [self.rate_over(stream, tick, self.settings) for tick in ticks]
+        return self._radiance(np.stack([rate for rate, _ in found]), gain, camera), np.stack([s for _, s in found])
+
+    def _radiance(self, images: Float32, gain: float, camera: Calibration | None) -> Float32:
+        """Return radiance from rates [n, H, W], which may be overwritten."""
+        if camera is None:
+            images /= gain
+            return images
+        found = images / np.float32(camera.radiance_gain) if self.corrected else camera.radiance(images)
+        found[:, ~(camera.gain > 0)] = np.nan
+        return found
+
+
+def _require_tick(stream: SpikeStream, tick: int) -> None:
+    if not 0 <= tick < stream.n_ticks:
+        raise problem(stream.source, f"ticks within [0, {stream.n_ticks})", f"{tick}", "ask for another tick")

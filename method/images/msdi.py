@@ -1,0 +1,59 @@
+"""The image maker `msdi`: MSDI's image generator (eq. 12) on the ticks around an instant, view by view."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.spikes.calibration import Calibration
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
+from spike4dgs.method.images.windows import window
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network, read_card, weights_path
+
+if TYPE_CHECKING:
+    from spike4dgs.method.msdi.network import Msdi
+
+
+def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None, device: str = "auto") -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, by the network in use.
+
+    With a calibration they are those of an ideal camera. Beyond its ends the clip is mirrored. Raises UserError where
+    the weights are missing or damaged.
+    """
+    chosen = choose_device(device, rasterizes=False)
+    return reconstruct(load_network(weights_path(), chosen), stream, tick, camera)
+
+
+def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
+    """Return the estimate of `network` at the start of `tick`: spikes per tick [H, W] float32, not negative."""
+    import torch  # imported where it is used: reading spikes must not wait for it
+
+    from spike4dgs.method.msdi.inputs import Sensors
+    from spike4dgs.method.msdi.network import has_bfloat16
+
+    device = next(network.parameters()).device
+    sensors = None
+    if camera:
+        sensors = Sensors(*(torch.from_numpy(a).to(device)[None] for a in (camera.gain, camera.dark)))
+    with torch.inference_mode():
+        spikes = torch.from_numpy(window(stream, tick, network.config.ticks)).to(device)[None]
+        rate: Float32 = network.images(spikes, sensors, half=has_bfloat16(device))[0].clamp(min=0).cpu().numpy()
+    return rate
+
+
+def msdi_maker(device: str) -> ImageMaker:
+    """Return the image maker whose network runs on `device`."""
+    return ImageMaker(
+        name="msdi",
+        definition="MSDI's image generator on the 41 ticks around tick t",
+        source="Spike4DGS, eq. 12",
+        rate=lambda stream, tick, _: msdi_image(stream, tick, device=device),
+        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        corrected=partial(msdi_image, device=device),
+        made_on=msdi_maker,
+    )
+
+
+MSDI = msdi_maker("auto")

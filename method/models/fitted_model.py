@@ -1,0 +1,166 @@
+"""The model that the one trainer fits: Gaussians and how they move, in memory and in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.runs.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.untrusted.numbers import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.models.model_file import ModelFile, group, write_model
+from spike4dgs.method.models.modules import make_filled
+from spike4dgs.method.models.names import BACKGROUND, from_file_names, motion_settings, to_file_names
+from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
+from spike4dgs.method.settings import Settings, make_settings
+from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat.background import Repeated, join
+from spike4dgs.method.splat.types import PixelFilter
+from spike4dgs.method.torch_state import one_torch_thread
+from spike4dgs.method.training_views.pinholes import through_lens
+
+_MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSpec:
+    """The source of a motion model: with it and the model's state, the model can be built again."""
+
+    name: str  # in `motion.table.MOTIONS`
+    extent: Extent
+    settings: Settings  # the motion's own
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        e = self.extent
+        extent = {"low": e.low.tolist(), "high": e.high.tolist(), "scale": e.scale, "n_ticks": e.n_ticks}
+        return {"name": self.name, "extent": {**extent, "width": e.width}, "settings": asdict(self.settings)}
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any], where: str) -> MotionSpec:
+        """Return the spec that `as_dict` gave, or an earlier version's.
+
+        Raises UserError for unknown settings, and KeyError, TypeError or ValueError for values that are none.
+        """
+        e = dict(value["extent"])
+        low, high = (torch.tensor([number(v, -MAX_LENGTH, MAX_LENGTH) for v in e.pop(key)]) for key in ("low", "high"))
+        scale, ticks = positive(e.pop("scale"), MAX_LENGTH), whole(e.pop("n_ticks"), 1, MAX_TICKS)
+        extent = Extent(low, high, scale, ticks, whole(e.pop("width"), 1, MAX_SIDE))
+        if e or len(low) != 3 or len(high) != 3:
+            raise ValueError(f"an extent of low, high, scale, n_ticks and width, and not {shown(value['extent'])}")
+        defaults = MOTIONS[value["name"]].defaults
+        settings = make_settings(motion_settings(dict(value["settings"]), defaults), where, defaults)
+        for setting in asdict(settings).values():
+            if type(setting) is int:  # of layers, levels, features: loops have so many turns
+                whole(setting, 0, _MOST_OF_ANYTHING)
+        return cls(value["name"], extent, settings)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """Gaussians and how they move, and others that do not."""
+
+    KIND: ClassVar = "gaussians"
+
+    pieces: tuple[Gaussians, ...]  # of equal parts of the clip, one after the other
+    background: Gaussians  # none unless the fit froze some
+    motion: Motion
+    duration_us: float
+    device: str
+    spec: MotionSpec
+    cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
+    pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
+    estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the Gaussians and of the motion model."""
+        tensors = [t for g in (*self.pieces, self.background) for t in g.tensors().values()]
+        return count_bytes([*tensors, *self.motion.state_dict().values()])
+
+    @through_lens
+    @torch.no_grad()
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
+        views = Views.from_cameras([camera], device=self.device)
+        with one_torch_thread():
+            return self._render(views, t_us)[0].clamp(min=0).cpu().numpy()
+
+    def _render(self, view: Views, t_us: float) -> Tensor:
+        """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
+        still = self._repeated.in_view(view) if len(self.background) and self.device == "cpu" else None
+        if still is None:
+            return self.rendered(self.splats(t_us), view)
+        return self.image(still.render(self._moving(t_us), [0]).image, view)
+
+    def rendered(self, splats: Splats, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
+        f = self.pixel_filter
+        return self.image(render(splats, views, eps2d=f.variance, antialiased=f.compensated).image, views)
+
+    def splats(self, t_us: float) -> Splats:
+        """Return what is rendered at `t_us`."""
+        moving = self._moving(t_us)
+        return join(self._repeated.splats, moving) if len(self.background) else moving
+
+    def _moving(self, t_us: float) -> Splats:
+        t, count = min(max(t_us / self.duration_us, 0.0), 1.0), len(self.pieces)
+        piece = min(int(t * count), count - 1)
+        return self.motion.splats(self.pieces[piece], t * count - piece)
+
+    @cached_property
+    def _repeated(self) -> Repeated:
+        return Repeated(self.background.splats(), self.pixel_filter)
+
+    def image(self, image: Tensor, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
+        return self.motion.image(image, views)
+
+    def save(self, path: Path, provenance: Provenance) -> None:
+        """Write the model to one file; see `saved_model.load_model`."""
+        pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
+        background = {BACKGROUND: to_file_names(self.background.tensors())}
+        tensors = group(**pieces, **background, motion=self.motion.state_dict())
+        config = {"motion": self.spec.as_dict(), "pieces": len(pieces), "filter": asdict(self.pixel_filter)}
+        write_model(path, ModelFile(self.KIND, config, tensors, provenance))
+
+    @classmethod
+    def from_file(cls, file: ModelFile, device: str) -> FittedModel:
+        """Return the model that `save` wrote.
+
+        Raises KeyError, TypeError, ValueError, RuntimeError or UserError for another version's.
+        """
+        spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
+        motion = make_filled(
+            lambda: MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator()), file.part("motion")
+        )
+        count = whole(file.config["pieces"], 1, len(file.tensors))
+        *pieces, background = (
+            Gaussians.from_file({k: v.to(device) for k, v in from_file_names(file.part(part)).items()})
+            for part in (*(f"piece{i}" for i in range(count)), BACKGROUND)
+        )
+        duration_us, found = file.provenance.duration_us, _filter(file.config.get("filter", {}))
+        made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, pixel_filter=found)
+        made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
+        return made
+
+
+def _filter(value: Mapping[str, Any]) -> PixelFilter:
+    """Return the filter that a file names, or the customary one where it names none, as earlier versions' do."""
+    made = PixelFilter(**value)
+    if type(made.compensated) is not bool:
+        raise ValueError(f"a filter with `compensated` true or false, and not {shown(made.compensated)}")
+    return replace(made, variance=number(made.variance, 0, MAX_SIDE))
+
+
+def count_bytes(tensors: Iterable[Tensor]) -> int:
+    """Return the bytes that tensors take in a file."""
+    return sum(t.numel() * t.element_size() for t in tensors)

@@ -1,0 +1,53 @@
+"""`load_model`: a model that a run saved, ready to render the images that it rendered then, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from spike4dgs.baselines.radiance_field.model import RadianceModel
+from spike4dgs.baselines.tracking.model import TrackedModel
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.method import Model
+from spike4dgs.benchmark.runs.provenance import Provenance
+from spike4dgs.method.fit import check_device
+from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.models.model_file import FIX, ModelFile, read_model
+
+# Readers of the tensors of each kind: file, device -> model. Its class writes that kind in `save`.
+KINDS: dict[str, Callable[[ModelFile, str], Model]] = {
+    FittedModel.KIND: FittedModel.from_file,
+    TrackedModel.KIND: TrackedModel.from_file,
+    RadianceModel.KIND: RadianceModel.from_file,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SavedModel:
+    """A model from a file, and its provenance."""
+
+    model: Model
+    provenance: Provenance
+
+    @property
+    def title(self) -> str:
+        """Method and scene."""
+        return f"{self.provenance.name} on {self.provenance.scene}"
+
+
+def load_model(path: Path | str, device: str = "cpu") -> SavedModel:
+    """Return the model of a file, on `device`.
+
+    Raises UserError where the file is missing, damaged, foreign, or of a version that this one cannot read, and where
+    the device is not there.
+    """
+    check_device(device)
+    file = read_model(Path(path))
+    if file.kind not in KINDS:
+        raise problem(path, f"a model of kind {', '.join(KINDS)}", repr(file.kind), FIX)
+    try:
+        return SavedModel(KINDS[file.kind](file, device), file.provenance)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as e:  # another version
+        found = f"one that this version cannot read ({type(e).__name__}: {e})"
+        raise problem(path, "a fitted model", found[:400], FIX) from None

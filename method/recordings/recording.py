@@ -1,0 +1,120 @@
+"""The recording that `fit` takes: a scene folder, or streams without poses, whose cameras are then estimated.
+
+Of a scene folder the fit reads only what `Scene.training` holds: no image, mask or map of the truth, and no held-out
+camera. The held-out cameras' streams and recordings are read after it, to judge it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from spike4dgs.baselines.starts.colmap import UNCALIBRATED, clip_means, map_views
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import sha256_file, sha256_json
+from spike4dgs.benchmark.metrics.pose_error import Sim3
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes
+from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
+from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.recordings.camera_facts import CameraFacts, camera_facts
+from spike4dgs.method.recordings.survey import survey_gains, survey_streams
+
+GIVEN = "given by the scene"
+ESTIMATED = "estimated with COLMAP, the focal length too: the unit of length is the array's largest distance"
+ALL = "all"  # the split of a recording without poses
+WHITE_PERCENTILE = 99.0  # of the mean rates; the rate of white is not known without a scene
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The data of a fit, and the facts for its report."""
+
+    training: TrainingScene
+    split: str
+    poses: str  # where they come from
+    facts: tuple[CameraFacts, ...]
+    scene: Scene | None = None  # the folder, for what is judged after the fit; None: streams without poses
+    notes: tuple[str, ...] = ()  # what was found, what was assumed, and what could not be used
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """The cameras that the fit does not see."""
+        return self.scene.test if self.scene else ()
+
+
+def open_recording(root: Path, seed: int = 0) -> Recording:
+    """Return the recording in a scene folder or in a folder of streams without poses, surveyed for faults.
+
+    Raises UserError for another folder, where too little was recorded, and where poses cannot be estimated.
+    """
+    if (root / STREAMS).is_file():
+        return _without_poses(root, open_stream_folder(root, allow_gaps=True), seed)
+    scene = open_scene(root, allow_gaps=True)
+    notes = (f"the fit does not see the held-out {', '.join(scene.test)}",) if scene.test else ()
+    recorded = {c: scene.stream(c) for c in scene.train}
+    surveyed = survey_streams(replace(scene.training, streams=tuple(recorded.values())))
+    training, gain_notes = survey_gains(surveyed.scene)
+    facts = camera_facts(training, recorded, surveyed.bad)
+    return Recording(training, scene.split, GIVEN, facts, scene, (*notes, *surveyed.notes, *gain_notes))
+
+
+def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) -> Recording:
+    """Return streams with the cameras that structure from motion finds; those that it does not find are left out."""
+    kinds = {(s.width, s.height, s.rate_hz, s.n_ticks) for s in streams.values()}
+    if len(streams) < 2 or len(kinds) > 1:
+        found = f"{len(streams)} stream(s) of {len(kinds)} kind(s)"
+        raise problem(root, "two or more streams of one size, rate and length", found, "record all cameras together")
+    names = sorted(streams)
+    revision = sha256_json({c: sha256_file(Path(streams[c].source)) for c in names})
+    first = streams[names[0]]
+    clock = first.rate_hz, first.n_ticks
+    surveyed = survey_streams(
+        TrainingScene(
+            root.resolve().name, revision, _guess(names, first), tuple(streams[c] for c in names), *clock, 1.0
+        )
+    )
+    scene = surveyed.scene
+    rates = clip_means(scene)
+    white = max(float(np.percentile(rates, WHITE_PERCENTILE)), 1e-6)
+    cameras = map_views(scene, rates / np.float32(white), seed, UNCALIBRATED, UNCALIBRATED.focal_prior).cameras
+    if len(cameras) < 2:
+        fix = "calibrate the array with `spike4dgs calibrate-rig`, and record with its calibration"
+        raise problem(root, "poses, or views in which COLMAP finds them", f"poses of {len(cameras)} views", fix)
+    kept = [c.id for c in cameras]
+    notes = [
+        f"white is taken to be {white:.3f} spikes per tick, the {WHITE_PERCENTILE:g}th percentile of all pixels' rates"
+    ]
+    if lost := [c.id for c in scene.cameras if c.id not in kept]:
+        notes.append(f"COLMAP found no pose of {', '.join(lost)}: left out")
+    repaired = {c.id: stream for c, stream in zip(scene.cameras, scene.streams, strict=True)}
+    training, gain_notes = survey_gains(
+        replace(scene, cameras=own_frame(cameras), streams=tuple(repaired[c] for c in kept), radiance_gain=white)
+    )
+    facts = camera_facts(training, streams, surveyed.bad)
+    return Recording(training, ALL, ESTIMATED, facts, notes=(*surveyed.notes, *notes, *gain_notes))
+
+
+def _guess(names: Sequence[str], stream: SpikeStream) -> tuple[Camera, ...]:
+    """Return cameras side by side that look along y: only a frame for what COLMAP finds."""
+    size, R = (stream.width, stream.height), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    focal, middle = UNCALIBRATED.focal_prior * stream.width, (stream.width / 2, stream.height / 2)
+    return tuple(
+        Camera(name, *size, focal, focal, *middle, R, -R @ np.array([float(i), 0.0, 0.0]))
+        for i, name in enumerate(names)
+    )
+
+
+def own_frame(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Return the cameras in the array's own frame: x right, y forward, z up, as their means are.
+
+    The origin is the mean centre, the unit of length the largest distance between two cameras.
+    """
+    W, centers = array_axes(cameras), np.stack([c.center for c in cameras])
+    size = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    frame = Sim3(1 / size, W, -W @ centers.mean(axis=0) / size)
+    return tuple(map(frame.camera, cameras))

@@ -1,0 +1,231 @@
+"""The report of a fit: one HTML page with its images inside and the video beside it, and nothing from a network."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.metrics.pose_error import angle_deg
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.reports.figure import new_figure
+from spike4dgs.benchmark.runs.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera, Float64, array_axes
+from spike4dgs.method.recordings.camera_facts import CameraFacts
+from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ABOVE, BEHIND = (0, 1), (0, 2)  # of right, forward and up, the axes that a plot shows
+
+_CSS = """
+:root { color-scheme: light dark; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.2rem; margin-top: 2rem; }
+.scroll { overflow-x: auto; font-size: 13px; } table { border-collapse: collapse; }
+th, td { padding: .2rem .6rem .2rem 0; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
+th { font-weight: 600; } th:first-child, td:first-child, .facts td { text-align: left; white-space: normal; }
+.facts td:first-child { white-space: nowrap; font-weight: 600; vertical-align: top; }
+img, video { max-width: 100%; height: auto; background: #fff; } code { overflow-wrap: anywhere; }
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Everything that the page shows. `given` are the cameras of the recording, `about.cameras` those of the fit."""
+
+    about: Provenance
+    source: Path  # the folder of the recording
+    poses: str  # where they come from
+    given: tuple[Camera, ...]
+    held_out: tuple[str, ...]
+    judged: HeldOutScores | None  # the held-out cameras by their own spikes
+    notes: tuple[str, ...]
+    facts: Sequence[CameraFacts]
+    columns: Mapping[str, Mapping[str, str]]  # more of the table of cameras: head -> camera -> cell
+    residuals: Mapping[str, float]  # dB, by camera
+    maker: str  # of the images that residuals are against
+    seconds: Mapping[str, float]  # by step
+    model_mb: float
+    environment: Mapping[str, Any]
+    command: str
+    video: str  # file name beside the page
+
+
+def write_report(path: Path, report: Report, sheet: Path) -> None:
+    """Write the page; `sheet` is the PNG that it embeds."""
+    about = report.about
+    title = f"{about.name} on {about.scene}"
+    notes = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>Fitted {escape(about.created)}. Files: <code>model.safetensors</code>, <code>sheet.png</code>, "
+        f"<code>{escape(report.video)}</code>.</p>",
+        _facts_table(_summary(report)),
+        f"<h2>Notes</h2><ul>{notes}</ul>" if notes else "",
+        "<h2>Video</h2>",
+        f'<video src="{escape(report.video)}" controls loop muted playsinline></video>',
+        "<h2>Training views</h2>",
+        f"<p>The {escape(report.maker)} image made from the spikes, the model's render, and their absolute "
+        "difference, at three times. Pixels that were left out are white in the difference.</p>",
+        _image(sheet.read_bytes(), "training views"),
+        "<h2>Cameras</h2>",
+        _cameras_table(report),
+        f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {report.maker} "
+        "images of the same camera. It is a residual of the fit and not a score: the model has seen these images, and "
+        "their noise is in it. Dead pixels never fire under uniform light, hot ones fire in the dark five times as "
+        "often as the median pixel, the rate of flickering ones is not steady. Without recordings of light and "
+        "darkness these are the pixels that differ from all of their neighbours. The gain is that of the camera "
+        "beside the array's. A clock is given beside the mean of all, at the middle of the clip, with its standard "
+        "error; a pose's error is the median distance of features from their points' projections, with the poses as "
+        "they were given.</p>",
+        _held_out(report.judged) if report.judged else "",
+        "<h2>Poses</h2>",
+        f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
+        _image(poses_plot(about.cameras, report.given), "the array from above and from behind"),
+        "<h2>Program</h2>",
+        _facts_table(_program(report)),
+    ]
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_CSS}</style>'
+    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    write_text(
+        path, f'<!doctype html><html lang="en"><head>{head}</head><body>' + "\n".join(parts) + "</body></html>\n"
+    )
+
+
+def _summary(report: Report) -> list[tuple[str, str]]:
+    about = report.about
+    first = about.cameras[0]
+    clip = f"{about.n_ticks} ticks at {about.rate_hz:g} Hz: {about.duration_us / 1e3:g} ms"
+    mean = _decibel(float(np.mean(list(report.residuals.values()))))
+    steps = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in report.seconds.items())
+    cameras = f"{len(about.cameras)} of {first.width}x{first.height}"
+    if report.held_out:
+        cameras += f"; held out: {', '.join(report.held_out)}"
+    return [
+        ("recording", str(report.source)),
+        ("cameras", cameras),
+        ("clip", clip),
+        ("poses", report.poses),
+        ("mean residual", f"{mean} dB (not a score)"),
+        ("times", steps),
+        ("model", f"{report.model_mb:.2f} MB"),
+    ]
+
+
+def _program(report: Report) -> list[tuple[str, str]]:
+    about, machine = report.about, report.environment
+    commit = about.harness["commit"] or "unknown (an installed package)"
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    return [
+        ("command", report.command),
+        ("method, budget, seed", f"{about.name}, {about.budget}, {about.method['seed']}"),
+        ("version, commit", f"{about.harness['version']}, {commit}{' and changes' if about.harness['dirty'] else ''}"),
+        ("recording's revision", about.scene_revision),
+        ("device", f"{about.device}: {machine['gpu'] or machine['cpu']}"),
+        ("system", f"Python {machine['python']}, {machine['platform']}"),
+        ("packages", packages),
+    ]
+
+
+def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
+    lines = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
+    return f'<table class="facts">{lines}</table>'
+
+
+def _cameras_table(report: Report) -> str:
+    heads = ["camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %"]
+    heads += ["dead", "hot", "flickering", "gain", *report.columns, "residual, dB"]
+    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
+    focal = {camera.id: camera.fx for camera in report.about.cameras}
+    for f in report.facts:
+        cells = [f.camera, f"{focal[f.camera]:.1f}", f"{f.missing}", *(f"{v:.4f}" for v in (f.mean, f.low, f.high))]
+        cells += [*(f"{n}" for n in (f.dead, f.hot, f.flickering)), f"{f.gain:.3f}"]
+        cells += [column.get(f.camera, "-") for column in report.columns.values()]
+        cells.append(_decibel(report.residuals[f.camera]))
+        lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
+    rows = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f'<div class="scroll"><table>{rows}</table></div>'
+
+
+def _held_out(judged: HeldOutScores) -> str:
+    """Return the section of the held-out cameras: a row for each, and their mean."""
+    heads = ["camera", "images", *(f"{METRICS[m].title}{', dB' if METRICS[m].unit else ''}" for m in SHOWN)]
+    rows = [(camera, str(judged.images[camera]), values) for camera, values in judged.cameras.items()]
+    rows.append(("mean", str(sum(judged.images.values())), judged.mean))
+    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
+    for name, images, values in rows:
+        cells = [name, images, *(METRICS[m].format(values[m]) for m in SHOWN)]
+        lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
+    table = "".join(f"<tr>{line}</tr>" for line in lines)
+    notes = "".join(f"<li>{escape(METRICS[m].title)}: {escape(note)}</li>" for m, note in judged.notes.items())
+    return (
+        f'<h2>Held-out cameras</h2><div class="scroll"><table>{table}</table></div>'
+        "<p>The fit has not seen these cameras. Their renders are compared with the spikes that they recorded "
+        "themselves, without any ground truth. The spike PSNR (higher is better) compares counts over 5, 20 and 80 "
+        "ticks; the noise of counting is in it, so compare it between models of one recording only. The spike deviance "
+        "(lower is better) is what the recorded intervals lose in likelihood against the recorded rates.</p>"
+        + (f"<ul>{notes}</ul>" if notes else "")
+    )
+
+
+def _decibel(value: float) -> str:
+    return f"{value:.2f}" if math.isfinite(value) else "-"
+
+
+def _image(png: bytes, text: str) -> str:
+    return f'<img alt="{escape(text)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
+    """Return a PNG of the array from above and from behind; where the fit moved cameras, the given ones too."""
+    figure = new_figure((9.0, 3.6))
+    moved = [(c, g) for c, g in zip(cameras, given, strict=True) if not np.allclose(c.w2c, g.w2c, atol=1e-9)]
+    middle, frame = np.mean([c.center for c in given], axis=0), array_axes(given)
+    above, behind = figure.subplots(1, 2)
+    for ax, plane, title in ((above, ABOVE, "from above"), (behind, BEHIND, "from behind")):
+        if moved:
+            _show(ax, given, middle, frame, plane, "0.6", "given")
+        label = "estimated" if moved else "cameras"
+        _show(ax, cameras, middle, frame, plane, "tab:blue", label)
+        ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if plane == ABOVE else "up")
+        ax.margins(0.25)
+        ax.grid(alpha=0.3)
+    if moved:
+        turn = max(float(angle_deg(c.R @ g.R.T)) for c, g in moved)
+        shift = max(float(np.linalg.norm(c.center - g.center)) for c, g in moved)
+        behind.legend(fontsize=8)
+        figure.suptitle(f"moved from the given poses by at most {shift:.4g} and {turn:.3f} degrees", fontsize=9)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _show(
+    ax: Axes,
+    cameras: Sequence[Camera],
+    middle: Float64,
+    frame: Float64,
+    plane: tuple[int, int],
+    color: str,
+    label: str,
+) -> None:
+    """Plot centres with their viewing directions, in two of the array's axes."""
+    centers = (np.stack([c.center for c in cameras]) - middle) @ frame.T
+    ahead = np.stack([c.R[2] for c in cameras]) @ frame.T
+    length = 0.25 * float(np.linalg.norm(centers, axis=1).max() or 1.0)
+    (x, y), (dx, dy) = centers[:, plane].T, length * ahead[:, plane].T
+    ax.scatter(x, y, s=18, color=color, label=label)
+    ax.update_datalim(np.stack([x + dx, y + dy], axis=1))
+    ax.quiver(x, y, dx, dy, color=color, angles="xy", scale_units="xy", scale=1, width=0.004)
+    for camera, a, b in zip(cameras, x, y, strict=True) if plane == BEHIND else ():
+        ax.annotate(camera.id, (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7, color=color)

@@ -1,0 +1,131 @@
+"""The survey of a recording before a fit: what is missing or wrong is found, repaired or left out, and said.
+
+Missing ticks and bad pixels are filled in the streams (`benchmark.spikes.repair`), so that every part of a method works
+as it is; the loss leaves out bad pixels and long gaps. A camera's gain is one number beside the array's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, Mask, find_bad
+from spike4dgs.benchmark.spikes.calibration import Recordings
+from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.repair import LONGEST_TICKS, fill_gaps, fill_pixels
+from spike4dgs.method.recordings.gains import between_views, from_recordings
+
+LEAST_PRESENT = 0.5  # share of its ticks with which a camera is used: a shorter one would be filled more than recorded
+MOST_BAD = 0.5  # share of its pixels with which it is: half of an image tells little, and its recordings may be wrong
+LEAST_GAIN = 0.005  # largest difference from 1 below which gains are left as they are: an estimate's own error
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A scene to fit, the bad pixels of its cameras, and notes for the report."""
+
+    scene: TrainingScene
+    bad: Mapping[str, BadPixels]
+    notes: tuple[str, ...]
+
+
+def survey_streams(scene: TrainingScene) -> Survey:
+    """Return a scene without holes in its streams. Poses do not matter.
+
+    Raises UserError where fewer than two cameras have recorded enough.
+    """
+    notes: list[str] = []
+    scene = _enough(scene, notes)
+    filled = tuple(fill_gaps(stream) for stream in scene.streams)
+    notes += _gap_notes(scene, replace(scene, streams=filled))
+    recordings = scene.recordings or (None,) * len(filled)
+    bad = {
+        camera.id: find_bad(stream, *((found.flat, found.dark) if found else ()))
+        for camera, stream, found in zip(scene.cameras, filled, recordings, strict=True)
+    }
+    kept = [i for i, camera in enumerate(scene.cameras) if bad[camera.id].all.mean() <= MOST_BAD]
+    notes += [f"most pixels of {c.id} are bad: left out" for i, c in enumerate(scene.cameras) if i not in kept]
+    masks = [bad[camera.id].all for camera in scene.cameras]
+    scene = replace(
+        scene,
+        streams=tuple(fill_pixels(s, m) for s, m in zip(filled, masks, strict=True)),
+        recordings=tuple(_without(r, m) for r, m in zip(scene.recordings, masks, strict=True))
+        if scene.recordings
+        else (),
+        states={
+            **scene.states,
+            **{c.id: replace(scene.state(c.id), bad=bad[c.id].all) for c in scene.cameras if bad[c.id].all.any()},
+        },
+    )
+    scene = _only(scene, kept)
+    return Survey(scene, bad, (*notes, *_pixel_notes([bad[c.id] for c in scene.cameras])))
+
+
+def survey_gains(scene: TrainingScene) -> tuple[TrainingScene, tuple[str, ...]]:
+    """Return a scene with the gain of each camera, from uniform light or else from the views; and notes.
+
+    Gains are relative to their mean: that of all cameras is the scene's own.
+    """
+    known = scene.calibrations is not None
+    gains = from_recordings(scene) if known else between_views(scene)
+    if gains is None or abs(gains - 1).max() < LEAST_GAIN:
+        return scene, ()
+    states = {c.id: replace(scene.state(c.id), gain=float(g)) for c, g in zip(scene.cameras, gains, strict=True)}
+    how = "from the recordings of uniform light" if known else "from points that several cameras see"
+    note = f"gains of the cameras from {gains.min():.3f} to {gains.max():.3f} of their mean, estimated {how}: corrected"
+    return replace(scene, states={**scene.states, **states}), (note,)
+
+
+def _enough(scene: TrainingScene, notes: list[str]) -> TrainingScene:
+    """Return the scene of those cameras that have recorded most of their ticks."""
+    share = [float(present(s.gaps, s.n_ticks).mean()) for s in scene.streams]
+    kept = [i for i, s in enumerate(share) if s >= LEAST_PRESENT]
+    for camera, own in zip(scene.cameras, share, strict=True):
+        if own < LEAST_PRESENT:
+            notes.append(f"{camera.id} lacks {1 - own:.0%} of its ticks: left out")
+    if len(kept) < min(2, len(share)):
+        fix = "record again, or choose another split"
+        raise problem(f"scene {scene.id}", "two cameras that recorded most ticks", f"{len(kept)}", fix)
+    return _only(scene, kept)
+
+
+def _only(scene: TrainingScene, kept: Sequence[int]) -> TrainingScene:
+    if len(kept) == len(scene.cameras):
+        return scene
+    return replace(
+        scene,
+        cameras=tuple(scene.cameras[i] for i in kept),
+        streams=tuple(scene.streams[i] for i in kept),
+        recordings=tuple(scene.recordings[i] for i in kept) if scene.recordings else (),
+    )
+
+
+def _without(recordings: Recordings | None, mask: Mask) -> Recordings | None:
+    if recordings is None:
+        return None
+    return replace(recordings, flat=fill_pixels(recordings.flat, mask), dark=fill_pixels(recordings.dark, mask))
+
+
+def _gap_notes(before: TrainingScene, after: TrainingScene) -> list[str]:
+    missing = sum(gap.ticks for stream in before.streams for gap in stream.gaps)
+    long = [gap for stream in after.streams for gap in stream.gaps]
+    if not missing:
+        return []
+    share = missing / (before.n_ticks * len(before.streams))
+    notes = [f"{missing} ticks are missing ({share:.2%} of all): filled from the spikes around them"]
+    for gap in long:
+        notes.append(
+            f"{gap.camera} lacks ticks [{gap.first_tick}, {gap.stop_tick}), more than {LONGEST_TICKS}: "
+            "images there are left out of the loss"
+        )
+    return notes
+
+
+def _pixel_notes(bad: Sequence[BadPixels]) -> list[str]:
+    if not any(own.all.any() for own in bad):
+        return []
+    kinds = ", ".join(f"{sum(int(own.kinds[kind].sum()) for own in bad)} {kind}" for kind in bad[0].kinds)
+    sources = " and ".join(sorted({own.source for own in bad}))
+    return [f"bad pixels of all cameras: {kinds} (from {sources}); left out of the loss, filled from their neighbours"]

@@ -1,0 +1,275 @@
+"""The initialisations `msdi`, `msdi-matched`, `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
+
+The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
+was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
+view 0's frame, at a scale of its own.
+
+`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, matches of the views are
+measured better than a network guesses them: those are the points of `rig` with `flat_field`. Where nothing matches, for
+lack of texture, the network's points replace the nearest depth: those of view 0, as inverse depths that a line brings
+to the matched ones.
+
+`msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
+views match in corrected means of the clip (`bundle`). From there on it is `msdi`.
+
+`msdi-uncalibrated` has the network alone: each view's pose follows from its own points, by PnP (`method.msdi.pose`),
+with one focal length for all. In both everything is moved to the scene's frame as COLMAP's result is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch.nn import functional
+
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.pose_error import align_cameras
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.scene.shared_time import local_ticks
+from spike4dgs.benchmark.spikes.calibration import Calibration
+from spike4dgs.method.images.windows import window
+from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
+from spike4dgs.method.msdi.shrink import shrink
+from spike4dgs.method.msdi.weights import load_network, weights_path
+from spike4dgs.method.settings import Settings
+from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.features import Mapping
+from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
+from spike4dgs.method.starts.rig import (
+    Cloud,
+    CloudSettings,
+    PointSettings,
+    fill,
+    filled,
+    matched,
+    thin,
+    window_means,
+)
+from spike4dgs.method.training_views.pinholes import nearest_pixels
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EstimateSettings(Settings):
+    """Numbers of the network's estimate (prefix `initialization`)."""
+
+    trained_px: int = 104  # longer side of the training images
+    least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
+
+
+@dataclass(frozen=True)
+class MsdiSettings(EstimateSettings, PointSettings):
+    """Numbers of `msdi` (prefix `initialization`)."""
+
+    least_matches: int = 50  # for a line through inverse depths
+    line_rounds: int = 10  # of reweighted least squares
+    farthest: float = 2.0  # times the farthest match: points beyond it are left out
+
+
+@dataclass(frozen=True)
+class MsdiMatchedSettings(MsdiSettings, MatchSettings):
+    """Numbers of `msdi-matched` (prefix `initialization`)."""
+
+
+@dataclass(frozen=True)
+class MsdiUncalibratedSettings(EstimateSettings, CloudSettings):
+    """Numbers of `msdi-uncalibrated` (prefix `initialization`)."""
+
+
+DEFAULTS, MATCHED, UNCALIBRATED = MsdiSettings(), MsdiMatchedSettings(), MsdiUncalibratedSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The network's estimate for V views of h x w pixels."""
+
+    factor: int  # the cameras' pixels are blocks of so many by so many
+    cameras: tuple[Camera, ...]  # the training cameras at this size
+    images: Float32  # [V, h, w] radiance
+    points: Float64  # [V, h, w, 3] in view 0's frame, at any scale
+    confidence: Float64  # [V, h, w]
+
+    def sure(self, settings: EstimateSettings) -> NDArray[np.bool_]:
+        """Return the pixels [V, h, w] whose points are used."""
+        least = np.quantile(self.confidence, settings.least_confidence, axis=(1, 2), keepdims=True)
+        return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
+
+
+def msdi(scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = "auto") -> Start:
+    """Return points at the calibrated poses; see the module.
+
+    Raises WeightsError where there are no weights, UserError where all cameras have one centre.
+    """
+    return _given(scene, infer(scene, settings, device, calibrated=True), settings)
+
+
+def _given(scene: TrainingScene, estimate: Estimate, settings: MsdiSettings) -> Start:
+    cloud, mean = matched(scene, settings, flat_field=True)
+    return filled(scene, completed(cloud, estimate, settings), mean, settings)
+
+
+def msdi_matched(
+    scene: TrainingScene, seed: int, settings: MsdiMatchedSettings = MATCHED, device: str = "auto"
+) -> Start:
+    """Return poses by the network's points of view 0 and by matches, and points; raises as `matched_poses` too."""
+    estimate = infer(scene, settings, device, calibrated=True)
+    cameras = matched_poses(scene, estimate, seed, settings).cameras
+    small = tuple(shrunk(camera, estimate.factor) for camera in cameras)
+    return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small), settings)
+
+
+def matched_poses(
+    scene: TrainingScene, estimate: Estimate, seed: int, settings: MsdiMatchedSettings = MATCHED
+) -> Mapping:
+    """Return the training cameras, whose intrinsics are known, and the points that they match.
+
+    Raises UserError unless all have poses.
+    """
+    guess = np.where(estimate.sure(settings)[0][..., None], estimate.points[0], np.nan)
+    images = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    return bundle(scene, guess, estimate.factor, images, seed, settings).of_all(scene, "MSDI")
+
+
+def msdi_uncalibrated(
+    scene: TrainingScene, seed: int, settings: MsdiUncalibratedSettings = UNCALIBRATED, device: str = "auto"
+) -> Start:
+    """Return poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
+    return unposed(scene, infer(scene, settings, device, calibrated=False), seed, settings, calibrated=False)
+
+
+def infer(
+    scene: TrainingScene, settings: EstimateSettings = DEFAULTS, device: str = "auto", *, calibrated: bool
+) -> Estimate:
+    """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
+    device = choose_device(device, rasterizes=False)
+    network = load_network(weights_path(), device)
+    factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / settings.trained_px))
+    clocks = [scene.state(camera.id).clock for camera in scene.cameras]
+    middles = [local_ticks(clock, [scene.n_ticks // 2], scene.n_ticks)[0][0] for clock in clocks]
+    windows = [window(s, t, network.config.ticks) for s, t in zip(scene.streams, middles, strict=True)]
+    spikes = np.stack(nearest_pixels(scene, windows))
+    small = shrink(torch.from_numpy(spikes), factor)[None]
+    cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)
+    K = torch.from_numpy(np.stack([c.K for c in cameras])[None].astype(np.float32))
+    sensors, gain = None, scene.radiance_gain
+    if calibrations := scene.calibrations:
+        sensors = block_means(at_pinholes(scene, calibrations), factor, device)
+        gain = float(np.mean([c.radiance_gain for c in calibrations]))
+    with torch.inference_mode():
+        found = network(small.to(device), K.to(device) if calibrated else None, sensors)
+    images = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
+    points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
+    return Estimate(factor, cameras, images, points, confidence)
+
+
+def shrunk(camera: Camera, factor: int) -> Camera:
+    """Return the view of a sensor whose pixels are blocks of `factor` x `factor`, sides rounded up."""
+    width, height = -(-camera.width // factor), -(-camera.height // factor)
+    fx, fy, cx, cy = (x / factor for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def at_pinholes(scene: TrainingScene, calibrations: Sequence[Calibration]) -> list[Calibration]:
+    """Return the response of the scene's views, by pixel: that of the nearest pixel of the stream."""
+    gains, darks = (nearest_pixels(scene, [getattr(c, name) for c in calibrations]) for name in ("gain", "dark"))
+    return [replace(c, gain=g, dark=d) for c, g, d in zip(calibrations, gains, darks, strict=True)]
+
+
+def block_means(calibrations: Sequence[Calibration], factor: int, device: str) -> Sensors:
+    """Return the maps [1, V, h, w] of sensors with larger pixels."""
+
+    def small(maps: list[Float32]) -> torch.Tensor:
+        whole = torch.from_numpy(np.stack(maps)).to(device)[None]
+        return functional.avg_pool2d(whole, factor, ceil_mode=True, count_include_pad=False)
+
+    return Sensors(small([c.gain for c in calibrations]), small([c.dark for c in calibrations]))
+
+
+def completed(cloud: Cloud, estimate: Estimate, settings: MsdiSettings = DEFAULTS) -> Cloud:
+    """Return the matched points, and the network's where view 0 sees none; the same cloud where no line fits."""
+    camera, depth, sure = estimate.cameras[0], estimate.points[0, :, :, 2], estimate.sure(settings)[0]
+    uv, z = camera.project(cloud.points)
+    uv, z = uv[z > 0], z[z > 0]
+    line = inverse_depth_line(np.where(sure, depth, np.nan), uv, z, settings)
+    if line is None:
+        return cloud
+    v, u = np.nonzero(sure & (depth > 0))
+    at, inverse = np.stack([u + 0.5, v + 0.5], axis=-1), np.polyval(line, 1 / depth[v, u])
+    empty = cKDTree(uv).query(at)[0] > settings.hole_px / estimate.factor
+    hole = empty & (inverse * z.max() * settings.farthest > 1)
+    points = np.concatenate([cloud.points, camera.unproject(at[hole], 1 / inverse[hole])])
+    return Cloud(points, np.concatenate([cloud.values, estimate.images[0, v[hole], u[hole]]]))
+
+
+def inverse_depth_line(depth: Float64, uv: Float64, z: Float64, settings: MsdiSettings = DEFAULTS) -> Float64 | None:
+    """Return (a, b) of the line a / depth + b that is closest to the inverse depths 1 / z of points at pixels uv.
+
+    The sum of the absolute differences is made smallest, by least squares that the last residuals weigh. `depth` [h, w]
+    is NaN where nothing is known. None for fewer than `least_matches` points, or where the line does not rise.
+    """
+    inside = (uv >= 0).all(axis=1) & (uv < depth.shape[::-1]).all(axis=1)
+    u, v = uv[inside].astype(np.int64).T
+    known = depth[v, u] > 0
+    if known.sum() < settings.least_matches:
+        return None
+    x, y = 1 / depth[v, u][known], 1 / z[inside][known]
+    if np.ptp(x) == 0:
+        return None
+    weights, line = np.ones(len(x)), np.zeros(2)
+    for _ in range(settings.line_rounds):
+        line = np.polyfit(x, y, 1, w=np.sqrt(weights))
+        weights = 1 / np.maximum(np.abs(np.polyval(line, x) - y), 1e-6 * y.mean())
+    return line if line[0] > 0 else None
+
+
+def unposed(
+    scene: TrainingScene,
+    estimate: Estimate,
+    seed: int,
+    settings: MsdiUncalibratedSettings = UNCALIBRATED,
+    *,
+    calibrated: bool,
+) -> Start:
+    """Return poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
+
+    Raises UserError where a view has no pose.
+    """
+    first, f = scene.cameras[0], estimate.factor
+    cameras = list(scene.cameras) if calibrated else _one_focal(scene, estimate, settings)
+    K = np.stack([shrunk(camera, f).K for camera in cameras])
+    poses = solve_poses(estimate.points, estimate.confidence, K, seed)
+    if bad := [f"{c.id} ({p.reason})" for c, p in zip(estimate.cameras, poses, strict=True) if not p.found]:
+        fix = "use rig or colmap"
+        raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
+    known = [pose.w2c for pose in poses if pose.w2c is not None]
+    posed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
+    move = align_cameras(posed, scene.cameras)
+    moved = tuple(move.camera(c) for c in posed)
+    sure = estimate.sure(settings)
+    cloud = thin(moved, Cloud(move(estimate.points[sure]), estimate.images[sure]), settings)
+    images = estimate.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
+    cloud = fill(moved, images, cloud, settings)
+    return Start(moved, cloud.points.astype(np.float32), cloud.values)
+
+
+def _one_focal(scene: TrainingScene, estimate: Estimate, settings: EstimateSettings) -> list[Camera]:
+    """Return the cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
+    first, f = scene.cameras[0], estimate.factor
+    middle = first.width / 2, first.height / 2
+    v, u = np.nonzero(estimate.sure(settings)[0])
+    offsets = np.stack([u + 0.5, v + 0.5], axis=-1) - np.divide(middle, f)
+    focal = focal_from_points(estimate.points[0, v, u], offsets)
+    if focal is None:
+        fix = "use rig or colmap"
+        raise problem(f"MSDI on {scene.id}", "points that give a focal length", "none before the camera", fix)
+    return [replace(c, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]) for c in scene.cameras]

@@ -1,0 +1,258 @@
+"""The initialisation `rig`: the calibrated poses, and points by plane sweep over the training views.
+
+Static pixels are matched on the mean of the whole clip, where the spikes' quantisation noise has averaged out. Pixels
+that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
+ends those that are quiet just then, which is the background that something moving hides in the middle.
+
+With `flat_field` every image is corrected by its camera's calibrated gain and dark rate, where a scene has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.camera_state import Clock
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.scene.shared_time import local_window
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.settings import Settings
+from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.plane_sweep import (
+    DepthMap,
+    Mask,
+    SweepSettings,
+    agreed,
+    find_range,
+    inverse_depth_step,
+    lift,
+    sweep_all,
+    widest_baseline,
+)
+from spike4dgs.method.training_views.changes import COUNTS, changing, without_specks
+from spike4dgs.method.training_views.pinholes import nearest_pixels, seen_pixels, undistorted
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class CloudSettings(Settings):
+    """Numbers of thinning and filling a cloud of points (prefix `initialization`)."""
+
+    cell_px: float = 1.6  # one point per cell of this size: about 0.4 points per pixel
+    cell_parallax_px: float = 2.0  # a cell's depth, as parallax of the widest pair: about its size
+    hole_px: float = 2.0  # from the nearest point: further away it is empty
+    neighbours: int = 5  # points that tell the depth where there are none
+
+
+@dataclass(frozen=True)
+class PointSettings(CloudSettings, SweepSettings):
+    """Numbers of points by plane sweep (prefix `initialization`)."""
+
+    window_ticks: int = 40  # 2 ms at 20 kHz: a window within which things count as static
+
+
+@dataclass(frozen=True)
+class RigSettings(PointSettings):
+    """Numbers of `rig` (prefix `initialization`)."""
+
+    flat_field: bool = False  # correct images by each camera's calibration, if known
+
+
+DEFAULTS = RigSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points [N, 3] in the world and their gray values [N]."""
+
+    points: NDArray[np.float64]
+    values: Float32
+
+
+def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS) -> Start:
+    """Return the calibrated poses and first points of a scene; see the module.
+
+    Raises UserError where all cameras have one centre.
+    """
+    return swept(scene, settings, settings.flat_field)
+
+
+def swept(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> Start:
+    """Return the same, with corrected images or not."""
+    return filled(scene, *matched(scene, settings, flat_field), settings)
+
+
+def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> tuple[Cloud, Float32]:
+    """Return the points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
+    if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
+        found = f"{len(scene.cameras)} at one position"
+        raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
+    mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
+    windows = _windows(scene.n_ticks, settings.window_ticks)
+    counts = [
+        [s.counts(*local_window(clock, a, b, s.n_ticks)).astype(np.int64) for a, b in windows]
+        for s, clock in zip(scene.streams, _clocks(scene), strict=True)
+    ]
+    moving = _moving_pixels(scene, [np.stack(c) for c in counts])
+    planes = find_range(scene.cameras, mean, settings)
+    maps = sweep_all(scene.cameras, mean, planes, settings=settings)
+    seen = seen_pixels(scene)
+    static = [~m & s for m, s in zip(moving, seen, strict=True)] if seen else [~m for m in moving]
+    clouds = [_points(scene.cameras, maps, mean, static, settings)]
+    middle, last = len(windows) // 2, len(windows) - 1
+    for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
+        start, stop = windows[at]
+        images = _marked(scene, window_means(scene, start, stop, flat_field))
+        near = slice(max(0, at - 1), at + 2)
+        quiet = [~m | (at == middle) for m in _moving_pixels(scene, [np.stack(c[near]) for c in counts])]
+        short = sweep_all(scene.cameras, images, planes, moving, settings)
+        pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
+        clouds.append(_points(scene.cameras, short, images, pixels, settings))
+    points, values = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
+    return thin(scene.cameras, Cloud(points, values), settings), mean
+
+
+def filled(scene: TrainingScene, cloud: Cloud, mean: Float32, settings: CloudSettings) -> Start:
+    """Return the start from a cloud, filled where the image is empty, with gray of the clip's means [C, H, W]."""
+    cloud = fill(scene.cameras, mean, cloud, settings)
+    return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
+
+
+def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
+    """Return the mean radiance [C, H, W] of all views in a window."""
+    clocks = zip(scene.streams, _clocks(scene), strict=True)
+    rates = np.stack([_rate(s, *local_window(clock, start, stop, s.n_ticks)) for s, clock in clocks])
+    if flat_field and scene.calibrations:
+        means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
+    else:
+        means = rates / np.float32(scene.radiance_gain)
+    return undistorted(scene, means, unseen=None)
+
+
+def _marked(scene: TrainingScene, images: Float32) -> Float32:
+    """Return images [C, H, W] with -1 where a view sees nothing: the plane sweep takes that as outside of the image."""
+    if seen := seen_pixels(scene):
+        images[~np.stack(seen)] = -1
+    return images
+
+
+def _clocks(scene: TrainingScene) -> list[Clock]:
+    return [scene.state(camera.id).clock for camera in scene.cameras]
+
+
+def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
+    """Return mean spikes per tick [H, W]; clips of any length are counted in parts."""
+    parts = range(start, stop, 65535)
+    total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
+    return np.asarray(total / (stop - start), np.float32)
+
+
+def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
+    count = max(1, n_ticks // length)
+    return [(i * length, min((i + 1) * length, n_ticks)) for i in range(count)]
+
+
+def _moving_pixels(scene: TrainingScene, counts: Sequence[NDArray[np.int64]]) -> list[Mask]:
+    """Return the moving pixels of each view [h, w] from its counts [windows, H, W]; a pixel not seen does not move."""
+    moving = nearest_pixels(scene, [_moving(c) for c in counts])
+    seen = seen_pixels(scene)
+    return [m & s for m, s in zip(moving, seen, strict=True)] if seen else moving
+
+
+def _moving(counts: NDArray[np.int64]) -> Mask:
+    """Return the pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
+    changed = changing(torch.from_numpy(counts)[:, None], COUNTS)[0].numpy()
+    return cv2.dilate(without_specks(changed), np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def _points(
+    cameras: Sequence[Camera],
+    maps: Sequence[DepthMap],
+    images: Float32,
+    pixels: Sequence[Mask],
+    settings: SweepSettings,
+) -> tuple[NDArray[np.float64], Float32]:
+    """Return world points [N, 3] and their gray values [N] from the pixels of all views on which views agree."""
+    points, values = [], []
+    for i, camera in enumerate(cameras):
+        chosen = agreed(cameras, maps, i, settings) & pixels[i]
+        points.append(lift(camera, maps[i].inverse, chosen))
+        values.append(images[i][chosen])
+    return np.concatenate(points), np.concatenate(values)
+
+
+def middle_camera(cameras: Sequence[Camera]) -> Camera:
+    """Return a camera between all others: their mean centre and the rotation nearest to their mean rotation."""
+    u, _, vt = np.linalg.svd(np.mean([c.R for c in cameras], axis=0))
+    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    first = cameras[0]
+    center = np.mean([c.center for c in cameras], axis=0)
+    return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
+
+
+def thin(cameras: Sequence[Camera], cloud: Cloud, settings: CloudSettings) -> Cloud:
+    """Return one point, the mean, per cell of `cell_px` px and `cell_parallax_px` in the middle camera."""
+    keep, cells = cells_of(cameras, cloud.points, settings)
+    _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.reshape(-1)
+
+    def mean(x: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.bincount(inverse, weights=x, minlength=len(count)) / count
+
+    merged = np.stack([mean(axis) for axis in cloud.points[keep].T], axis=-1)
+    believed = count >= 2  # seen from one view only: not worth a Gaussian
+    return Cloud(merged[believed], mean(cloud.values[keep])[believed].astype(np.float32))
+
+
+def cells_of(
+    cameras: Sequence[Camera], points: NDArray[np.float64], settings: CloudSettings
+) -> tuple[Mask, NDArray[np.int64]]:
+    """Return which points [N, 3] are in front of the middle camera, and the cells [K, 3] that those lie in."""
+    uv, z = middle_camera(cameras).project(points)
+    step = inverse_depth_step(cameras, settings.cell_parallax_px)
+    keep = z > 0
+    cells = np.column_stack([np.floor(uv[keep] / settings.cell_px), np.floor(1 / (z[keep] * step))])
+    return keep, cells.astype(np.int64)
+
+
+def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: CloudSettings) -> Cloud:
+    """Return the cloud and points where the middle camera sees none, at the nearest points' median inverse depth.
+
+    Fewer points than that are chance: all of the image is then laid far away.
+    """
+    camera = middle_camera(cameras)
+    uv, z = camera.project(cloud.points)
+    # The image's border too: outer views see beyond the middle one.
+    margin = 0.1 * np.array([camera.width, camera.height])
+    axes = [np.arange(-m, n + m, 2.0) + 1.0 for m, n in zip(margin, (camera.width, camera.height), strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    if len(cloud.points) < settings.neighbours:
+        far = 1 / inverse_depth_step(cameras)
+        gray = np.full(len(grid), np.maximum(mean, 0).mean(), np.float32)
+        return Cloud(camera.unproject(grid, np.full(len(grid), far)), gray)
+    distance, nearest = cKDTree(uv).query(grid, k=settings.neighbours)
+    empty = distance[:, 0] > settings.hole_px
+    depth = 1 / np.median(1 / z[nearest[empty]], axis=1)
+    added = camera.unproject(grid[empty], depth)
+    seen = np.stack([look_up(c, m, added) for c, m in zip(cameras, mean, strict=True)])
+    visible = np.isfinite(seen).any(axis=0)
+    added, seen = added[visible], seen[:, visible]
+    values = np.concatenate([cloud.values, np.nanmedian(seen, axis=0).astype(np.float32)])
+    return Cloud(np.concatenate([cloud.points, added]), values)
+
+
+def look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gray value [N] of the pixel that sees each point; NaN outside the image, and where it is negative."""
+    uv, z = camera.project(points)
+    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+    u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    return np.where(inside & (image[v, u] >= 0), image[v, u], np.nan)

@@ -1,0 +1,104 @@
+"""Images of instants from means over spans of time, by the model that is being fitted.
+
+A value that is a mean over a span [a, b] around its instant is compared with the model at that instant, once what the
+model says of the difference is added to it:
+
+    value + (model(0) - mean of model over [a, b]).
+
+Where that holds for a model, its mean over the span is what was measured. So the fit has the same optimum as one that
+renders the whole span at each step, at the cost of one render. The model that corrects is a snapshot, taken anew a few
+times in a fit; repeated, this is van Cittert's deconvolution (1931), which starts from what was measured.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+
+import torch
+from torch import Tensor
+
+from spike4dgs.method.splat.kernels.threads import work_alone
+from spike4dgs.method.training_views.training_images import Spans
+
+REACH = 2.0  # half spans from the instant, beyond which no span is followed
+
+RenderViews = Callable[[float, Sequence[int]], Tensor]  # ticks from the instant, views -> [V, H, W], no gradient
+
+
+def node(half: float) -> float:
+    """Return the outer node, in ticks, of three-point Gauss-Legendre over [-half, half]; the inner one is 0."""
+    return half * math.sqrt(0.6)
+
+
+def correction(before: Tensor, now: Tensor, after: Tensor, spans: Spans) -> Tensor:
+    """Return light at the instant - its mean over each span [V, H, W], from renders at -node, 0 and node.
+
+    Light is taken as quadratic in time. Over [-half, half] that is exact for light up to the fifth power.
+    """
+    far, reach = node(spans.half), REACH * spans.half
+    a, b = spans.ends.to(now).clamp(-reach, reach).unbind(1)
+    slope, bend = (after - before) / (2 * far), (before + after - 2 * now) / (2 * far * far)
+    return -(slope * (a + b) / 2 + bend * (a * a + a * b + b * b) / 3)
+
+
+class Corrections:
+    """The corrections by one snapshot of a model, made when they are first asked for and kept as half floats.
+
+    `begin` has them made ahead, in the order in which a fit will ask for them: a thread of its own fills the time in
+    which the fit's other steps keep one core waiting. The values are the same whoever makes them.
+    """
+
+    def __init__(self, spans: Spans, render: Callable[[int], RenderViews]) -> None:
+        self.spans, self.render = spans, render
+        self._made: dict[tuple[int, int], Future[Tensor]] = {}
+        self._lock, self._stopped, self._thread = threading.Lock(), threading.Event(), threading.Thread()
+
+    def at(self, index: int, views: Sequence[int]) -> Tensor:
+        """Return the corrections [V, H, W] of some views' images of one time."""
+        self._make(index, views)
+        return torch.stack([self._made[index, v].result() for v in views]).float()
+
+    def begin(self, requests: Iterable[tuple[int, Sequence[int]]]) -> None:
+        """Make what `at` will be asked for, beside the caller, until `stop`."""
+
+        def work() -> None:
+            work_alone()
+            torch.set_num_threads(1)
+            for index, views in requests:
+                if self._stopped.is_set():
+                    return
+                self._make(index, views)
+
+        self._thread = threading.Thread(target=work, name="corrections")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Make nothing ahead any more; return once the thread that did has ended."""
+        self._stopped.set()
+        if self._thread.ident:
+            self._thread.join()
+
+    def _make(self, index: int, views: Sequence[int]) -> None:
+        """Make what neither thread has begun. An error is raised where the image is asked for."""
+        with self._lock:
+            begun = {v: Future[Tensor]() for v in views if (index, v) not in self._made}
+            self._made.update(((index, v), future) for v, future in begun.items())
+        if not begun:
+            return
+        try:
+            made = self._correct(index, list(begun))
+        except Exception as error:
+            for future in begun.values():
+                future.set_exception(error)
+            return
+        for future, image in zip(begun.values(), made, strict=True):
+            future.set_result(image.half())
+
+    def _correct(self, index: int, views: Sequence[int]) -> Tensor:
+        far, render = node(self.spans.half), self.render(index)
+        with torch.no_grad():
+            before, now, after = (render(ticks, views) for ticks in (-far, 0.0, far))
+            return correction(before, now, after, self.spans.at(index).at(torch.tensor(views)))

@@ -1,0 +1,240 @@
+"""`fault-table`: what the imperfections of an array cost, in dB at a held-out camera.
+
+Each capture is that of an emulated array which shows one made scene, with one fault of one size. `fit` gets the capture
+alone, its recordings under uniform light and in the dark included; the scene's truth judges what it rendered.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.environment import command_line, environment, harness
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.metrics.measure import score_image
+from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
+from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.cli.fit import PREDICTIONS, fit
+
+FLAT_RADIANCE = 0.7  # of the emulated uniform light
+_EXACT = "none"
+METRICS = ("psnr", "psnr_dynamic")
+Recorder = Callable[..., int]  # `spike4dgs record`
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault, its size in words, and the options of `record --worse` that make it."""
+
+    fault: str
+    size: str
+    worse: Mapping[str, float]
+    lens: bool = False  # of the scene that was made with lenses
+
+    @property
+    def name(self) -> str:
+        """The name of its folder."""
+        return "-".join((*self.fault.split(), *self.size.split())).replace("%", "percent").replace("°", "deg")
+
+
+CASES = (
+    Case(_EXACT, "", {}),
+    Case("clock offset", "3 ticks", {"offset_ticks": 3}),
+    Case("clock offset", "30 ticks", {"offset_ticks": 30}),
+    Case("clock drift", "20 ppm", {"drift_ppm": 20}),
+    Case("clock drift", "5000 ppm", {"drift_ppm": 5000}),
+    Case("dropped ticks", "0.1 %", {"dropped": 0.001}),
+    Case("dropped ticks", "5 %", {"dropped": 0.05}),
+    Case("bad pixels", "40 a camera", {"bad_pixels": 40}),
+    Case("bad pixels", "400 a camera", {"bad_pixels": 400}),
+    Case("gain", "2 %", {"gain": 0.02}),
+    Case("gain", "10 %", {"gain": 0.1}),
+    Case("poses", "0.1°", {"pose_deg": 0.1}),
+    Case("poses", "1°", {"pose_deg": 1}),
+    Case(
+        "all of them",
+        "small",
+        {"offset_ticks": 3, "drift_ppm": 20, "dropped": 0.001, "bad_pixels": 40, "gain": 0.02, "pose_deg": 0.1},
+    ),
+)
+LENS_CASES = (
+    Case("lens", "known", {}, lens=True),
+    Case("lens", "10 % wrong", {"lens": 0.1}, lens=True),
+    Case("lens", "ignored", {"lens": 1}, lens=True),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The scores of a method's fit of a capture; `error` says why there are none."""
+
+    case: Case
+    method: str
+    psnr: float | None
+    psnr_dynamic: float | None
+    error: str = ""
+
+
+def make_fault_table(record: Recorder, imperfections: Callable[..., Any]) -> Callable[..., int]:
+    """Return the command. `record` and `imperfections` make the captures."""
+
+    def fault_table(
+        scene: Positional[Path],
+        *,
+        lens_scene: Path | None = None,
+        methods: tuple[str, ...] = ("spike4dgs-x", "spk2img+stg"),
+        out: Path = Path("runs/faults"),
+        budget: str = "quick",
+        seed: int = 0,
+        device: str = "auto",
+    ) -> int:
+        """Make captures of a scene worse on purpose, fit each, and tabulate the dB that a held-out camera loses.
+
+        A killed run continues: give the same command again.
+
+        Args:
+            scene: A made scene with ground truth.
+            lens_scene: The same scene made with `make-dataset --lens`, for the rows of lens distortion; its held-out
+                camera is judged through its lens.
+            methods: Methods by name.
+            out: Folder for table.md, table.csv, table.json and table.png; captures and fits are kept there too.
+            budget: quick, standard (4 times the steps), or a multiple of quick.
+            seed: Seed of the imperfections and of the fits.
+            device: auto, cpu or cuda.
+        """
+        truth = _with_truth(scene)
+        curved = None if lens_scene is None else _with_truth(lens_scene)
+        found: list[Outcome] = []
+        for case in (*CASES, *(LENS_CASES if curved else ())):
+            shown = curved if curved and case.lens else truth
+            capture = out / "captures" / case.name
+            _capture(record, imperfections(**case.worse), shown.root, capture, seed)
+            for method in methods:
+                folder = out / "fits" / case.name / method
+                found.append(_outcome(case, method, capture, folder, shown, budget=budget, seed=seed, device=device))
+                about = {"command": command_line(), "harness": harness(), "environment": environment("cpu")}
+                _write(out, found, {"scene": truth.id, "budget": budget, "seed": seed, **about})
+        print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
+        return 0
+
+    return fault_table
+
+
+def _with_truth(scene: Path) -> Scene:
+    opened = open_scene(scene)
+    if not opened.targets:
+        raise problem(scene, "a scene with ground truth", "none", "make one with `spike4dgs make-dataset`")
+    return opened
+
+
+def _capture(record: Recorder, worse: Any, scene: Path, out: Path, seed: int) -> None:
+    """Record uniform light, darkness and the scene with an emulated array; a finished capture is kept."""
+    if (out / "clip" / "manifest.json").exists():
+        return
+    shutil.rmtree(out, ignore_errors=True)
+    light = {"flat": out / "flat", "dark": out / "dark"}
+    for mode, folder in light.items():
+        record(emulate=scene, out=folder, mode=mode, worse=worse, seed=seed)
+    record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, **light)
+
+
+def _outcome(case: Case, method: str, capture: Path, out: Path, truth: Scene, **options: Any) -> Outcome:
+    """Fit a capture and score its held-out cameras against the truth; finished scores are kept."""
+    kept = out / "scores.json"
+    if not kept.exists():
+        try:
+            fit(capture / "clip", method=method, out=out, **options)
+            scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
+        except UserError as e:
+            scores = {**dict.fromkeys(METRICS), "error": str(e)}
+        write_json(kept, scores)
+    return Outcome(case, method, **read_json(kept, "the scores of a fit"))
+
+
+def _scores(folder: Path, truth: Scene) -> dict[str, float]:
+    """Return the mean scores over all targets; over those with a moving region for `psnr_dynamic`."""
+    predictions = open_predictions(folder, truth.targets)
+    images = [
+        score_image(truth.ground_truth(t), predictions.read(t), truth.moving(t), metrics=METRICS) for t in truth.targets
+    ]
+    values = {m: [image[m] for image in images if m in image] for m in METRICS}
+    return {m: sum(v) / len(v) for m, v in values.items()}
+
+
+def _write(out: Path, found: Sequence[Outcome], about: Mapping[str, Any]) -> None:
+    """Write the table so far in all its forms."""
+    methods = list(dict.fromkeys(o.method for o in found))
+    exact = {o.method: o for o in found if o.case.fault == _EXACT}
+    write_json(out / "table.json", {**about, "outcomes": [asdict(o) for o in found]})
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["fault", "size", "method", *METRICS, *(f"{m}_lost" for m in METRICS), "error"])
+    for o in found:
+        values, lost = [getattr(o, m) for m in METRICS], _lost(o, exact[o.method])
+        rows.writerow([o.case.fault, o.case.size, o.method, *(_text(v) for v in (*values, *lost)), o.error])
+    write_text(out / "table.csv", text.getvalue())
+    write_text(out / "table.md", _markdown(found, methods, exact))
+    _plot(out / "table.png", found, methods, exact)
+
+
+def _lost(outcome: Outcome, exact: Outcome) -> list[float | None]:
+    """Return the dB lost beside the capture without faults, by `METRICS`; None where there is no score."""
+    pairs = [(getattr(exact, m), getattr(outcome, m)) for m in METRICS]
+    return [None if a is None or b is None else a - b for a, b in pairs]
+
+
+def _markdown(found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> str:
+    header = [f"{m}, dB" for m in methods] + [f"{m}, moving, dB" for m in methods]
+    lines = [f"| fault | size | {' | '.join(header)} |", "|" + "---|" * (2 + len(header))]
+    by_case: dict[str, dict[str, Outcome]] = {}
+    for o in found:
+        by_case.setdefault(o.case.name, {})[o.method] = o
+    for outcomes in by_case.values():
+        case = next(iter(outcomes.values())).case
+        cells = [_cell(outcomes.get(method), exact, k) for k in range(len(METRICS)) for method in methods]
+        lines.append(f"| {case.fault} | {case.size} | {' | '.join(cells)} |")
+    errors = [f"- {o.case.fault}, {o.case.size}, {o.method}: {o.error}" for o in found if o.error]
+    return "\n".join([*lines, "", *errors]).rstrip() + "\n"
+
+
+def _cell(outcome: Outcome | None, exact: Mapping[str, Outcome], k: int) -> str:
+    """Return the score without faults, the change of any other, or a dash."""
+    if outcome is None or (value := getattr(outcome, METRICS[k])) is None:
+        return "-"
+    if outcome.case.fault == _EXACT:
+        return f"{value:.2f}"
+    lost = _lost(outcome, exact[outcome.method])[k]
+    return "-" if lost is None else f"{-lost:+.2f}"
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def _plot(path: Path, found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> None:
+    """Plot the dB lost where things move, a bar for each fault and method."""
+    labels = {o.case.name: f"{o.case.fault}, {o.case.size}" for o in found if o.case.fault != _EXACT}
+    names = list(labels)
+    figure = new_figure((8.0, 1.2 + 0.35 * max(1, len(names))))
+    axis = figure.subplots()
+    width = 0.8 / len(methods)
+    for i, method in enumerate(methods):
+        lost = {o.case.name: _lost(o, exact[method])[1] for o in found if o.method == method}
+        bars = [(y, value) for y, name in enumerate(names) if (value := lost.get(name)) is not None]
+        shift = (i - (len(methods) - 1) / 2) * width
+        axis.barh([y + shift for y, _ in bars], [v for _, v in bars], width, label=method, color=method_color(i))
+    axis.set_yticks(range(len(names)), list(labels.values()))
+    axis.invert_yaxis()
+    axis.axvline(0, color="black", linewidth=0.8)
+    axis.set_xlabel("dB lost where things move, held-out camera")
+    axis.legend(loc="lower right")
+    save_figure(figure, path)

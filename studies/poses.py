@@ -1,0 +1,211 @@
+"""`poses`: estimate the training cameras' poses of scenes, and measure them against the calibrated ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+from tyro.conf import Positional
+
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.baselines.starts.colmap import UNCALIBRATED, clip_means, map_views
+from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
+from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import Float32
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.starts.base import Initialization
+from spike4dgs.method.starts.msdi import infer, matched_poses, unposed
+from spike4dgs.method.starts.rig import rig, window_means
+from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
+
+Row = dict[str, float | int | str | None]
+CLIP = "clip"  # means of the whole clip, as they are
+FLAT = "flat"  # the same, corrected by the cameras' calibrations
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Cameras with poses, and how many points came with them."""
+
+    cameras: Sequence[Camera]
+    points: int
+
+
+def _rig(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = rig(scene)
+    return Estimate(start.cameras, len(start.points))
+
+
+def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    focal = None if calibrated else UNCALIBRATED.focal_prior
+    found = map_views(scene, images, seed, focal_prior=focal)
+    return Estimate(found.cameras, len(found.points))
+
+
+def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = unposed(scene, infer(scene, calibrated=calibrated), seed, calibrated=calibrated)
+    return Estimate(start.cameras, len(start.points))
+
+
+def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    if not calibrated:
+        raise problem("msdi-matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
+    found = matched_poses(scene, infer(scene, calibrated=True), seed)
+    return Estimate(found.cameras, len(found.points))
+
+
+def _dust3r(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+    start = estimate_dust3r(scene, images, seed, calibrated=calibrated)
+    return Estimate(start.cameras, len(start.points))
+
+
+ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Estimate]] = {
+    "rig": _rig,
+    "colmap": _colmap,
+    "dust3r": _dust3r,
+    "msdi": _msdi,
+    "msdi-matched": _msdi_matched,
+}
+COLUMNS = {  # key of the row -> heading, format
+    "registered": ("views", "{}"),
+    "points": ("points", "{}"),
+    "rotation_deg": ("rotation deg", "{:.3f}"),
+    "rotation_max_deg": ("max", "{:.3f}"),
+    "translation_m": ("translation m", "{:.4f}"),
+    "translation_of_array": ("of array", "{:.1%}"),
+    "rra_5": ("RRA@5", "{:.2f}"),
+    "rta_5": ("RTA@5", "{:.2f}"),
+    "rta_15": ("RTA@15", "{:.2f}"),
+    "maa_30": ("mAA30", "{:.3f}"),
+    "focal_ratio": ("focal / true", "{:.3f}"),
+    "seconds": ("s", "{:.1f}"),
+}
+
+
+def poses(
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    initialization: tuple[str, ...] = ("colmap",),
+    images: str = CLIP,
+    unknown_intrinsics: bool = False,
+    refine: bool = False,
+    seed: int = 0,
+    split: str | None = None,
+    out: Path | None = None,
+    allow_gaps: bool = False,
+) -> int:
+    """Estimate the training cameras of scenes and print a table of pose errors.
+
+    Errors are those after the similarity that fits the estimated cameras to the calibrated ones; RRA and RTA are
+    shares of camera pairs. `rig` takes the calibrated poses: its errors are zero, and its points are counted.
+
+    Args:
+        scenes: Scene folders.
+        initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
+            view, and what views match).
+        images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
+            calibrations, as in recipes with flat_field), or images of the clip's middle, such as tfp.
+        unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
+        refine: Also fit 4DGS to TFP images from these poses, poses included, and measure what they became.
+        seed: Seed of everything random.
+        split: Split whose training cameras are taken; each scene's default one if left out.
+        out: Write the rows to this JSON file.
+        allow_gaps: Accept recordings with gaps.
+    """
+    if unknown := [name for name in initialization if name not in ESTIMATORS]:
+        expected = f"names among {', '.join(ESTIMATORS)}"
+        raise problem("--initialization", expected, ", ".join(unknown), "correct the names")
+    if images not in (CLIP, FLAT, *IMAGES):
+        raise problem("--images", f"one of {', '.join((CLIP, FLAT, *IMAGES))}", repr(images), "correct the name")
+    rows = []
+    for path in scenes:
+        scene = as_pinholes(open_scene(path, allow_gaps, split).training)
+        shown = _images(scene, images)
+        for name in initialization:
+            budget = Budget() if refine else None
+            rows += measure_poses(scene, shown, name, seed, calibrated=not unknown_intrinsics, refine=budget)
+    _print(rows)
+    if out:
+        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "refine": refine, "seed": seed}
+        write_json(out, {"settings": settings, "rows": rows})
+    return 0
+
+
+def _images(scene: TrainingScene, images: str) -> Float32:
+    """Return one image of each training view [C, H, W], linear radiance."""
+    if images == CLIP:
+        return clip_means(scene)
+    if images == FLAT:
+        return window_means(scene, 0, scene.n_ticks, flat_field=True)
+    made = [IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams]
+    return undistorted(scene, np.concatenate(made), unseen=None)
+
+
+def measure_poses(
+    scene: TrainingScene, images: Float32, name: str, seed: int, *, calibrated: bool, refine: Budget | None = None
+) -> list[Row]:
+    """Return rows of the table: errors (None where fewer than two views have poses) and seconds.
+
+    An estimator's refusal is the row's `error`. With a budget to refine, a row of the refined poses follows.
+    """
+    start = time.perf_counter()
+    try:
+        found = ESTIMATORS[name](scene, images, seed, calibrated)
+    except UserError as e:
+        empty: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
+        return [{**empty, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}]
+    rows = [_row(scene, name, found, time.perf_counter() - start)]
+    if refine and len(found.cameras) == len(scene.cameras):
+        start = time.perf_counter()
+        better = Estimate(refined(scene, found.cameras, refine, seed), found.points)
+        rows.append(_row(scene, f"{name}, refined", better, time.perf_counter() - start))
+    return rows
+
+
+def refined(scene: TrainingScene, cameras: Sequence[Camera], budget: Budget, seed: int) -> tuple[Camera, ...]:
+    """Return `cameras`, in any order, after 4DGS was fitted to TFP images from their poses, poses included."""
+    posed = {camera.id: camera for camera in cameras}
+    start = rig(replace(scene, cameras=tuple(posed[camera.id] for camera in scene.cameras)))
+    parts = replace(PARTS, initialization={"given": Initialization(lambda request: start)})
+    recipe = Recipe("refined", "tfp", "given", "hexplane", "pixel", {"trainer.refine_poses": True})
+    with RunDisplay(make_console(), 1) as display, display.cell(f"poses of {scene.id}, refined") as shown:
+        model = RecipeMethod(recipe, parts).fit(scene, FitRequest(budget, "cpu", seed, shown.progress))
+    assert isinstance(model, FittedModel)
+    return model.cameras
+
+
+def _row(scene: TrainingScene, name: str, found: Estimate, seconds: float) -> Row:
+    row: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS), "seconds": seconds}
+    row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": found.points}
+    if len(found.cameras) < 2:
+        return {**row, "error": "fewer than two views have poses"}
+    true = {camera.id: camera for camera in scene.cameras}
+    partners = [true[camera.id] for camera in found.cameras]
+    ratios = [a.fx / b.fx for a, b in zip(found.cameras, partners, strict=True)]
+    return {**row, **pose_errors(found.cameras, partners).summary(), "focal_ratio": float(np.mean(ratios))}
+
+
+def _print(rows: Sequence[Row]) -> None:
+    table = Table("scene", "poses", *(heading for heading, _ in COLUMNS.values()))
+    for row in rows:
+        values = ((row[key], text) for key, (_, text) in COLUMNS.items())
+        shown = ["-" if value is None else text.format(value) for value, text in values]
+        table.add_row(str(row["scene"]), str(row["initialization"]), *shown)
+    console = make_console()
+    console.print(table)
+    for row in rows:
+        if row.get("error"):
+            console.print(f"{row['scene']}, {row['initialization']}: {row['error']}", highlight=False, markup=False)

@@ -1,0 +1,250 @@
+"""Spk2ImgNet's windows, training data, training, weight files, and its place among the image makers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
+
+from spike4dgs.baselines.images.spk2img import weights
+from spike4dgs.baselines.images.spk2img.data import Example, draw, open_for_training, read_examples
+from spike4dgs.baselines.images.spk2img.maker import reconstruct
+from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
+from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of, train_spk2img
+from spike4dgs.baselines.images.spk2img.weights import Card, load_network, read_card, save_weights
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.images.windows import window
+
+
+def stream_of(spikes: np.ndarray) -> SpikeStream:
+    return SpikeStream(pack(spikes), spikes.shape[2], spikes.shape[1], 20000.0)
+
+
+@pytest.mark.parametrize("n", [3, 25, 41, 60])
+def test_windows_beyond_the_clip_are_mirrored(n: int) -> None:
+    spikes = np.random.default_rng(n).integers(0, 2, (n, 4, 6), dtype=np.uint8)
+    longer = np.pad(spikes, ((20, 20), (0, 0), (0, 0)), mode="symmetric")
+    for tick in {0, 1, n // 2, n - 1}:
+        np.testing.assert_array_equal(window(stream_of(spikes), tick), longer[tick : tick + 41])
+
+
+def dawn(height: int = 20, width: int = 31) -> Example:
+    """An image that is dark until tick 50; then some pixels fire at every tick. The truth is that pattern."""
+    lit = np.random.default_rng(5).random((height, width)) < 0.4
+    spikes = np.zeros((100, height, width), np.uint8)
+    spikes[50:] = lit
+    moving = np.array([0, height * width - 1, 7 * width + 11])
+    return Example(stream_of(spikes), 50, lit.astype(np.float32), moving, GAIN)
+
+
+def test_augmented_patches_fit_their_truth_in_space_and_time() -> None:
+    """Turned, flipped, reversed or not: pixels change at the start of the middle tick, where the truth says so."""
+    batch = draw([dawn()], 64, 16, 0.5, np.random.default_rng(0))
+    assert batch.spikes.shape == (64, 41, 16, 16) and batch.spikes.dtype == batch.rate.dtype == np.float32
+    forward = 0
+    for spikes, rate in zip(batch.spikes, batch.rate, strict=True):
+        before, after = spikes[19], spikes[20]
+        bright, dark = (after, before) if after.any() else (before, after)
+        np.testing.assert_array_equal(bright, rate)
+        assert not dark.any()
+        assert (spikes[:20] == before).all() and (spikes[20:] == after).all()
+        forward += bool(after.any())
+    assert 16 < forward < 48
+    assert len({rate.tobytes() for rate in batch.rate}) > 50
+    np.testing.assert_array_equal(batch.gain, np.float32(GAIN))
+
+
+def test_patches_around_motion_hold_a_moving_pixel() -> None:
+    """A truth that is 1 at the only moving pixel: every patch drawn on motion contains it."""
+    rate = np.zeros((20, 31), np.float32)
+    rate[3, 30] = 1
+    example = Example(stream_of(np.zeros((100, 20, 31), np.uint8)), 50, rate, np.array([3 * 31 + 30]), GAIN)
+    batch = draw([example], 40, 10, 1.0, np.random.default_rng(1))
+    np.testing.assert_array_equal(batch.rate.sum(axis=(1, 2)), 1)
+    anywhere = draw([example], 40, 10, 0.0, np.random.default_rng(1))
+    assert anywhere.rate.sum() < 30
+
+
+def test_examples_are_all_images_of_a_scene(small_scene: Path) -> None:
+    examples = read_examples(open_for_training(small_scene))
+    assert [e.tick for e in examples] == [20, 40, 60]
+    scene = open_scene(small_scene)
+    for example, target in zip(examples, scene.targets, strict=True):
+        np.testing.assert_allclose(example.rate, GAIN * scene.ground_truth(target), rtol=1e-6)
+        np.testing.assert_array_equal(example.moving, np.flatnonzero(scene.moving(target)))
+        assert example.stream.packed.tobytes() == scene.stream("cam_03").packed.tobytes()
+
+
+def test_the_public_benchmark_and_seasons_are_refused(small_scene: Path) -> None:
+    meta = json.loads((small_scene / "scene.json").read_text())
+    public, season = r" \(1 or higher\), found the public", ", found variant 9000, which is kept for hidden seasons"
+    for variant, refused in ((0, public), (1, ""), (8999, ""), (9000, season)):
+        meta["source"]["variant"] = variant
+        (small_scene / "scene.json").write_text(json.dumps(meta))
+        write_manifest(small_scene)
+        if refused:
+            with pytest.raises(UserError, match=f"expected a training variant{refused}"):
+                open_for_training(small_scene)
+        else:
+            assert open_for_training(small_scene).id == "pattern-0"
+
+
+@pytest.mark.parametrize(
+    ("camera", "first_tick", "ticks", "kept"),
+    [
+        ("cam_03", 0, 19, [40, 60]),  # tick 40 needs ticks [19, 60], the reversed window's first included
+        ("cam_03", 19, 1, [60]),
+        ("cam_03", 60, 1, [20]),
+        ("cam_03", 61, 1, [20, 40]),
+        ("cam_02", 0, 80, [20, 40, 60]),  # no image is of this camera
+    ],
+)
+def test_images_whose_spikes_lack_ticks_are_not_trained_on(
+    small_scene: Path, camera: str, first_tick: int, ticks: int, kept: list[int]
+) -> None:
+    write_gaps(small_scene, [{"camera": camera, "first_tick": first_tick, "ticks": ticks, "reason": "overflow"}])
+    assert [e.tick for e in read_examples(open_for_training(small_scene, allow_gaps=True))] == kept
+
+
+def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path) -> None:
+    write_gaps(small_scene, [{"camera": "cam_03", "first_tick": 0, "ticks": 80, "reason": "overflow"}])
+    with pytest.raises(UserError, match="a recording without gaps"):
+        train_spk2img(scenes=(small_scene,), out=tmp_path / "out")
+    with pytest.raises(UserError, match="with ground truth, found no image that has all its spikes"):
+        train_spk2img(scenes=(small_scene,), out=tmp_path / "out", allow_gaps=True)
+
+
+def write_gaps(scene: Path, gaps: list[dict[str, Any]]) -> None:
+    meta = json.loads((scene / "scene.json").read_text())
+    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": gaps}))
+    write_manifest(scene)
+
+
+def test_loss_from_its_definition() -> None:
+    rng = np.random.default_rng(0)
+    rate, truth = rng.random((2, 6, 6)), rng.random((2, 6, 6))
+    estimates, gain = rng.random((2, 5, 4, 6, 6)), np.array([0.5, 2.0])
+    expected = 0.0
+    for b in range(2):
+        expected += np.abs(rate[b] - truth[b]).mean() / gain[b] / 2
+        for branch in range(4):
+            expected += 0.02 * 5 * np.abs(estimates[b, 2, branch] - truth[b]).mean() / gain[b] / 2
+    found = Reconstruction(torch.from_numpy(rate), torch.from_numpy(estimates))
+    loss = loss_of(found, torch.from_numpy(truth), torch.from_numpy(gain), 0.02)
+    assert loss.item() == pytest.approx(expected, rel=1e-12)
+    perfect = Reconstruction(torch.from_numpy(truth), torch.from_numpy(truth)[:, None, None].expand(2, 5, 4, 6, 6))
+    assert loss_of(perfect, torch.from_numpy(truth), torch.from_numpy(gain), 0.02).item() == 0
+
+
+SMALL = TrainingSettings(width=4, steps=25, batch=2, patch=16, warm_up=5, lr=5e-3)
+
+
+def test_training_learns(small_scene: Path) -> None:
+    training = Training(read_examples(open_for_training(small_scene)), SMALL, "cpu", seed=1)
+    losses = [training.train_step() for _ in range(SMALL.steps)]
+    assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:4])
+
+
+def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene: Path, tmp_path: Path) -> None:
+    examples = read_examples(open_for_training(small_scene))
+    whole, first, second = (Training(examples, SMALL, "cpu", seed=2) for _ in range(3))
+    for _ in range(6):
+        whole.train_step()
+    for _ in range(3):
+        first.train_step()
+    first.save(tmp_path / "c.safetensors", "key")
+    second.resume(tmp_path / "c.safetensors", "key")
+    assert second.step == 3
+    for _ in range(3):
+        second.train_step()
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, second.network.state_dict()[name]), name
+    with pytest.raises(UserError, match="another fit's"):
+        second.resume(tmp_path / "c.safetensors", "another key")
+
+
+def test_command_to_weights_to_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = write_small_scene(tmp_path / "one", seed=1), write_small_scene(tmp_path / "two", seed=2)
+    out = tmp_path / "out"
+    arguments = {"scenes": (one,), "hidden": (two,), "out": out, "width": 2, "steps": 2, "device": "cpu"}
+    assert train_spk2img(**arguments) == 0
+    assert "step 2/2, loss" in capsys.readouterr().out
+    path = out / "spk2img-2.safetensors"
+    card, scene = read_card(path), open_scene(two)
+    assert (card.width, card.steps, card.seed) == (2, 2, 0)
+    assert card.trained_on == (f"pattern-1@{open_scene(one).revision[:16]}",)
+    assert list(card.hidden_psnr_db) == ["pattern-2"] and 0 < card.hidden_psnr_db["pattern-2"] < 40
+    before = path.read_bytes()
+    assert train_spk2img(**arguments) == 0  # done already
+    assert path.read_bytes() == before
+
+    monkeypatch.setenv(weights.VARIABLE, str(path))
+    stream = scene.stream("cam_03")
+    images = IMAGES["spk2img"](stream, [0, 40, 79], GAIN)
+    assert images.shape == (3, HEIGHT, WIDTH) and images.dtype == np.float32
+    network = load_network(path, "cpu")
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(window(stream, 40)[None].astype(np.float32))).rate[0].clamp(min=0)
+    np.testing.assert_allclose(images[1], expected.numpy() / GAIN, atol=1e-5)
+    assert (images >= 0).all()
+
+
+def test_hidden_scenes_are_not_trained_on(small_scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--hidden: expected scenes that are not trained on, found pattern-0"):
+        train_spk2img(scenes=(small_scene,), hidden=(small_scene,), out=tmp_path / "out")
+    with pytest.raises(UserError, match="--scenes: expected scene folders, found none"):
+        train_spk2img(scenes=(), out=tmp_path / "out")
+    with pytest.raises(UserError, match="--width and --steps: expected numbers from 1 up, found 8, 0"):
+        train_spk2img(scenes=(small_scene,), steps=0, out=tmp_path / "out")
+
+
+def test_weights_survive_as_half_floats(tmp_path: Path) -> None:
+    network, path = Spk2ImgNet(4), tmp_path / "w.safetensors"
+    card = Card(4, 7, 1, ("a@0",), {"b": 31.5})
+    save_weights(path, network, card)
+    assert read_card(path) == card
+    loaded = load_network(path, "cpu")
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value.half().float())
+    rate = reconstruct(loaded, stream_of(np.ones((50, 6, 9), np.uint8)), 25)
+    assert rate.shape == (6, 9) and rate.dtype == np.float32
+
+
+def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = stream_of(np.ones((50, 6, 9), np.uint8))
+    monkeypatch.setenv(weights.VARIABLE, str(tmp_path / "none.safetensors"))
+    with pytest.raises(UserError, match=r"none\.safetensors: expected weights of Spk2ImgNet, found no such file; "):
+        IMAGES["spk2img"](stream, [25], GAIN)
+    monkeypatch.delenv(weights.VARIABLE)
+    monkeypatch.setattr(weights, "WEIGHTS", replace(weights.WEIGHTS, shipped=tmp_path / "spk2img-8.safetensors"))
+    with pytest.raises(UserError, match=r"spk2img-8.*`spike4dgs train-spk2img`, or set SPIKE4DGS_SPK2IMG to a file"):
+        IMAGES["spk2img"](stream, [25], GAIN)
+
+
+def test_foreign_and_damaged_weights_are_refused(tmp_path: Path) -> None:
+    foreign = tmp_path / "foreign.safetensors"
+    safetensors.torch.save_file({"x": torch.zeros(3)}, foreign)
+    with pytest.raises(UserError, match="expected metadata spike4dgs-spk2img/1, found none"):
+        load_network(foreign, "cpu")
+    path = tmp_path / "w.safetensors"
+    save_weights(path, Spk2ImgNet(4), Card(8, 7, 1, (), {}))  # the card says 8
+    with pytest.raises(
+        UserError, match=r"parameters of width 8, found \d+ other tensors, the first align\S+ \(4,\); t"
+    ):
+        load_network(path, "cpu")
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(UserError, match="expected weights of Spk2ImgNet, found damaged data"):
+        read_card(path)

@@ -1,0 +1,205 @@
+"""The fit of a radiance field: a textured plane, resuming, skipping, and times."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import GAIN, ToyWorld
+
+from spike4dgs.baselines.radiance_field import PUBLISHED, RADIANCE_FIELD, RadianceFieldSettings, fit_radiance_field
+from spike4dgs.baselines.radiance_field.fit import Fitter
+from spike4dgs.baselines.radiance_field.march import camera_rays
+from spike4dgs.baselines.radiance_field.model import RadianceModel
+from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import FitRequest, Progress
+from spike4dgs.method.fit import FitJob, measure
+from spike4dgs.method.settings import override, scaled
+from spike4dgs.method.splat import Views
+from spike4dgs.method.starts.base import Start
+from spike4dgs.method.training_views.training_images import TrainingImages
+
+WORLD = ToyWorld(width=40, height=25, n_ticks=80)
+SMALL = RadianceFieldSettings(
+    steps=220,
+    rays=128,
+    coarse_samples=24,
+    fine_samples=8,
+    depth=3,
+    width=32,
+    coarse_depth=2,
+    coarse_width=16,
+    position_frequencies=5,
+    direction_frequencies=1,
+    lr_field=1e-2,
+    lr_field_last=1e-3,
+)
+
+
+def silent(done: int, total: int, note: str = "") -> None:
+    pass
+
+
+def plane(camera, t: float = 0.5, travel: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance [H, W] of a textured plane y = 0, and its points [H * W, 3]; the texture moves by `travel` m in all."""
+    v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
+    towards = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+    points = camera.center + towards * (-camera.center[1] / towards[:, 1:2])
+    x, z = points[:, 0] - travel * (t - 0.5), points[:, 2]
+    return (0.5 + 0.3 * np.sin(5 * x + 2 * z) * np.cos(4 * z - 3 * x)).reshape(camera.height, camera.width), points
+
+
+def job(
+    motion=SMALL, progress: Progress = silent, checkpoint: Path | None = None, seed=0, travel=0.0, every=8
+) -> FitJob:
+    scene = WORLD.training
+    ticks = tuple(range(4, 80, 8))
+    frames = np.stack([[plane(c, k / 80, travel)[0] for c in scene.cameras] for k in ticks]).astype(np.float32)
+    points = np.concatenate([plane(c)[1][::5] for c in scene.cameras])
+    points += np.random.default_rng(0).normal(size=points.shape) * [0, 0.02, 0]
+    start = Start(scene.cameras, points.astype(np.float32), np.full(len(points), 0.5, np.float32))
+    images = TrainingImages(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(frames), 80)
+    extent = measure(start, scene)
+    grid = OccupancySettings(cells=16, every=every)
+    settings = {**RADIANCE_FIELD.settings, "motion": motion, "occupancy": grid}
+    request = FitRequest(seed=seed, progress=progress, checkpoint=checkpoint)
+    return FitJob(scene, start, images, extent, settings, request, "this")
+
+
+@cache
+def fitted(travel: float) -> RadianceModel:
+    return fit_radiance_field(job(travel=travel))
+
+
+def psnr(model: RadianceModel, travel: float, at: float | None = None) -> float:
+    """Of the held-out centre camera; `at` stops the model's clock."""
+    errors = []
+    for t in (0.15, 0.4, 0.85):
+        truth = plane(WORLD.held_out, t, travel)[0]
+        errors.append(np.mean((model.render(WORLD.held_out, (at or t) * model.duration_us) - truth) ** 2))
+    return float(-10 * np.log10(errors).mean())
+
+
+def test_a_static_plane_is_seen_from_a_new_viewpoint() -> None:
+    assert psnr(fitted(0.0), 0.0) > 27
+
+
+def test_what_moves_is_followed() -> None:
+    model = fitted(0.3)
+    assert model.field.occupancy.movable.any()
+    assert psnr(model, 0.3) > psnr(model, 0.3, at=0.5) + 3 and psnr(model, 0.3) > 22
+
+
+def test_nothing_moves_where_no_pixel_changes() -> None:
+    assert not fitted(0.0).field.occupancy.movable.any()
+    images = [fitted(0.0).render(WORLD.held_out, t) for t in (0.0, 3000.0)]
+    np.testing.assert_array_equal(*images)
+
+
+@torch.no_grad()
+def test_skipping_what_is_empty_changes_the_image_by_less_than_a_hundredth() -> None:
+    model = fitted(0.0)
+    grid = model.field.occupancy
+    assert float(grid.occupied.float().mean()) < 0.5
+    rays = camera_rays(WORLD.held_out)
+    skipped = model.field.trace(rays, 0.5, None)[1]
+    occupied = grid.occupied.clone()
+    grid.occupied.copy_(grid.candidates)
+    everything = model.field.trace(rays, 0.5, None)[1]
+    grid.occupied.copy_(occupied)
+    assert float((skipped - everything).abs().max()) < 0.01
+
+
+def test_a_render_is_the_same_bits_again_and_stops_at_the_ends_of_the_clip() -> None:
+    model = fitted(0.3)
+    images = {t: model.render(WORLD.held_out, t) for t in (-1e6, 0.0, model.duration_us, 1e9)}
+    assert images[0.0].dtype == np.float32 and images[0.0].shape == (25, 40)
+    np.testing.assert_array_equal(images[-1e6], images[0.0])
+    np.testing.assert_array_equal(images[1e9], images[model.duration_us])
+    np.testing.assert_array_equal(model.render(WORLD.held_out, 0.0), images[0.0])
+    assert not np.array_equal(images[0.0], images[1e9])
+
+
+SHORT = replace(SMALL, steps=24, rays=32)
+
+
+def short(progress: Progress = silent, checkpoint: Path | None = None, seed: int = 0, travel: float = 0.3) -> FitJob:
+    return job(SHORT, progress, checkpoint, seed, travel, every=3)
+
+
+def tensors(fitter: Fitter) -> dict[str, torch.Tensor]:
+    return {k: v.detach().clone() for k, v in fitter.state().tensors.items()}
+
+
+@cache
+def uninterrupted() -> dict[str, torch.Tensor]:
+    fitter = Fitter(short())
+    fitter.run()
+    return tensors(fitter)
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("step", [10, 20])
+def test_killed_and_resumed_gives_the_same_bits(step: int, tmp_path: Path) -> None:
+    def dies(done: int, total: int, note: str = "") -> None:
+        if done == step:
+            raise Killed
+
+    path = tmp_path / "fit.safetensors"
+    with pytest.raises(Killed):
+        Fitter(short(dies, path)).run(checkpoint_s=0)
+    second = Fitter(short(silent, path))
+    second.run()
+    result = tensors(second)
+    assert result.keys() == uninterrupted().keys()
+    for name, value in uninterrupted().items():
+        assert torch.equal(result[name], value), name
+
+
+def test_another_seed_gives_another_field_and_another_fits_checkpoint_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fit.safetensors"
+    other = Fitter(short(silent, path, seed=1))
+    other.run()
+    assert not torch.equal(tensors(other)["field.fine.value.weight"], uninterrupted()["field.fine.value.weight"])
+    with pytest.raises(UserError, match="another fit's; delete it"):
+        Fitter(replace(short(silent, path, travel=0.0), key="that")).run()
+
+
+def test_every_parameter_learns() -> None:
+    fitter = Fitter(short())
+    before = {k: v.detach().clone() for k, v in fitter.field.named_parameters()}
+    for _ in range(3):
+        fitter.train_step()
+    unchanged = [k for k, v in fitter.field.named_parameters() if torch.equal(v, before[k])]
+    assert not unchanged
+
+
+def test_times_open_up_from_the_middle() -> None:
+    fitter = Fitter(job(replace(SHORT, steps=1000)))
+    seen: list[set[int]] = []
+    for first in (0, 500):
+        seen.append(set())
+        for step in range(first, first + 60):
+            fitter.step = step
+            seen[-1].add(fitter.choose_time())
+    assert seen[0] <= {3, 4, 5, 6} and seen[1] == set(range(10))
+
+
+def test_budgets_scale_the_steps_and_published_values_are_settings() -> None:
+    s = RADIANCE_FIELD.settings
+    motion = RadianceFieldSettings()
+    assert scaled(s, 0.5) == {**s, "motion": replace(motion, steps=round(motion.steps / 2))}
+    paper = override(s, PUBLISHED, "paper")
+    assert isinstance(found := paper["motion"], RadianceFieldSettings)
+    assert found.steps == 200_000 and found.width == 256 and found.lr_field == 5e-4
+
+
+def test_spikes_of_the_stream_are_what_a_rate_is_compared_with() -> None:
+    fitter = Fitter(job())
+    assert torch.allclose(fitter.recorded[0].view(8, 25, 40), GAIN * job().training_images.images[0])

@@ -1,0 +1,254 @@
+"""Spacetime Gaussians against the published formulas in float64, their edits, and the decoder."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gaussian_clouds import cloud
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+from small_scenes import array_cameras
+from torch import Tensor
+from toy_world import ToyWorld
+
+from spike4dgs.baselines.stg.spacetime import Spacetime, SpacetimeLite, SpacetimeSettings
+from spike4dgs.baselines.stg.spacetime_decoder import Decoder, rays
+from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
+from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
+from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
+from spike4dgs.method.motion.polynomial import move_to
+from spike4dgs.method.motion.table import MOTIONS, Extent
+from spike4dgs.method.splat import Views, render
+from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.training_views.lookup import look_up, variation_at
+from spike4dgs.method.training_views.projection import project
+from spike4dgs.method.training_views.training_images import TrainingImages
+
+WORLD = ToyWorld(width=64, height=40, side=2, n_ticks=200)
+EXTENT = Extent(-torch.ones(3), torch.ones(3), 2.0, 200, 64)
+SETTINGS = SpacetimeSettings()
+
+
+def motion(name: str = "spacetime") -> SpacetimeLite:
+    made = MOTIONS[name](EXTENT, MOTIONS[name].defaults, seeded(0, -1))
+    assert isinstance(made, SpacetimeLite)
+    return made
+
+
+@pytest.mark.parametrize("t", [0.0, 0.31, 1.0])
+def test_opacity_and_path_are_the_published_ones(t: float) -> None:
+    g = cloud(dtype=torch.float64)
+    splats = motion().splats(g, t)
+    for i in range(len(g)):
+        x, m = g.means[i].numpy(), g.extra["coefficients"][i].numpy().reshape(3, 3)
+        d = t - float(g.extra["times"][i])
+        mean = x + m[0] * d + m[1] * d**2 + m[2] * d**3
+        fade = np.exp(-((d / np.exp(float(g.extra["log_temporal_scales"][i]))) ** 2))
+        np.testing.assert_allclose(splats.means[i].numpy(), mean, rtol=1e-12, atol=1e-12)
+        opacity = fade / (1 + np.exp(-float(g.logits[i])))
+        np.testing.assert_allclose(float(splats.opacities[i]), opacity, rtol=1e-12)
+        quat = g.quats[i].numpy() + d * g.extra["angular_velocities"][i].numpy()
+        R = Rotation.from_quat(quat / np.linalg.norm(quat), scalar_first=True).as_matrix()
+        np.testing.assert_allclose(rotation_matrices(splats.quats[i : i + 1])[0].numpy(), R, atol=1e-12)
+        np.testing.assert_allclose(splats.scales[i].numpy(), np.exp(g.log_scales[i].numpy()), rtol=1e-12)
+        f = g.extra["features"][i].numpy()
+        np.testing.assert_allclose(splats.colors[i].numpy(), [float(g.colors[i]), f[0], d * f[1]], rtol=1e-12)
+
+
+def test_a_small_angular_velocity_turns_evenly() -> None:
+    g = cloud(1, dtype=torch.float64)
+    start, axis = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]), np.array([0.0, 0.0, 1.0])
+    end = start * Rotation.from_rotvec(0.05 * axis)
+    q0, q1 = (torch.from_numpy(r.as_quat(scalar_first=True)) for r in (start, end))
+    g = replace(g, quats=q0[None], extra={**g.extra, "times": torch.zeros(1), "angular_velocities": (q1 - q0)[None]})
+    halfway = rotation_matrices(motion().splats(g, 0.5).quats)[0].numpy()
+    expected = Slerp([0, 1], Rotation.concatenate([start, end]))(0.5).as_matrix()
+    np.testing.assert_allclose(halfway, expected, atol=1e-6)
+
+
+def test_times_learn_from_opacity_alone_and_lite_splats_gray() -> None:
+    g = cloud(dtype=torch.float64).trainable()
+    splats = motion().splats(g, 0.4)
+    for part in (splats.means, splats.quats, splats.colors):
+        grad = torch.autograd.grad(part.square().sum(), g.extra["times"], allow_unused=True, retain_graph=True)[0]
+        assert grad is None or not grad.any()
+    (grad,) = torch.autograd.grad(splats.opacities.sum(), g.extra["times"])
+    assert grad.abs().min() > 0
+    assert torch.equal(motion("spacetime-lite").splats(g, 0.4).colors, g.colors)
+
+
+def test_a_faded_gaussian_is_not_rasterised() -> None:
+    g = cloud(20)
+    g.means.mul_(0.2)
+    g.logits[:] = 5.0
+    g.extra["times"][:10], g.extra["log_temporal_scales"][:] = 0.9, -2.5
+    g.extra["times"][10:], g.extra["coefficients"][:] = 0.2, 0.0
+    out = render(motion("spacetime-lite").splats(g, 0.2), Views.from_cameras(array_cameras(1)))
+    assert not out.visible[0, :10].any() and out.visible[0, 10:].all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0, 1))
+def test_a_path_is_the_same_around_any_time(seed: int, t: float) -> None:
+    g = cloud(seed=seed, dtype=torch.float64)
+    moved = move_to(g, torch.rand(len(g), generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64))
+    before, after = motion().splats(g, t), motion().splats(moved, t)
+    torch.testing.assert_close(after.means, before.means, rtol=0, atol=1e-10)
+    torch.testing.assert_close(after.quats, before.quats, rtol=0, atol=1e-10)
+
+
+EDITS = ("prune", "densify", "relocate", "concatenate")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.lists(st.sampled_from(EDITS), min_size=1, max_size=5))
+def test_extra_parameters_stay_with_their_gaussians_through_all_edits(seed: int, edits: list[str]) -> None:
+    rng = torch.Generator().manual_seed(seed)
+    g = cloud(10, seed)
+    ids = torch.arange(10.0)
+    g = replace(g, colors=ids[:, None], extra={"a": ids, "b": ids[:, None].repeat(1, 3)})
+    for name in edits:
+        mask, other = torch.rand(2, len(g), generator=rng) < 0.4
+        if name == "prune":
+            g = prune(g, mask | (torch.arange(len(g)) == 0)).gaussians
+        elif name == "densify":
+            edit = densify(g, mask, other, rng)
+            assert (
+                edit.added == int((edit.source < 0).sum()) and (edit.source[len(edit.source) - edit.added :] < 0).all()
+            )
+            g = edit.gaussians
+        elif name == "relocate":
+            g = relocate(g, mask, rng).gaussians
+        else:
+            g = concatenate([g, g.rows(mask)])
+        assert torch.equal(g.extra["a"], g.colors[:, 0]) and torch.equal(g.extra["b"], g.colors.repeat(1, 3))
+
+
+def test_moments_of_extra_parameters_follow_an_edit() -> None:
+    g = cloud(6).trainable()
+    adam = make_adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
+    sum((v * v).sum() for v in g.tensors().values()).backward()
+    adam.step()
+    before = {k: adam.state[v]["exp_avg"].clone() for k, v in g.extra.items()}
+    keep = torch.tensor([0, 1, 1, 0, 1, 1]).bool()
+    new = apply_edit(adam, prune(g, keep))
+    assert set(new.extra) == {"times", "log_temporal_scales", "coefficients", "angular_velocities", "features"}
+    for name, leaf in new.extra.items():
+        assert leaf.requires_grad and torch.equal(adam.state[leaf]["exp_avg"], before[name][keep])
+
+
+def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> None:
+    g = cloud(12)
+    g.logits[:] = 0.0
+    statistics = GradientStatistics(torch.tensor([1.0, 0.0] * 6), torch.ones(12))
+    (edit,) = adapt_density(g, statistics, DensitySettings(), 100.0, 50, torch.Generator().manual_seed(0))
+    born = motion().born(edit, torch.Generator().manual_seed(1))
+    old, new = born.gaussians.rows(torch.arange(12)), born.gaussians.rows(torch.arange(12, 18))
+    assert edit.added == born.added == 6 and all(torch.equal(v, g.tensors()[k]) for k, v in old.tensors().items())
+    assert new.extra["times"].min() >= 0 and new.extra["times"].max() <= 1 and new.extra["times"].std() > 0.1
+    before, after = (motion().splats(x, 0.7) for x in (g.rows(torch.arange(0, 12, 2)), new))
+    torch.testing.assert_close(after.means, before.means, rtol=0, atol=1e-5)
+
+
+def test_relocated_gaussians_keep_their_hosts_times() -> None:
+    g = cloud(12)
+    edit = relocate(g, torch.arange(12) < 3, torch.Generator().manual_seed(0))
+    assert torch.equal(motion().born(edit, torch.Generator()).gaussians.extra["times"], edit.gaussians.extra["times"])
+
+
+def test_rays_project_to_their_pixels() -> None:
+    cameras = array_cameras(2)
+    origin, direction = rays(Views.from_cameras(cameras))
+    for i, camera in enumerate(cameras):
+        np.testing.assert_allclose(origin[i].numpy(), camera.center, atol=1e-12)
+        d = direction[i].double().numpy().T
+        np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, rtol=1e-6)
+        uv, z = camera.project(camera.center + 2.5 * d)
+        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+        np.testing.assert_allclose(uv, np.stack([u, v], -1).reshape(-1, 2), atol=1e-4)
+        assert (z > 0).all()
+
+
+def test_decoder_is_two_pointwise_layers_beside_the_albedo() -> None:
+    cameras = array_cameras(2)
+    views = Views.from_cameras(cameras)
+    center = torch.tensor([0.1, -0.2, 0.3])
+    decoder = Decoder(center, 1.7, torch.Generator().manual_seed(0))
+    channels = torch.rand(2, views.height, views.width, 3, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(decoder(channels, views), channels[..., 0])  # it starts as the albedo
+    with torch.no_grad():
+        decoder.second.copy_(torch.randn(1, 6, generator=torch.Generator().manual_seed(2)))
+    w1, w2 = (p.detach().double().numpy() for p in (decoder.first, decoder.second))
+    out = decoder(channels, views).detach().numpy()
+    for view, v, u in ((0, 0, 0), (1, 7, 31), (1, 23, 39)):
+        camera = cameras[view]
+        point = camera.unproject(np.array([[u + 0.5, v + 0.5]]), np.array([1.0]))[0]
+        ray = (point - camera.center) / np.linalg.norm(point - camera.center)
+        albedo, *features = channels[view, v, u].double().numpy()
+        x = np.concatenate([features, (camera.center - center.double().numpy()) / 1.7, ray])
+        np.testing.assert_allclose(out[view, v, u], albedo + w2[0] @ np.maximum(w1 @ x, 0), rtol=1e-4, atol=1e-5)
+
+
+def make_training_images(count: int = 9) -> TrainingImages:
+    ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks - 1, count))
+    frames = [[WORLD.trace(c, t / WORLD.n_ticks)[0] for c in WORLD.cameras] for t in ticks]
+    images = torch.from_numpy(np.array(frames, np.float32))
+    return TrainingImages(Views.from_cameras(WORLD.cameras), ticks, images, WORLD.n_ticks)
+
+
+def surface() -> tuple[Tensor, np.ndarray]:
+    """Points of one view's surfaces at the clip's middle, and which lie on the board that moves."""
+    camera = WORLD.cameras[0]
+    _, depth, board = WORLD.trace(camera, 0.5)
+    v, u = np.mgrid[4 : camera.height - 4 : 3, 4 : camera.width - 4 : 3].reshape(2, -1)
+    points = camera.unproject(np.stack([u, v], -1) + 0.5, depth[v, u])
+    return torch.from_numpy(points.astype(np.float32)), board[v, u]
+
+
+def test_points_are_seen_where_the_cameras_see_them() -> None:
+    points, _ = surface()
+    rows, inside = project(points, make_training_images(1).views)
+    for i, camera in enumerate(WORLD.cameras):
+        uv, z = camera.project(points.double().numpy())
+        within = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
+        assert (inside[i].numpy() == within).all()
+        u, v = np.floor(uv[within]).astype(int).T
+        assert (rows[i].numpy()[within] == v * camera.width + u).all()
+
+
+def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times() -> None:
+    points, board = surface()
+    f = make_training_images()
+    change = variation_at(points, f).numpy()
+    shift = change > SETTINGS.moving_change
+    assert shift[board].mean() > 0.5 > 3 * shift[~board].mean()  # the board uncovers some of what is behind it
+    n = len(points)
+    g = Gaussians(points, torch.zeros(n, 3), torch.ones(n, 4), torch.zeros(n), torch.zeros(n, 1))
+    timed = motion().attach(g, f)
+    short = timed.extra["log_temporal_scales"].exp() < 1
+    assert len(timed) == n + (SETTINGS.moving_copies - 1) * shift.sum() and int(short.sum()) == 3 * shift.sum()
+    thirds = (timed.extra["times"][short].view(3, -1) * 3).long()
+    assert torch.equal(thirds, torch.arange(3)[:, None].expand_as(thirds))
+    assert not timed.extra["coefficients"].any() and not timed.extra["angular_velocities"].any()
+    assert torch.equal(timed.extra["features"][:, 0], timed.colors[:, 0])
+    i = int(torch.nonzero(short)[0])
+    t = timed.extra["times"][i : i + 1]
+    nearest = int(np.abs(np.array(f.ticks) / f.n_ticks - float(t)).argmin())
+    seen = [p.flatten()[r[i_]] for p, r, i_ in zip(f.images[nearest], *_at(timed.means[i : i + 1], f), strict=True)]
+    assert timed.colors[i, 0] in seen
+    assert torch.equal(look_up(timed.means[i : i + 1], t, f), timed.colors[i])
+
+
+def _at(point: Tensor, f: TrainingImages) -> tuple[Tensor, list[int]]:
+    return project(point, f.views)[0], [0] * len(f.views)
+
+
+def test_groups_and_learning_rates_name_every_parameter() -> None:
+    full, lite = motion(), motion("spacetime-lite")
+    g = full.timed(cloud(4), torch.zeros(4), 1.0)
+    assert set(full.learning_rates()) == set(g.extra) and set(lite.learning_rates()) == set(g.extra) - {"features"}
+    assert isinstance(full, Spacetime) and set(full.groups()) == {"decoder"} and not lite.groups()
+    assert full.groups()["decoder"][0] == list(full.decoder.parameters())

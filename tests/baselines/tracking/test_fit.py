@@ -1,0 +1,277 @@
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+from toy_world import ToyWorld
+
+from spike4dgs.baselines.tracking.fit import (
+    TRACKING,
+    Tracker,
+    Visit,
+    first_index,
+    fit_tracking,
+    visits,
+)
+from spike4dgs.baselines.tracking.losses import find_neighbours
+from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
+from spike4dgs.baselines.tracking.settings import PUBLISHED, TrackingSettings
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, measure
+from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.settings import override
+from spike4dgs.method.splat import Views
+from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.supervision.pixel import PixelSettings
+from spike4dgs.method.supervision.table import SUPERVISIONS
+from spike4dgs.method.training_views.foreground import foreground_masks
+from spike4dgs.method.training_views.training_images import TrainingImages
+
+WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.25)
+CAMERAS = tuple(c for c in WORLD.cameras if c is not WORLD.held_out)
+TIMES = 5
+TINY = {"first_steps": 3, "later_steps": 2, "first_move": 1.0, "views_per_step": 2, "neighbours": 4}
+
+
+def silent(done: int, total: int, note: str = "") -> None:
+    pass
+
+
+@cache
+def shown() -> tuple[TrainingImages, Start]:
+    """Exact images of the board at `TIMES` times, and noisy points on the surfaces as they are at the middle one."""
+    ticks = tuple(int(t) for t in np.linspace(0, WORLD.n_ticks, TIMES))
+    frames = np.array([[WORLD.trace(c, t / WORLD.n_ticks)[0] for c in CAMERAS] for t in ticks], np.float32)
+    start = Start(CAMERAS, *WORLD.surfaces(CAMERAS[::3], 0.005))
+    return TrainingImages(Views.from_cameras(CAMERAS), ticks, torch.from_numpy(frames), WORLD.n_ticks), start
+
+
+def job(
+    checkpoint: Path | None = None,
+    progress: Callable[..., None] = silent,
+    static: bool = False,
+    ssim_weight: float = 0.2,
+    **changes: object,
+) -> FitJob:
+    images, start = shown()
+    if static:
+        images = replace(images, images=images.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
+    scene = TrainingScene("toy", "toy", CAMERAS, (), 20000.0, WORLD.n_ticks, 0.6)
+    motion, supervision = replace(TrackingSettings(), **changes), PixelSettings(ssim_weight)
+    settings = {**TRACKING.settings, "motion": motion, "supervision": supervision}
+    request = FitRequest(progress=progress, checkpoint=checkpoint)
+    return FitJob(scene, start, images, measure(start, scene), settings, request, "this")
+
+
+def test_times_are_visited_outward_with_the_velocity_known_so_far() -> None:
+    assert visits(2, 5) == [Visit(3, 2, None), Visit(4, 3, 2), Visit(1, 2, 3), Visit(0, 1, 2)]
+    assert visits(0, 3) == [Visit(1, 0, None), Visit(2, 1, 0)]
+    assert visits(2, 3) == [Visit(1, 2, None), Visit(0, 1, 2)]
+    assert visits(0, 1) == []
+    known = {7}
+    for v in visits(7, 20):
+        assert {v.before, *([] if v.earlier is None else [v.earlier])} <= known
+        known.add(v.index)
+    assert known == set(range(20))
+
+
+@pytest.mark.parametrize(("start", "index"), [(0.0, 0), (0.5, 2), (1.0, 4), (-3.0, 0), (9.0, 4)])
+def test_the_first_time_is_where_the_settings_say(start: float, index: int) -> None:
+    assert first_index(job(start=start)) == index
+
+
+@cache
+def tracked() -> TrackedModel:
+    return fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
+
+
+def test_known_translation_is_recovered() -> None:
+    model = tracked()
+    tracks, g = model.tracks, model.gaussians
+    # The Gaussians on the board, told by its true position at the first time.
+    x, y, z = g.means[tracks.free].unbind(-1)
+    board = (x.abs() < 0.4) & (y.abs() < 0.05) & ((z - 0.6).abs() < 0.3) & (g.logits[tracks.free].sigmoid() > 0.3)
+    assert board.sum() > 50
+    moved = (tracks.means[:, board] - tracks.means[2, board]).median(dim=1).values  # [T, 3]
+    expected = WORLD.travel * (torch.linspace(0, 1, TIMES) - 0.5)
+    torch.testing.assert_close(moved[:, 0], expected, atol=0.025 * WORLD.travel, rtol=0)
+    assert moved[:, 2].abs().max() < 0.025 * WORLD.travel
+    assert moved[:, 1].abs().max() < 0.03  # depth: a fifth of a pixel of parallax across the whole array
+
+
+def test_the_board_is_seen_from_a_new_viewpoint_at_times_between_the_tracked_ones() -> None:
+    for t in (0.375, 0.625, 0.8):
+        truth, _, board = WORLD.trace(WORLD.held_out, t)
+        error = (tracked().render(WORLD.held_out, t * WORLD.n_ticks * 50.0) - truth) ** 2
+        assert -10 * np.log10(error[board].mean()) > 22
+
+
+def test_the_background_is_fixed_or_hardly_moves() -> None:
+    model = tracked()
+    start, stop = model.at(0.0), model.at(model.duration_us)
+    others = torch.ones(len(start), dtype=torch.bool).index_fill(0, model.tracks.free, False)
+    assert torch.equal(start.means[others], stop.means[others])
+    assert torch.equal(start.quats[others], stop.quats[others])
+    assert not torch.equal(start.means, stop.means)
+    soft = fit_tracking(job(**TINY, freeze_background=False))
+    moving = int(fit_tracking(job(**TINY)).tracks.free.numel())
+    assert len(soft.tracks.free) == len(soft.tracks.rows) > moving
+    assert (soft.tracks.means[0, moving:] != soft.tracks.means[2, moving:]).any()
+
+
+def test_only_the_window_is_rendered_and_the_gradient_is_that_of_the_whole_image() -> None:
+    gradients = []
+    for margin in (8, 1000):
+        j = job(**TINY, margin_px=margin, ssim_weight=0.0)
+        g = from_points(j.start.points, j.start.values, opacity=0.5)
+        tracker = Tracker(j, g, foreground_masks(j.training_images.images))
+        tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+        old = tracker.tracks.at(2)
+        leaves = {k: v.clone().requires_grad_() for k, v in old.items()}
+        tracker.loss(3, old)(leaves, [0, 3, 5]).backward()
+        gradients.append([leaves[k].grad[: tracker.count] for k in ("means", "quats", "colors")])
+    assert Tracker(job(**TINY), g, foreground_masks(j.training_images.images)).share < 0.8
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
+
+
+def test_what_flies_off_to_where_nothing_moves_stays_where_it_was() -> None:
+    j = job(**TINY)
+    g = from_points(j.start.points, j.start.values, opacity=0.5)
+    tracker = Tracker(j, g, foreground_masks(j.training_images.images))
+    tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+    tracks = tracker.tracks
+    tracks.means[1, 7] -= torch.tensor([0.0, 0.0, 0.45])  # from there its velocity takes it far above the board
+    tracker.track(Visit(3, 2, 1))
+    assert torch.equal(tracks.means[3, 7], tracks.means[2, 7])
+    assert (tracks.means[3, 8:] != tracks.means[2, 8:]).any(dim=1).float().mean() > 0.9
+
+
+class Killed(Exception):
+    pass
+
+
+@cache
+def uninterrupted() -> TrackedModel:
+    return fit_tracking(job(**TINY))
+
+
+def everything(model: TrackedModel) -> dict[str, torch.Tensor]:
+    return {**model.gaussians.tensors(), **{f"tracks.{k}": v for k, v in model.tracks.tensors().items()}}
+
+
+@pytest.mark.parametrize("time", ["loss", "time 2", "time 3", "time 4", "time 5"])
+def test_killed_at_any_time_and_resumed_gives_the_same_bits(time: str, tmp_path: Path) -> None:
+    path = tmp_path / "fit.safetensors"
+
+    def dies(done: int, total: int, note: str = "") -> None:
+        if note.startswith(time):
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit_tracking(job(path, dies, **TINY), checkpoint_s=0)
+    assert path.is_file() == (time != "loss")  # before the end of the first time there is nothing to go on from
+    seen: list[str] = []
+    resumed = fit_tracking(job(path, lambda done, total, note="": seen.append(note), **TINY))
+    assert any(note.startswith("loss") for note in seen) == (time == "loss")
+    for name, value in everything(uninterrupted()).items():
+        assert torch.equal(everything(resumed)[name], value), name
+
+
+def test_finished_fit_is_read_back_and_another_fit_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fit.safetensors"
+    one, two = (fit_tracking(job(path, **TINY)) for _ in range(2))
+    images = [m.render(WORLD.held_out, 3000.0) for m in (one, two)]
+    assert images[0].dtype == np.float32 and images[0].shape == (40, 64) and np.array_equal(*images)
+    with pytest.raises(UserError, match="another fit's; delete it"):
+        fit_tracking(replace(job(path, **TINY), key="that"))
+
+
+def test_progress_counts_all_steps_to_the_end() -> None:
+    seen: list[tuple[int, int]] = []
+    fit_tracking(job(progress=lambda done, total, note="": seen.append((done, total)), **TINY))
+    assert {total for _, total in seen} == {3 + 4 * 2}
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen) and seen[-1][0] == 11
+
+
+def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
+    model = fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
+    images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
+    assert len(model.tracks.free) == 0 and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
+
+
+def tracks() -> Tracks:
+    """Three times of four Gaussians that move along and turn about the y axis by 4 and then 2 degrees."""
+    g = from_points(
+        np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32), np.ones(6, np.float32), opacity=0.5
+    )
+    made = Tracks.start(g, torch.tensor([1, 4, 2, 5]), torch.tensor([5, 1, 4, 2, 0]), (10, 30, 40), 20000.0)
+    for i, (x, angle) in enumerate([(0.0, 0.0), (1.0, 4.0), (3.0, 6.0)]):
+        half = np.deg2rad(angle) / 2
+        quat = torch.tensor([np.cos(half), 0, np.sin(half), 0], dtype=torch.float32)
+        colors = torch.full((5, 1), 0.2 * i)
+        made.put(i, {"means": torch.full((4, 3), x), "quats": 3 * quat.expand(4, 4), "colors": colors})
+    return made
+
+
+@pytest.mark.parametrize(
+    ("t_us", "x", "color"),
+    [(500, 0, 0), (1000, 0.5, 0.1), (1500, 1, 0.2), (1875, 2.5, 0.35), (2000, 3, 0.4), (250, -0.25, 0), (2250, 4, 0.4)],
+)
+def test_between_times_all_is_linear_and_positions_go_on_beyond_the_ends(t_us: float, x: float, color: float) -> None:
+    values = tracks().between(t_us)
+    torch.testing.assert_close(values["means"], torch.full((4, 3), float(x)))
+    torch.testing.assert_close(values["colors"], torch.full((5, 1), float(color)))
+
+
+def test_rotations_between_times_are_those_of_slerp() -> None:
+    slerp = Slerp([500, 1500, 2000], Rotation.from_rotvec(np.deg2rad([[0, 0, 0], [0, 4, 0], [0, 6, 0]])))
+    for t_us in np.linspace(500, 2000, 13):
+        w, x, y, z = tracks().between(float(t_us))["quats"][0].tolist()
+        error = (Rotation.from_quat([x, y, z, w]) * slerp(t_us).inv()).magnitude()
+        assert np.rad2deg(error) < 0.001
+
+
+def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
+    g = from_points(
+        np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32), np.ones(6, np.float32), opacity=0.5
+    )
+    model = TrackedModel(g, tracks(), duration_us=2500.0)
+    now = model.at(1500.0)
+    assert torch.equal(now.means[[0, 3]], g.means[[0, 3]]) and (now.means[[1, 2, 4, 5]] == 1).all()
+    assert torch.equal(now.colors[3], g.colors[3])
+    assert torch.equal(model.at(9999.0).means, model.at(2500.0).means)
+    assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
+    assert model.size_bytes == 4 * (6 * 12 + 3 * (4 * 7 + 5))
+
+
+def test_a_recipe_runs_it_from_spikes_to_images() -> None:
+    def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
+        return np.stack([stream.counts(t - 10, t + 10) / (20 * gain) for t in ticks]).astype(np.float32)
+
+    parts = Parts(
+        {"mean": images}, {"true": Initialization(lambda request: shown()[1])}, {}, SUPERVISIONS, {"tracking": TRACKING}
+    )
+    settings = {**{f"motion.{name}": value for name, value in TINY.items()}, "images.time_spacing_ticks": 110}
+    recipe = Recipe("test", "mean", "true", "tracking", "pixel", settings)
+    model = RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest(Budget(2.0)))
+    image = model.render(WORLD.held_out, 6000.0)
+    truth = WORLD.trace(WORLD.held_out, 0.5)[0]
+    assert len(model.tracks.times_us) == 3
+    assert -10 * np.log10(((image - truth) ** 2).mean()) > 12  # after six steps
+
+
+def test_budget_scales_steps_only_and_the_publications_counts_are_settings() -> None:
+    s = TrackingSettings()
+    half = s.scaled(0.5)
+    assert (half.first_steps, half.later_steps) == (s.first_steps // 2, s.later_steps // 2)
+    assert replace(half, first_steps=s.first_steps, later_steps=s.later_steps) == s
+    paper = override(TRACKING.settings, PUBLISHED, "paper")
+    assert TRACKING.published == PUBLISHED and paper["motion"] == replace(s, first_steps=2500, later_steps=500)

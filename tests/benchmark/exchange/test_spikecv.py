@@ -1,0 +1,166 @@
+"""SpikeCV folders: round trips, the layout at sizes that are no whole bytes, and refused folders."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
+from spike4dgs.benchmark.scene.cameras import to_nerfstudio
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.benchmark.spikes.stream import pack
+
+
+def write_spikecv(folder: Path, spikes: np.ndarray) -> Path:
+    """What SpikeCV counts on: H * W bits to a tick, no padding, bottom row first."""
+    folder.mkdir(parents=True)
+    np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tofile(folder / "a.dat")
+    config = {"filename": "a.dat", "spike_w": spikes.shape[2], "spike_h": spikes.shape[1], "is_labeled": False}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+def random_spikes(n: int, height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 2, (n, height, width), dtype=np.uint8)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 1100), st.integers(1, 9), st.integers(8, 21), st.integers(0, 9))
+def test_import_of_any_size_and_length(
+    tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, seed: int
+) -> None:
+    root = tmp_path_factory.mktemp("spikecv")
+    spikes = random_spikes(n, height, width, seed)
+    assert import_spikecv(write_spikecv(root / "cam", spikes), root / "out", rate_hz=40000.0) == 0
+    stream = open_stream_folder(root / "out")["cam"]
+    assert (stream.rate_hz, stream.n_ticks, stream.rows_bottom_up) == (40000.0, n, True)
+    np.testing.assert_array_equal(stream.window(0, n), spikes)
+    if height * width % 8 == 0:
+        assert (root / "out/cam.dat").read_bytes() == (root / "cam/a.dat").read_bytes()
+
+
+def test_rows_stored_top_down(tmp_path: Path) -> None:
+    spikes = random_spikes(9, 5, 11)
+    import_spikecv(write_spikecv(tmp_path / "cam", spikes), tmp_path / "out", rate_hz=1.0, rows_top_down=True)
+    np.testing.assert_array_equal(open_stream_folder(tmp_path / "out")["cam"].window(0, 9), spikes[:, ::-1])
+
+
+def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_spikecv(small_scene, tmp_path / "spikecv") == 0
+    assert "not in SpikeCV's format: 20000 ticks per second" in capsys.readouterr().out
+    config = yaml.safe_load((tmp_path / "spikecv/cam_01/config.yaml").read_text())
+    assert (config["filename"], config["spike_w"], config["spike_h"]) == ("cam_01.dat", WIDTH, HEIGHT)
+    transforms = tmp_path / "poses.json"
+    transforms.write_text(json.dumps({"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}))
+    arguments = {"rate_hz": 20000.0, "transforms": transforms, "radiance_gain": 0.6}
+    assert import_spikecv(tmp_path / "spikecv", tmp_path / "back", **arguments) == 0
+    scene, back = open_scene(small_scene), open_scene(tmp_path / "back")
+    assert (back.n_ticks, back.rate_hz, back.radiance_gain, back.targets) == (TICKS, 20000.0, 0.6, ())
+    assert back.train == tuple(scene.cameras) and back.test == ()
+    for camera in scene.cameras:
+        name = f"spikes/{camera}.dat"
+        assert (small_scene / name).read_bytes() == (tmp_path / "back" / name).read_bytes()
+        np.testing.assert_allclose(back.cameras[camera].w2c, scene.cameras[camera].w2c, atol=1e-12)
+    assert len(back.training.streams) == 4
+
+
+def test_export_has_no_padding_and_rows_bottom_up(tmp_path: Path) -> None:
+    spikes = random_spikes(30, 5, 13)
+    cameras = array_cameras(1, 13, 5)
+    transforms = tmp_path / "poses.json"
+    top = to_nerfstudio(cameras[0])
+    pose = {"camera": "cam", "transform_matrix": top.pop("transform_matrix")}
+    transforms.write_text(json.dumps({**top, "frames": [pose]}))  # intrinsics once at the top
+    source = write_spikecv(tmp_path / "cam", spikes[:, ::-1])
+    arguments = {"rate_hz": 20000.0, "transforms": transforms, "rows_top_down": True}
+    import_spikecv(source, tmp_path / "scene", **arguments)
+    assert (tmp_path / "scene/spikes/cam.dat").read_bytes() == pack(spikes, rows_bottom_up=False).tobytes()
+    export_spikecv(tmp_path / "scene", tmp_path / "out")
+    expected = np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tobytes()
+    assert (tmp_path / "out/cam/cam.dat").read_bytes() == expected
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(1, 1100), st.integers(1, 9), st.integers(8, 21), st.booleans(), st.integers(0, 9))
+def test_a_scene_of_any_size_goes_out_and_comes_back(
+    tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, top_down: bool, seed: int
+) -> None:
+    root, spikes = tmp_path_factory.mktemp("spikecv"), random_spikes(n, height, width, seed)
+    poses = {"frames": [{"camera": "cam", **to_nerfstudio(array_cameras(1, width, height)[0])}]}
+    (root / "poses.json").write_text(json.dumps(poses))
+    known = {"rate_hz": 20000.0, "transforms": root / "poses.json"}
+    source = write_spikecv(root / "cam", spikes[:, ::-1] if top_down else spikes)
+    import_spikecv(source, root / "scene", rows_top_down=top_down, **known)
+    np.testing.assert_array_equal(open_scene(root / "scene").stream("cam").window(0, n), spikes)
+    export_spikecv(root / "scene", root / "out")
+    import_spikecv(root / "out", root / "back", **known)
+    np.testing.assert_array_equal(open_scene(root / "back").stream("cam").window(0, n), spikes)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (None, "expected a folder with config.yaml"),
+        ("a: [", "config.yaml: expected a stream's description .YAML., found damaged text"),
+        ("just text", "config.yaml: expected filename, spike_w and spike_h"),
+        ("{filename: a.dat, spike_w: 11}", "config.yaml: expected filename, spike_w and spike_h, found no 'spike_h'"),
+        ("{filename: [a.dat, b.dat], spike_w: 11, spike_h: 5}", "config.yaml: expected .* of one stream"),
+        ("{filename: a.dat, spike_w: eleven, spike_h: 5}", "config.yaml: expected .* of one stream"),
+        ("{filename: b.dat, spike_w: 11, spike_h: 5}", "b.dat: expected the stream that config.yaml names, found no"),
+        ("{filename: a.dat, spike_w: 12, spike_h: 50}", r"a.dat: expected whole ticks of 12x50 pixels, found 62 bytes"),
+    ],
+)
+def test_bad_folders_are_refused_before_anything_is_written(tmp_path: Path, config: str | None, message: str) -> None:
+    folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
+    (folder / "config.yaml").unlink() if config is None else (folder / "config.yaml").write_text(config)
+    with pytest.raises(UserError, match=message) as error:
+        import_spikecv(folder, tmp_path / "out", rate_hz=20000.0)
+    assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+
+def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
+    camera = array_cameras(1, 11, 5)[0]
+    for name, n in (("cam_00", 9), ("cam_01", 8)):
+        write_spikecv(tmp_path / "in" / name, random_spikes(n, 5, 11))
+
+    def attempt(*frames: dict[str, object]) -> None:
+        (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
+        import_spikecv(tmp_path / "in", tmp_path / "out", rate_hz=1.0, transforms=tmp_path / "poses.json")
+
+    pose = to_nerfstudio(camera)
+    with pytest.raises(UserError, match=r"found none for cam_01 \(it has cam_00\)"):
+        attempt({"camera": "cam_00", **pose})
+    with pytest.raises(UserError, match="expected 11x5 pixels for cam_00, found 12x5"):
+        attempt({"camera": "cam_00", **pose, "w": 12}, {"camera": "cam_01", **pose})
+    with pytest.raises(UserError, match="one size and length for one scene, found 11x5x8 and 11x5x9"):
+        attempt({"camera": "cam_00", **pose}, {"camera": "cam_01", **pose})
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_refusals(tmp_path: Path, small_scene: Path) -> None:
+    folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
+    with pytest.raises(UserError, match="expected positive numbers, at most 1e.09, found 0, 1"):
+        import_spikecv(folder, tmp_path / "out", rate_hz=0)
+    for command in (lambda: import_spikecv(folder, folder, rate_hz=1.0), lambda: export_spikecv(small_scene, folder)):
+        with pytest.raises(UserError, match="expected a new or empty folder"):
+            command()
+    import_spikecv(folder, tmp_path / "out", rate_hz=1.0)
+    with open(tmp_path / "out/cam.dat", "ab") as file:
+        file.truncate(7 * 7)
+    with pytest.raises(UserError, match="cam.dat: expected 9 ticks, found 7; the stream is truncated"):
+        open_stream_folder(tmp_path / "out")
+    (tmp_path / "out/stream.json").write_text('{"schema": "other"}')
+    with pytest.raises(UserError, match="stream.json: expected schema 'spike4dgs-streams/1', found 'other'"):
+        open_stream_folder(tmp_path / "out")
+    (tmp_path / "out/stream.json").write_text('{"schema": "spike4dgs-streams/1", "streams": {"cam": {}}}')
+    with pytest.raises(UserError, match="stream.json: expected file, width"):
+        open_stream_folder(tmp_path / "out")

@@ -1,0 +1,385 @@
+"""Downloads from a local HTTP server that cuts, flips, fails, and from a process that is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_hub import REPOSITORY, serve_hub
+from range_server import Behaviour, serve
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.release import scenes as scenes_module
+from spike4dgs.benchmark.release import source as source_module
+from spike4dgs.benchmark.release.index import BLOCK
+from spike4dgs.benchmark.release.scenes import Report, download, open_release
+from spike4dgs.benchmark.release.selection import Selection
+from spike4dgs.benchmark.release.source import Patience, Source
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.folder import open_stream_folder
+from spike4dgs.cli import main
+
+HASTE = Patience(first_wait_s=0.001, longest_wait_s=0.002)
+
+
+def fetch(
+    address: str, out: Path, selection: Selection | None = None, workers: int = 4, patience: Patience = HASTE
+) -> Report:
+    source = Source(address, patience)
+    return download(source, open_release(source), selection or Selection(), out, workers)
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != ".download.lock")
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.fixture(scope="session")
+def whole(packed: tuple[Path, object], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What a download from the folder itself gives."""
+    out = tmp_path_factory.mktemp("whole")
+    fetch(str(packed[0]), out)
+    return tree(out)
+
+
+def total(files: dict[str, bytes]) -> int:
+    return sum(map(len, files.values()))
+
+
+def test_scenes_come_out_as_they_were(whole: dict[str, bytes], scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
+    for root in scene_folders:
+        for path in root.glob("spikes/*.dat"):
+            assert whole[f"{root.name}/spikes/{path.name}"] == path.read_bytes()
+    assert {name for name in whole if name.startswith("pattern-1/")} == {
+        f"pattern-1/{p.relative_to(scene_folders[1])}" for p in scene_folders[1].rglob("*") if p.is_file()
+    }
+
+
+@pytest.mark.parametrize("scheme", ["path", "file", "memory"])
+def test_any_file_system_of_fsspec_serves(
+    scheme: str, release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    address = {"path": str(release_folder), "file": f"file://{release_folder}", "memory": "memory://releases/1"}[scheme]
+    if scheme == "memory":
+        import fsspec
+
+        fsspec.filesystem("memory").put(str(release_folder), "/releases/1", recursive=True)
+    fetch(address, tmp_path)
+    assert tree(tmp_path) == whole
+
+
+def test_hugging_face_serves(release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    """Through huggingface_hub's own file system, with a server of this machine in the hub's place."""
+    pytest.importorskip("huggingface_hub")
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = ["download", "all", "--from", f"hf://datasets/{REPOSITORY}", "--out", str(tmp_path)]
+    with serve_hub(release_folder) as (endpoint, seen):
+        hub = {"HF_ENDPOINT": endpoint, "HF_HUB_DISABLE_TELEMETRY": "1", "HF_HOME": str(tmp_path.with_suffix(".hub"))}
+        done = subprocess.run([sys.executable, "-c", code, *command], env=os.environ | hub, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert tree(tmp_path) == whole
+    assert len(seen.asked(".tar")) <= 8 and None not in seen.asked(".tar")
+
+
+def test_over_http_in_few_requests(release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    with serve(release_folder) as (address, seen):
+        report = fetch(address, tmp_path)
+    assert tree(tmp_path) == whole
+    assert report.fetched == total(whole)
+    assert report.requests == len(seen.requests)
+    assert len(seen.asked(".tar")) <= 8, "neighbours share a request"
+    again = fetch(str(release_folder), tmp_path)
+    assert again.fetched == 0, "nothing is fetched twice"
+
+
+def test_ten_cuts_cost_nothing_but_time(release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    with serve(release_folder, Behaviour(cuts=10, cut_after=300_000)) as (address, seen):
+        fetch(address, tmp_path, workers=2, patience=replace(HASTE, tries=11))  # all may hit one block
+    assert seen.cuts == 0
+    assert tree(tmp_path) == whole
+
+
+def test_flipped_bits_are_fetched_again(release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    with serve(release_folder, Behaviour(flips=3)) as (address, seen):
+        report = fetch(address, tmp_path)
+    assert tree(tmp_path) == whole
+    assert report.fetched == total(whole), "what was damaged does not count as fetched"
+    assert any(asked and _length(asked) <= BLOCK for asked in seen.asked()), "a damaged block is fetched alone"
+
+
+def _length(asked: str) -> int:
+    start, stop = asked.removeprefix("bytes=").split("-")
+    return int(stop) + 1 - int(start)
+
+
+def test_a_damaged_copy_is_an_error_after_three_tries(
+    release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    described = json.loads(sorted(release_folder.glob("shards/*/*.json"))[0].read_text())
+    suffix = Path(described["shard"]).name
+    member = next(f for f in described["files"] if f["path"] == "spikes/cam_00.dat")
+    with serve(release_folder, Behaviour(suffix, flip_at=member["offset"] + BLOCK + 5)) as (address, _):
+        with pytest.raises(UserError, match=r"pattern-0/spikes/cam_00.dat: expected bytes with sha256 .* 3 times"):
+            fetch(address, tmp_path)
+    assert not (tmp_path / "pattern-0/spikes/cam_00.dat").exists()
+    assert not (tmp_path / "pattern-0/manifest.json").exists(), "the scene is unfinished"
+    with serve(release_folder) as (address, seen):
+        report = fetch(address, tmp_path)
+    assert 0 < report.fetched <= total(whole) - BLOCK, "the good blocks of that file stayed"
+    assert tree(tmp_path) == whole
+
+
+def test_a_server_that_is_away_for_a_while(release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    with serve(release_folder, Behaviour(failures=[503, 429, 500, 408])) as (address, _):
+        fetch(address, tmp_path)
+    assert tree(tmp_path) == whole
+    with serve(release_folder, Behaviour(suffix="", failures=[503] * 50)) as (address, _):
+        with pytest.raises(UserError, match=r"release.json: expected an answer, found .*, 8 times in a row; check"):
+            fetch(address, tmp_path / "never")
+
+
+@pytest.mark.parametrize("status", [401, 403, 410])
+def test_a_refusal_is_not_tried_again(status: int, release_folder: Path, tmp_path: Path) -> None:
+    with serve(release_folder, Behaviour(suffix="", failures=[status] * 9)) as (address, seen):
+        with pytest.raises(UserError, match="release.json: expected an answer, found"):
+            fetch(address, tmp_path)
+        assert len(seen.requests) == 1
+
+
+def test_no_server_and_no_release(release_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected an answer, found ClientConnectorError"):
+        fetch("http://127.0.0.1:1", tmp_path)
+    with pytest.raises(UserError, match=r"release.json: expected a file, found no such file; check the address"):
+        fetch(str(tmp_path), tmp_path)
+    with serve(release_folder) as (address, _), pytest.raises(UserError, match="found no such file"):
+        fetch(f"{address}/other", tmp_path)
+    with pytest.raises(UserError, match="expected an address"):
+        fetch("nonsense://x/y", tmp_path)
+
+
+def test_a_server_without_ranges_is_refused_in_one_line(release_folder: Path, tmp_path: Path) -> None:
+    with serve(release_folder, Behaviour(ranges=False)) as (address, _):
+        with pytest.raises(UserError, match="expected a server that sends parts of a file, found one that does not"):
+            fetch(address, tmp_path)
+
+
+def test_a_damaged_index_is_refused(release_folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(release_folder, tmp_path / "copy"))
+    path = sorted(copy.glob("shards/*/*.json"))[0]
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(UserError, match=r"00000.json: expected sha256 .*, found .*; the server's copy is damaged"):
+        fetch(str(copy), tmp_path / "out")
+    data = json.loads((copy / "release.json").read_text())
+    data["scenes"][0]["id"] = "../../elsewhere"
+    (copy / "release.json").write_text(json.dumps(data))
+    with pytest.raises(UserError, match="at scenes/0/id"):
+        fetch(str(copy), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"path": "manifest.json"', '"path": "notes.json"', "expected manifest.json of pattern-0, found none"),
+        ('"path": "scene.json"', '"path": "README.md"', "expected distinct files, found one twice"),
+        ('"path": "scene.json"', '"path": "../scene.json"', "at files/[0-9]+/path: '../scene.json' does not match"),
+        ('"path": "scene.json"', '"path": "/scene.json"', "at files/[0-9]+/path: '/scene.json' does not match"),
+        ('"camera": "cam_00"', '"camera": "../cam"', "at files/[0-9]+/camera"),
+    ],
+)
+def test_a_hostile_index_is_refused(old: str, new: str, words: str, release_folder: Path, tmp_path: Path) -> None:
+    """Its hash is the one that release.json has: whoever made it made both."""
+    copy = Path(shutil.copytree(release_folder, tmp_path / "copy"))
+    path = sorted(copy.glob("shards/*/*.json"))[0]
+    before = sha256_file(path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    top = copy / "release.json"
+    top.write_text(top.read_text().replace(before, sha256_file(path)))
+    with pytest.raises(UserError, match=words):
+        fetch(str(copy), tmp_path / "out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "out"]
+
+
+def test_a_pinned_release(release_folder: Path, release: object) -> None:
+    source = Source(str(release_folder))
+    assert open_release(source, release.sha256) == release  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match=f"expected sha256 {'0' * 64}, found"):
+        open_release(source, "0" * 64)
+
+
+class TestSelection:
+    def test_parts_of_one_camera(self, release_folder: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+        with serve(release_folder) as (address, seen):
+            chosen = Selection(("pattern-1",), ("cam_02",), ("spikes",))
+            report = fetch(address, tmp_path, chosen)
+        got = tree(tmp_path)
+        assert got == {name: whole[name] for name in got}
+        top = {name for name in whole if name.startswith("pattern-1/") and name.count("/") == 1}
+        assert set(got) == {*top, "pattern-1/spikes/cam_02.dat"}
+        assert report.fetched == total(got)
+        assert len(seen.asked()) == 2
+        fetch(str(release_folder), tmp_path, Selection(("pattern-1",)))
+        assert tree(tmp_path) == {n: d for n, d in whole.items() if n.startswith("pattern-1/")}, "the rest comes later"
+
+    @pytest.mark.parametrize("window", [(0.0, 20.0), (100.0, 120.0), (437.55, 457.55), (990.0, 1000.0)])
+    def test_a_cameras_window_in_one_request(
+        self, window: tuple[float, float], release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
+    ) -> None:
+        with serve(release_folder) as (address, seen):
+            report = fetch(address, tmp_path, Selection(("pattern-0",), ("cam_01",), (), window))
+        assert len(seen.asked()) == 1
+        (stream,) = open_stream_folder(report.folders[0]).values()
+        first, stop = round(window[0] * 20), round(window[1] * 20)
+        assert np.array_equal(stream.packed, open_scene(scene_folders[0]).stream("cam_01").packed[first:stop])
+        assert report.fetched <= 2 * BLOCK
+        facts = json.loads((report.folders[0] / "stream.json").read_text())["excerpt"]
+        assert (facts["scene"], facts["first_tick"], facts["n_ticks"]) == ("pattern-0", first, stop - first)
+        assert not list(tmp_path.rglob(".*.part"))
+        with serve(release_folder) as (address, seen):
+            fetch(address, tmp_path, Selection(("pattern-0",), ("cam_01",), (), window))
+        assert seen.asked() == [], "it is there"
+
+    def test_what_the_release_has_not(self, release_folder: Path, tmp_path: Path) -> None:
+        for chosen, words in (
+            (Selection(("car",)), "--scenes: expected names among pattern-0, pattern-1"),
+            (Selection((), ("cam_77",)), "--cameras: expected names among cam_00"),
+            (Selection((), (), ("sound",)), "--parts: expected names among calibration, description, images"),
+            (Selection(("pattern-0",), (), (), (990.0, 2000.0)), None),
+            (Selection((), (), (), (1000.0, 1001.0)), "--window-ms: expected milliseconds from 0 to 1000"),
+            (Selection((), (), ("spikes",), (0.0, 1.0)), "--window-ms: expected no --parts beside it"),
+        ):
+            if words is None:
+                fetch(str(release_folder), tmp_path, chosen)
+                continue
+            with pytest.raises(UserError, match=words):
+                fetch(str(release_folder), tmp_path / "out", chosen)
+
+
+class TestWhatIsThere:
+    def test_damaged_files_are_mended_block_by_block(
+        self, release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+    ) -> None:
+        fetch(str(release_folder), tmp_path)
+        long, short = tmp_path / "pattern-0/spikes/cam_00.dat", tmp_path / "pattern-1/scene.json"
+        data = bytearray(long.read_bytes())
+        data[BLOCK + 7] ^= 1
+        long.write_bytes(data + b"more")
+        short.write_bytes(b"{}")
+        report = fetch(str(release_folder), tmp_path)
+        assert tree(tmp_path) == whole
+        assert report.fetched == BLOCK + len(whole["pattern-1/scene.json"])
+
+    def test_other_scenes_are_not_overwritten(self, release_folder: Path, tmp_path: Path) -> None:
+        (tmp_path / "pattern-0").mkdir()
+        (tmp_path / "pattern-0/notes.txt").write_text("mine")
+        with pytest.raises(UserError, match="pattern-0: expected this version of the scene, or no folder"):
+            fetch(str(release_folder), tmp_path)
+        (tmp_path / "pattern-0/manifest.json").write_text("{}")
+        with pytest.raises(UserError, match="pattern-0: expected this version of the scene, or no folder"):
+            fetch(str(release_folder), tmp_path)
+
+    def test_a_part_of_another_release_does_no_harm(
+        self, release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+    ) -> None:
+        with serve(release_folder, Behaviour(failures=[403])) as (address, _), pytest.raises(UserError):
+            fetch(address, tmp_path, workers=1)
+        part = tmp_path / "pattern-0/spikes/.cam_00.dat.part"
+        part.parent.mkdir(exist_ok=True)
+        part.write_bytes(bytes(5 * BLOCK))
+        fetch(str(release_folder), tmp_path)
+        assert tree(tmp_path) == whole
+
+
+class TestDisk:
+    def test_room_is_looked_for_first(
+        self, release_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        usage = shutil.disk_usage(tmp_path)._replace(free=1_000_000)
+        monkeypatch.setattr(scenes_module.shutil, "disk_usage", lambda path: usage)
+        with serve(release_folder) as (address, seen):
+            with pytest.raises(UserError, match=r"expected 1?\d\.\d MB of free disk space, found 1.0 MB; free some"):
+                fetch(address, tmp_path)
+            assert seen.asked() == []
+
+    def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+        self, release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+    ) -> None:
+        """Files end at 1.5 MB in that process, as on a disk that is full."""
+        code = (
+            "import resource, sys; from spike4dgs.cli import main\n"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))\n"
+            "sys.exit(main(sys.argv[1:]))"
+        )
+        command = ["download", "all", "--from", str(release_folder), "--out", str(tmp_path)]
+        done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 2
+        assert "expected room for the file, found file too large; free some disk space" in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        got = tree(tmp_path)
+        finished = {name: data for name, data in got.items() if not name.rpartition("/")[2].startswith(".")}
+        assert finished == {name: whole[name] for name in finished}
+        assert "pattern-0/manifest.json" not in finished
+        report = fetch(str(release_folder), tmp_path)
+        assert tree(tmp_path) == whole
+        assert report.fetched < total(whole), "it went on where it stopped"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_killed_download_goes_on_bit_exact(
+    seed: int, release_folder: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    rng = random.Random(seed)
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
+    with serve(release_folder, Behaviour(pause_s=0.01)) as (address, _):
+        command = [sys.executable, "-c", code, "download", "all", "--from", address, "--out", str(tmp_path)]
+        limit = time.monotonic() + 60
+        running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        enough = rng.randrange(1, total(whole) - 3_000_000)
+        while running.poll() is None and total(tree_of_parts(tmp_path)) < enough and time.monotonic() < limit:
+            time.sleep(0.005)
+        running.send_signal(signal.SIGKILL)
+        assert running.wait() == -9, "it was killed before its end"
+    got = tree(tmp_path)
+    finished = {name: data for name, data in got.items() if not name.rpartition("/")[2].startswith(".")}
+    assert finished == {name: whole[name] for name in finished}, "what has its name is whole"
+    report = fetch(str(release_folder), tmp_path)
+    assert tree(tmp_path) == whole
+    assert report.fetched < total(whole), "it went on where it was"
+
+
+def tree_of_parts(root: Path) -> dict[str, bytes]:
+    """The files that can be read just now."""
+    found = {}
+    for path in root.rglob("*"):
+        try:
+            found[str(path)] = path.read_bytes() if path.is_file() else b""
+        except OSError:  # it was renamed meanwhile
+            continue
+    return found
+
+
+def test_two_downloads_do_not_share_a_folder(release_folder: Path, tmp_path: Path) -> None:
+    from spike4dgs.benchmark.locks import locked
+
+    with locked(tmp_path / ".download.lock", tmp_path, "free"), pytest.raises(UserError, match="a run in progress"):
+        fetch(str(release_folder), tmp_path)
+
+
+def test_without_an_address_there_is_no_server(
+    tmp_path: Path, release_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv(source_module.VARIABLE, raising=False)
+    assert main(["download", "all", "--out", str(tmp_path)]) == 2
+    assert "there is no public server yet: add --from ADDRESS" in capsys.readouterr().err
+    monkeypatch.setenv(source_module.VARIABLE, str(release_folder))
+    assert main(["download", "all", "--scenes", "pattern-1", "--parts", "images", "--out", str(tmp_path)]) == 0

@@ -1,0 +1,66 @@
+"""The scenes of a track: found, fetched, or refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from range_server import serve
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.release import source as source_module
+from spike4dgs.benchmark.release.download_command import make_download
+from spike4dgs.benchmark.release.index import Release
+from spike4dgs.benchmark.release.track import track_folders
+
+
+@pytest.fixture
+def revisions(release: Release) -> dict[str, str]:
+    return {scene: entry.revision for scene, entry in release.scenes.items()}
+
+
+def test_what_is_missing_is_fetched(
+    revisions: dict[str, str], release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
+) -> None:
+    shutil.copytree(scene_folders[0], tmp_path / "pattern-0")
+    with serve(release_folder) as (address, seen):
+        assert track_folders(revisions, tmp_path, address) == (tmp_path / "pattern-0", tmp_path / "pattern-1")
+        assert seen.requests
+        seen.requests.clear()
+        track_folders(revisions, tmp_path, address)
+        assert not seen.requests, "nothing is missing now"
+        (tmp_path / "pattern-1/spikes/cam_00.dat").unlink()
+        track_folders(revisions, tmp_path, address)
+        assert (tmp_path / "pattern-1/spikes/cam_00.dat").is_file()
+
+
+def test_another_revision_is_refused(
+    revisions: dict[str, str], release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
+) -> None:
+    shutil.copytree(scene_folders[0], tmp_path / "pattern-0")
+    other = revisions | {"pattern-0": "0" * 64}
+    with pytest.raises(UserError, match=f"pattern-0: expected revision {'0' * 64} of the track, found"):
+        track_folders(other, tmp_path, str(release_folder))
+    with pytest.raises(UserError, match=f"expected pattern-0 in revision {'0' * 64}, found .*; name another release"):
+        track_folders(other, tmp_path / "new", str(release_folder))
+    with pytest.raises(UserError, match="expected moon-0 in revision 11, found no such scene"):
+        track_folders({"moon-0": "11"}, tmp_path / "new", str(release_folder))
+
+
+def test_without_a_server_the_scenes_are_named(
+    revisions: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(source_module.VARIABLE, raising=False)
+    with pytest.raises(UserError, match="a release with pattern-0, pattern-1, found none; there is no public server"):
+        track_folders(revisions, tmp_path, None)
+
+
+def test_the_command_takes_a_tracks_scenes(revisions: dict[str, str], release_folder: Path, tmp_path: Path) -> None:
+    command = make_download(lambda name: {"pattern-1": revisions["pattern-1"]})
+    assert command("outdoor", source=str(release_folder), out=tmp_path, parts=("images",)) == 0
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["pattern-1"]
+    with pytest.raises(UserError, match="--scenes: expected scenes of outdoor: pattern-1, found pattern-0"):
+        command("outdoor", source=str(release_folder), out=tmp_path, scenes=("pattern-0",))
+    with pytest.raises(UserError, match="expected pattern-1 in revision 22"):
+        make_download(lambda name: {"pattern-1": "22"})("outdoor", source=str(release_folder), out=tmp_path / "new")

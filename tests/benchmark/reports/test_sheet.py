@@ -1,0 +1,136 @@
+"""The sheet: every pixel is a scored one, scales are what they say, and text is text and inside the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+from pypdf import PdfReader
+from sheets import Results, write_results
+
+from spike4dgs.benchmark.reports.error_map import OFF_SCALE, SCALES, absolute_error
+from spike4dgs.benchmark.reports.panels import Panels, make_panels
+from spike4dgs.benchmark.reports.sheet import make_sheet, write_sheet
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
+
+NOISE = {"worse": 0.15, "spk2img+colmap+spacetime-with-a-very-long-name+again": 0.02, "fine": 0.003}
+REASON = "ValueError: " + "no luck with this one, which has a long story; " * 40
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return write_results(tmp_path_factory.mktemp("results"), NOISE, {"bad": REASON})
+
+
+@pytest.fixture(scope="module")
+def panels(results: Results) -> Panels:
+    return make_panels(results.scene, results.folders, results.records)
+
+
+@pytest.fixture(scope="module")
+def figure(panels: Panels) -> Figure:
+    return make_sheet(panels)
+
+
+def images(figure: Figure) -> list[np.ndarray]:
+    return [np.asarray(i.get_array()) for axes in figure.axes for i in axes.images]
+
+
+def texts(figure: Figure) -> list[Text]:
+    every = [*figure.texts, *(t for a in figure.axes for t in a.get_yticklabels(which="both"))]
+    return [t for t in every if t.get_text() and t.get_visible()]
+
+
+def test_panels_are_the_crops_of_what_was_scored(results: Results, panels: Panels, figure: Figure) -> None:
+    shown = images(figure)
+    box = panels.boxes[0]
+    assert panels.size == (24, 24) and panels.is_cropped
+    for k, target in enumerate(results.scene.targets):
+        assert box.of(results.scene.moving(target)).sum() == results.scene.moving(target).sum(), "nothing is cut off"
+        truth = results.scene.ground_truth(target)
+        for name in NOISE:
+            image = read_exr(results.folders[name] / f"{target.name}.exr")
+            part = encode_srgb(image)[box.y : box.y + 24, box.x : box.x + 24]
+            assert any(np.array_equal(part, other) for other in shown), f"{name} at {k}"
+        assert any(np.array_equal(encode_srgb(truth), other) for other in shown), "the whole picture, too"
+    rectangles = [p for a in figure.axes for p in a.patches if isinstance(p, Rectangle)]
+    assert [(r.get_x() + 0.5, r.get_y() + 0.5, r.get_width(), r.get_height()) for r in rectangles] == [tuple(box)] * 3
+
+
+def test_the_scale_is_the_one_that_is_shown(results: Results, panels: Panels, figure: Figure) -> None:
+    assert panels.scales == {"worse": 0.3, list(NOISE)[1]: 0.1, "fine": 0.01}
+    target, box = results.scene.targets[1], panels.boxes[1]
+    truth = box.of(results.scene.ground_truth(target))
+    for name, scale in panels.scales.items():
+        every = [absolute_error(panels.render(name, k), panels.truth(k)) for k in range(3)]
+        beyond = [np.mean(np.stack(every) > s) for s in SCALES]
+        assert beyond[SCALES.index(scale)] <= OFF_SCALE or scale == max(SCALES)
+        assert all(b > OFF_SCALE for b, s in zip(beyond, SCALES, strict=True) if s < scale), "the smallest that does"
+        image = box.of(read_exr(results.folders[name] / f"{target.name}.exr"))
+        error = np.abs(image.clip(0, 1) - truth.clip(0, 1))
+        expected = colormaps["magma"](np.clip(error / scale, 0, 1))[..., :3] * 255
+        shown = min((i for i in images(figure) if i.shape == expected.shape), key=lambda i: abs(i - expected).max())
+        assert np.abs(shown - expected).max() < 8, "half a step of 255 colours"
+    bars = [a for a in figure.axes if any(t.get_text() == "0" for t in a.get_yticklabels())]
+    assert [tops(bar) for bar in bars] == ["0.3", "0.1", "0.01"]
+    assert [bar.get_ylim()[1] for bar in bars] == [0.3, 0.1, 0.01]
+    names = [t.get_text() for t in figure.texts if t.get_text().startswith("error \N{MULTIPLICATION SIGN}")]
+    assert names == [f"error \N{MULTIPLICATION SIGN}{k}" for k in (1, 3, 30)]
+
+
+def tops(bar: Axes) -> str:
+    return [str(t.get_text()) for t in bar.get_yticklabels()][-1]
+
+
+def test_nothing_is_cut_off_and_no_text_lies_on_another(figure: Figure) -> None:
+    page = figure.bbox
+    boxes = [(t.get_text(), t.get_window_extent()) for t in texts(figure)]
+    assert len(boxes) > 20
+    for text, box in boxes:
+        assert page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1, text
+    for i, (text, a) in enumerate(boxes):
+        for other, b in boxes[i + 1 :]:
+            width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+            assert width <= 0 or height <= 2, f"{text} | {other}"  # boxes have room for letters below the line
+    for axes in figure.axes:
+        for text, box in boxes:
+            if text.split()[0] in "".join(NOISE):
+                assert not axes.bbox.overlaps(box) or box.x0 >= axes.bbox.x1 or box.x1 <= axes.bbox.x0, text
+
+
+def test_the_pdf_has_text_as_text_inside_its_page(results: Results, tmp_path: Path) -> None:
+    write_sheet(tmp_path / "sheet.png", results.scene, results.folders, results.records)
+    page = PdfReader(tmp_path / "sheet.pdf").pages[0]
+    found: list[tuple[str, float, float]] = []
+
+    def visit(text: str, cm: Any, tm: list[float], font: Any, size: float) -> None:
+        if text.strip():
+            found.append((text.strip(), tm[4] * cm[0] + cm[4], tm[5] * cm[3] + cm[5]))
+
+    page.extract_text(visitor_text=visit)
+    together = "".join(text for text, _, _ in found).replace("\n", "")
+    for name in (*NOISE, "ground truth", "bad", "failed: ValueError: no luck", "PSNR 33.98 dB, moving 32.98 dB"):
+        assert name in together
+    assert all(0 <= x <= page.mediabox.width and 0 <= y <= page.mediabox.height for _, x, y in found)
+    embedded = {i.image.size for i in page.images if i.image}
+    assert (24, 24) in embedded, "images keep their own pixels"
+    before = (tmp_path / "sheet.pdf").read_bytes()
+    write_sheet(tmp_path / "sheet.png", results.scene, results.folders, results.records)
+    assert (tmp_path / "sheet.pdf").read_bytes() == before, "the same sheet is the same file"
+
+
+def test_a_sheet_of_many_methods_grows(tmp_path: Path) -> None:
+    many = write_results(tmp_path, {f"method+{i:02d}": 0.02 for i in range(14)})
+    figure = make_sheet(make_panels(many.scene, many.folders, many.records))
+    shown = {t.get_text() for t in figure.texts}
+    assert all(f"method+{i:02d}" in shown for i in range(14))
+    rows = sorted({round(a.bbox.y0) for a in figure.axes})
+    assert len(rows) == 15 and min(np.diff(rows)) > 150, "each as large as in a small sheet"
+    test_nothing_is_cut_off_and_no_text_lies_on_another(figure)

@@ -1,0 +1,84 @@
+"""Training bursts on disk: the format, and damaged files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_bursts import toy_burst, write_toy_shard
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.training_bursts import (
+    open_bursts,
+    open_folder,
+    write_bursts,
+)
+from spike4dgs.generators.msdi_data.rig_jitter import jittered_cameras
+from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.worlds import WORLDS
+
+
+def test_jittered_rigs_stay_near_the_worlds_own() -> None:
+    world = WORLDS["turntable"].build(0, 13, 0.1)
+    own = cameras(world, 104, 64)
+    none = jittered_cameras(world, 104, 64, np.random.default_rng(0), 0.0)
+    for a, b in zip(own, none, strict=True):
+        np.testing.assert_allclose(a.w2c, b.w2c, atol=1e-9)
+        assert a.fx == pytest.approx(b.fx)
+    target = np.array(world.rig.target)
+    distance = np.linalg.norm(own[4].center - target)
+    seen = set()
+    for seed in range(20):
+        rig = jittered_cameras(world, 104, 64, np.random.default_rng(seed))
+        for camera in rig:
+            np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
+            assert 0.5 * distance < np.linalg.norm(camera.center - target) < 2 * distance
+            uv, z = camera.project(target[None])
+            assert z[0] > 0 and np.abs(uv[0] - (52, 32)).max() < 80
+            assert camera.center[2] > 0
+        seen.add(tuple(rig[0].center))
+    assert len(seen) == 20
+
+
+def test_bursts_survive_as_half_floats(tmp_path: Path) -> None:
+    file = open_bursts(write_toy_shard(tmp_path, 13))
+    assert len(file) == 2 and file.facts.id == "toy-13" and not file.facts.hidden
+    for number, t in enumerate((0.3, 0.7)):
+        expected, found = toy_burst(ToyWorld(width=32, height=24, seed=13), t), file.read(number)
+        np.testing.assert_array_equal(found.moving, expected.moving)
+        np.testing.assert_array_equal(found.w2c, expected.w2c)
+        np.testing.assert_array_equal(found.K, expected.K)
+        for name in ("keys", "depth", "gain", "dark"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, err_msg=name)
+            assert getattr(found, name).dtype == np.float32
+
+
+def test_equal_bursts_give_equal_files(tmp_path: Path) -> None:
+    one, two = (write_toy_shard(tmp_path / name, 13) for name in "ab")
+    assert one.read_bytes() == two.read_bytes()
+    assert open_bursts(one).sha256 != open_bursts(write_toy_shard(tmp_path, 14)).sha256
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
+    path = write_toy_shard(tmp_path, 13)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    with pytest.raises(UserError, match="expected training bursts, found damaged data"):
+        open_bursts(path)
+    path.write_bytes(whole.replace(b"spike4dgs-bursts/1", b"spike4dgs-bursts/9"))
+    with pytest.raises(UserError, match="expected metadata spike4dgs-bursts/1, found spike4dgs-bursts/9"):
+        open_bursts(path)
+    path.write_bytes(whole.replace(b"values.0.1", b"values.0.7"))
+    with pytest.raises(UserError, match="expected training bursts, found damaged data"):
+        open_bursts(path).read(1)
+    with pytest.raises(UserError, match="expected a folder of training bursts, found no"):
+        open_folder(tmp_path / "empty")
+
+
+def test_radiance_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
+    facts = open_bursts(write_toy_shard(tmp_path, 13)).facts
+    with pytest.raises(UserError, match="expected finite radiances, found 1 that are not in values"):
+        write_bursts(tmp_path / "x.safetensors", facts, {"values.0.0": np.array([1, np.nan], np.float16)})
+    assert not (tmp_path / "x.safetensors").exists()

@@ -1,0 +1,78 @@
+"""What a manifest says of contents is believed on opening, and checked by `verify`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from full_scene import write_full_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file, write_json
+from spike4dgs.benchmark.scene.manifest import read_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.verify import verify, verify_content
+
+TRUTH = "images/cam_03/000020.exr"
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> Path:
+    return write_full_scene(tmp_path / "scene")
+
+
+def edit_manifest(root: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
+    data = json.loads((root / "manifest.json").read_text())
+    edit(data["files"])
+    write_json(root / "manifest.json", data)
+
+
+def test_a_forged_content_is_found(full: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    honest = open_scene(full).revision
+    other = full / "images/cam_03/000040.exr"
+    (full / TRUTH).write_bytes(other.read_bytes())  # easier truth, under the honest scene's revision
+    facts = {"bytes": other.stat().st_size, "sha256": sha256_file(other)}
+    edit_manifest(full, lambda files: files[TRUTH].update(facts))
+    forged = open_scene(full)
+    assert forged.revision == honest and list(forged.manifest.problems()) == []
+    (line,) = verify_content(forged)
+    assert "000020.exr: expected content" in line
+    assert verify((full,)) == 2 and "the manifest claims another content" in capsys.readouterr().err
+
+
+def test_a_stream_has_no_content_but_its_bytes(full: Path) -> None:
+    honest = open_scene(full).revision
+    stream = full / "spikes/cam_00.dat"
+    stream.write_bytes(stream.read_bytes()[::-1])
+    facts = {"sha256": sha256_file(stream), "content": read_manifest(full).files["spikes/cam_00.dat"][1]}
+    edit_manifest(full, lambda files: files["spikes/cam_00.dat"].update(facts))
+    assert open_scene(full).revision != honest
+
+
+def test_missing_and_changed_data_are_found_without_the_other_files(full: Path) -> None:
+    scene = open_scene(full)
+    (full / "README.md").unlink()
+    assert list(verify_content(scene)) == []
+    (full / "truth/cam_02.npz").unlink()
+    (full / TRUTH).write_bytes((full / "images/cam_03/000040.exr").read_bytes())
+    lines = list(verify_content(open_scene(full)))
+    assert [name for name in ("cam_02.npz", "000020.exr") for line in lines if name in line] == [
+        "cam_02.npz",
+        "000020.exr",
+    ]
+
+
+@pytest.mark.parametrize("name", ["../outside", "/etc/passwd", "a/../../b", "a//b", "./a", "a\\..\\b", "..", "", "."])
+def test_a_path_that_leaves_the_folder_is_refused(full: Path, name: str) -> None:
+    edit_manifest(full, lambda files: files.update({name: {"bytes": 1, "sha256": "0" * 64}}))
+    with pytest.raises(UserError, match=r"manifest.json: expected paths inside the scene folder"):
+        open_scene(full)
+
+
+def test_a_content_that_is_no_hash_is_refused(full: Path) -> None:
+    edit_manifest(full, lambda files: files[TRUTH].update(content="abc"))
+    with pytest.raises(UserError, match=f"64 hex digits as the content of {TRUTH}"):
+        open_scene(full)

@@ -1,0 +1,223 @@
+"""`run-benchmark`, as the command line calls it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from dummy_methods import CountMethod, FailingMethod
+from PIL import Image
+from small_scenes import write_small_scene
+
+from spike4dgs.benchmark import plugins
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.cli import load
+
+run_benchmark = load("run-benchmark")
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two methods and a failing one, found as those of another package are: by entry point."""
+    methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
+    methods["bad"] = FailingMethod("bad", ValueError("no luck"))
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+
+
+@pytest.mark.usefixtures("installed")
+def test_run_benchmark_leaves_results_images_and_entries(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5")
+    assert code == 0
+    text = capsys.readouterr().out
+    assert "quick+counts" in text and "Results" in text and "re-scored, rank 1 of" in text
+    for name in ("sheet_pattern-0", "scatter"):
+        with Image.open(out / f"{name}.png") as image:
+            assert min(image.size) > 300
+        assert (out / f"{name}.pdf").read_bytes().startswith(b"%PDF-")
+    assert cv2.VideoCapture(str(out / "sheet_pattern-0.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3, "one for each target"
+    rows = json.loads((out / "leaderboard/local.json").read_text())["boards"][0]["rows"]
+    assert [(r["rank"], r["label"]) for r in rows] == [(1, "re-scored"), (2, "re-scored")]
+    assert text.count("local board, in") == 1, "one line says that no track has this scene"
+    record = json.loads((out / "results/counts.json").read_text())
+    assert record["scenes"]["pattern-0"]["budget"] == 0.5
+
+
+@pytest.mark.usefixtures("installed")
+def test_ranks_are_printed_once_and_are_the_final_ones(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("counts", "quick+counts", "bad")
+    assert run_benchmark((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
+    text = capsys.readouterr().out
+    shown = dict(re.findall(r"^(\S+): .*, (rank \d of 2|not ranked) .*on the local board", text, re.MULTILINE))
+    rows = json.loads((tmp_path / "out/leaderboard/local.json").read_text())["boards"][0]["rows"]
+    assert shown == {r["method"]: f"rank {r['rank']} of 2" if r["rank"] else "not ranked" for r in rows}
+    assert text.index("results.csv") < text.index("rank ") and text.count("rank ") == 2
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_run_with_another_method_adds_to_what_is_there(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+
+    def go(*methods: str, **options: Any) -> str:
+        assert run_benchmark((small_scene,), methods=methods, out=out, device="cpu", metrics=("psnr",), **options) == 0
+        return capsys.readouterr().out
+
+    def rows() -> list[dict[str, str]]:
+        return list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+
+    def height() -> int:
+        with Image.open(out / "sheet_pattern-0.png") as image:
+            return image.height
+
+    go("counts")
+    alone, one = rows(), height()
+    assert [r["method"] for r in alone] == ["counts"]
+    text = go("quick+counts")
+    assert [r["method"] for r in rows()] == ["counts", "quick+counts"] and rows()[0] == alone[0]
+    assert height() > 1.2 * one
+    table = text.partition("Results")[2].partition("images:")[0]
+    assert {"counts", "quick+counts"} <= set(table.split())
+    for row in rows():
+        record = json.loads((out / f"results/{row['method']}.json").read_text())
+        cell = record["scenes"]["pattern-0"]
+        assert (row["scene"], row["split"], row["status"]) == ("pattern-0", record["dataset"]["split"], "ok")
+        assert float(row["psnr"]) == cell["metrics"]["psnr"] and float(row["fit_seconds"]) == cell["fit_seconds"]
+        assert cell["metrics"]["niqe"] is None and row["niqe"] == ""
+    text = go("counts", seed=1)
+    assert [(r["method"], r["seed"]) for r in rows()] == [("quick+counts", "0"), ("counts", "1")], "replaced, not twice"
+
+
+@pytest.mark.usefixtures("installed")
+def test_several_seeds_have_folders_of_their_own_and_one_row_of_the_table(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for methods in (("counts",), ("quick+counts",)):
+        options: dict[str, Any] = {"seed": 2, "seeds": 3, "device": "cpu", "metrics": ("psnr",)}
+        assert run_benchmark((small_scene,), methods=methods, out=out, **options) == 0
+    table = capsys.readouterr().out.rpartition("Results")[2].partition("images:")[0]
+    rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+    assert [(r["method"], r["seed"]) for r in rows] == [(m, k) for m in ("counts", "quick+counts") for k in "234"]
+    for method in ("counts", "quick+counts"):
+        folders = (out, out / "seed-3", out / "seed-4")
+        records = [json.loads((f / f"results/{method}.json").read_text()) for f in folders]
+        assert [r["method"]["seed"] for r in records] == [2, 3, 4]
+        values = [r["mean"]["psnr"] for r in records]
+        assert values == [float(r["psnr"]) for r in rows if r["method"] == method]
+        assert re.search(rf" {re.escape(method)} +{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} ", table)
+    assert not (out / "seed-2").exists()
+
+
+@pytest.mark.usefixtures("installed")
+def test_records_that_do_not_belong_there_are_left_out_and_named(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, other = tmp_path / "out", write_small_scene(tmp_path / "other", seed=5)
+    for scene, method in ((other, "counts"), (small_scene, "quick+counts")):
+        (out / "results").mkdir(parents=True, exist_ok=True)
+        (out / "results/damaged.json").write_text("{")
+        run_benchmark((scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",))
+    text = " ".join(capsys.readouterr().out.split())
+    assert "results/counts.json: other scenes, revisions or split" in text
+    assert "results/damaged.json: expected a spike4dgs-result/1 record (JSON)" in text
+    assert [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())] == ["quick+counts"]
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_method_without_its_predictions_is_in_the_table_and_not_in_the_sheet(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    for method in ("counts", "quick+counts"):
+        assert run_benchmark((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",)) == 0
+        with Image.open(out / "sheet_pattern-0.png") as image:
+            height = image.height
+        shutil.rmtree(out / "predictions/counts", ignore_errors=True)
+    assert run_benchmark((small_scene,), methods=("quick+counts",), out=out, device="cpu", metrics=("psnr",)) == 0
+    with Image.open(out / "sheet_pattern-0.png") as image:
+        assert image.height == height
+    assert len((out / "results.csv").read_text().splitlines()) == 3
+
+
+@pytest.mark.usefixtures("installed")
+def test_run_benchmark_exits_1_where_a_cell_failed(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run_benchmark((small_scene,), methods=("bad", "quick+counts"), out=out, device="cpu") == 1
+    shown = capsys.readouterr()
+    assert "failed: bad on pattern-0" in shown.err
+    assert "bad (failed)" in shown.out
+    rows = json.loads((out / "leaderboard/local.json").read_text())["boards"][0]["rows"]
+    assert [(r["method"], r["rank"]) for r in rows] == [("quick+counts", 1), ("bad", None)]
+
+
+@pytest.mark.usefixtures("installed")
+def test_another_record_in_a_shared_leaderboard_needs_replace(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def go(seed: int, budget: str = "quick", replace: bool = False) -> int:
+        return run_benchmark(
+            (small_scene,),
+            methods=("quick+counts",),
+            out=tmp_path / "out",
+            seed=seed,
+            device="cpu",
+            budget=budget,
+            leaderboard=tmp_path / "board",
+            replace=replace,
+        )
+
+    assert go(0) == 0 and go(0) == 0
+    assert go(1) == 0, "another seed has an entry of its own"
+    assert go(1, "0.5") == 1
+    assert "pass --replace" in capsys.readouterr().err
+    assert go(1, "0.5", replace=True) == 0
+    (path,) = (tmp_path / "board/local").glob("pattern-0@*/quick+counts@seed-1.json")
+    assert json.loads(path.read_text())["record"]["scenes"]["pattern-0"]["budget"] == 0.5
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"methods": ("nonsense",)}, "--methods: expected names among bad, counts, quick+counts, found nonsense"),
+        ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, 1e+06 at most, found '0'"),
+        ({"budget": "nan"}, "or a positive number, 1e+06 at most, found 'nan'"),
+        ({"budget": "fast"}, "or a positive number, 1e+06 at most, found 'fast'"),
+        ({"device": "tpu"}, "--device: expected auto, cpu or cuda, found 'tpu'"),
+        ({"device": "cuda:99"}, "--device: expected a CUDA device of this machine, found 'cuda:99'"),
+        ({"scenes": ()}, "scenes: expected at least one scene folder"),
+        ({"scenes": (Path("nowhere"),)}, "nowhere: expected a scene folder, found no such folder"),
+    ],
+)
+def test_bad_arguments_are_user_errors(
+    small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError) as e:
+        run_benchmark(**{"scenes": (small_scene,), "out": tmp_path / "out", **arguments})
+    assert message in str(e.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == "cpu" == choose_device("cpu")

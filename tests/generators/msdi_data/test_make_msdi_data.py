@@ -1,0 +1,119 @@
+"""Training bursts: jittered rigs, rendering, and the command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.training_bursts import (
+    Burst,
+    burst_path,
+    open_folder,
+    write_bursts,
+)
+from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
+from spike4dgs.generators.msdi_data import make_msdi_data as msdi_data
+from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_msdi_data
+from spike4dgs.generators.msdi_data.rig_jitter import jittered_cameras
+from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.worlds import WORLDS
+from spike4dgs.method.msdi.training.data import points_of
+
+
+def test_jittered_rigs_stay_near_the_worlds_own() -> None:
+    world = WORLDS["turntable"].build(0, 13, 0.1)
+    own = cameras(world, 104, 64)
+    none = jittered_cameras(world, 104, 64, np.random.default_rng(0), 0.0)
+    for a, b in zip(own, none, strict=True):
+        np.testing.assert_allclose(a.w2c, b.w2c, atol=1e-9)
+        assert a.fx == pytest.approx(b.fx)
+    target = np.array(world.rig.target)
+    distance = np.linalg.norm(own[4].center - target)
+    seen = set()
+    for seed in range(20):
+        rig = jittered_cameras(world, 104, 64, np.random.default_rng(seed))
+        for camera in rig:
+            np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
+            assert 0.5 * distance < np.linalg.norm(camera.center - target) < 2 * distance
+            uv, z = camera.project(target[None])
+            assert z[0] > 0 and np.abs(uv[0] - (52, 32)).max() < 80
+            assert camera.center[2] > 0
+        seen.add(tuple(rig[0].center))
+    assert len(seen) == 20
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Burst]:
+    folder = tmp_path_factory.mktemp("bursts")
+    facts, arrays = MakeBursts(rigs=1, instants=1, width=32, height=20, spp=4, seed=0)(("turntable", 14))
+    write_bursts(burst_path(folder, "turntable", 14), facts, arrays)
+    file = open_folder(folder)[0]
+    return folder, file.read(0)
+
+
+def test_rendered_depth_agrees_between_views(rendered: tuple[Path, Burst]) -> None:
+    burst = rendered[1]
+    points = points_of(burst.depth, burst.K, burst.w2c)
+    K, w2c = burst.K[0], burst.w2c[0]
+    camera = Camera("c", 32, 20, K[0, 0], K[1, 1], K[0, 2], K[1, 2], w2c[:3, :3], w2c[:3, 3])
+    off = []
+    for view in range(1, 9):
+        uv, z = camera.project(points[view].reshape(-1, 3).astype(np.float64))
+        inside = np.isfinite(z) & (uv > 0).all(1) & (uv < (32, 20)).all(1)
+        column, row = uv[inside].astype(int).T
+        off.append(np.abs(burst.depth[0, row, column] / z[inside] - 1))
+    assert np.median(np.concatenate(off)) < 0.02
+
+
+def test_only_moving_pixels_are_stored_twice_and_they_change(rendered: tuple[Path, Burst]) -> None:
+    burst = rendered[1]
+    assert 0.05 < burst.moving.mean() < 0.6
+    change = np.abs(burst.keys[0] - burst.keys[-1])
+    assert not change[~burst.moving].any()
+    assert change[burst.moving].mean() > 1e-3
+    assert np.isfinite(burst.keys).all() and 0.05 < burst.keys.mean() < 2
+
+
+def test_the_command_keeps_existing_shards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = []
+
+    def fake(self: MakeBursts, chunk: tuple[str, int]):  # type: ignore[no-untyped-def]
+        made.append(chunk)
+        return self.facts(*chunk), {"still": np.zeros(3, np.float16)}
+
+    monkeypatch.setattr(msdi_data.MakeBursts, "__call__", fake)
+    assert make_msdi_data(("car", "bird"), out=tmp_path, variants=1) == 0
+    hidden = [(w, v) for v in HIDDEN_VARIANTS for w in ("car", "bird")]
+    assert made == [*hidden, ("car", 13), ("bird", 13)]
+    assert "8/8" in capsys.readouterr().out
+    made.clear()
+    burst_path(tmp_path, "car", 11).unlink()
+    assert make_msdi_data(("car",), out=tmp_path, variants=2) == 0
+    assert made == [("car", 11), ("car", 14)]
+    with pytest.raises(UserError, match="choose another --out"):
+        make_msdi_data(("car",), out=tmp_path, variants=1, spp=64)
+
+
+def test_no_variant_that_is_kept_for_tests_is_ever_made() -> None:
+    assert min(HIDDEN_VARIANTS) >= 10 and min(HIDDEN_VARIANTS) > 0
+    assert max(HIDDEN_VARIANTS) < FIRST_TRAINING_VARIANT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"worlds": ("cart",)}, "expected some of jaywalk, .* found cart"),
+        ({"rigs": 0}, "expected counts from 1 up"),
+        ({"variants": 8988}, "--variants: expected at most 8987, found 8988; variants from 9000 on are kept"),
+        ({"spp": 12}, "--spp: expected a power of two, found 12"),
+    ],
+)
+def test_wrong_arguments_are_named(tmp_path: Path, arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make_msdi_data(out=tmp_path, **arguments)  # type: ignore[arg-type]

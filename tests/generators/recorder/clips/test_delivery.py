@@ -1,0 +1,67 @@
+"""The thread that passes frames to the sink: it ends in every case."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from spike4dgs.generators.recorder.clips.cutting import Cutter
+from spike4dgs.generators.recorder.clips.delivery import Delivery
+from spike4dgs.generators.recorder.clips.layouts import UInt8, make_layout
+from spike4dgs.generators.recorder.clips.ring import Ring
+
+LAYOUT = make_layout("plain", 16, 8)  # 16 bytes a frame
+
+
+def filled(blocks: int) -> dict[str, Ring]:
+    """Return a ring in which this many blocks of three frames wait."""
+    ring = Ring(blocks, 3 * LAYOUT.frame_bytes)
+    for i in range(blocks):
+        ring.take()[:] = i
+        ring.put(ring.slot_bytes, i)
+    return {"cam": ring}
+
+
+def deliver(rings: dict[str, Ring], sink: object, n_ticks: int) -> Delivery:
+    return Delivery(sink, rings, {"cam": Cutter("cam", LAYOUT, rings["cam"])}, n_ticks)  # type: ignore[arg-type]
+
+
+def test_what_waits_is_delivered_up_to_the_end_of_the_clip() -> None:
+    got: list[tuple[int, UInt8]] = []
+    rings = filled(5)
+    deliver(rings, lambda camera, first, frames: got.append((first, frames.copy())), 13).finish()
+    assert [first for first, _ in got] == [0, 3, 6, 9, 12] and rings["cam"].waiting == 0
+    frames = np.concatenate([f for _, f in got])
+    np.testing.assert_array_equal(frames[:, 0], np.repeat(np.arange(5), 3)[:13])
+
+
+def test_an_error_of_the_sink_is_raised_at_the_end() -> None:
+    def refuse(camera: str, first: int, frames: UInt8) -> None:
+        raise OSError("disk full")
+
+    delivery = deliver(filled(5), refuse, 15)
+    with pytest.raises(OSError, match="disk full"):
+        delivery.finish()
+    delivery.abandon()
+
+
+def test_an_abandoned_delivery_ends_after_the_block_that_the_sink_has() -> None:
+    begun, go_on, rings = threading.Event(), threading.Event(), filled(5)
+
+    def stall(camera: str, first: int, frames: UInt8) -> None:
+        begun.set()
+        assert go_on.wait(60)
+
+    delivery = deliver(rings, stall, 15)
+    assert begun.wait(60)
+    end = threading.Thread(target=delivery.abandon)
+    end.start()
+    while not delivery._abandoned.is_set():
+        time.sleep(1e-3)
+    assert end.is_alive() and rings["cam"].waiting == 4, "it waits for the sink"
+    go_on.set()
+    end.join(60)
+    assert not end.is_alive() and rings["cam"].waiting == 4

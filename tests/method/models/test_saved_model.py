@@ -1,0 +1,193 @@
+"""Models on disk: the same images, one clear error for anything else, and what a run writes."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from dummy_methods import CountMethod, run
+from saved_models import DURATION_US, MODELS, WORLD, model, provenance
+from small_scenes import write_small_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.runs.provenance import Savable
+from spike4dgs.method.held_out_pose import RefinableModel, Refinement
+from spike4dgs.method.models.model_file import ModelFile, read_model, write_model
+from spike4dgs.method.models.saved_model import load_model
+from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.splat import PixelFilter
+
+FLAT = Path(__file__).parent / "flat_settings_models"  # of a version with one flat list of settings
+MOVING = [name for name in MODELS if name != "static"]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path) -> None:
+    path, camera = tmp_path / "deep" / "m.safetensors", WORLD.held_out
+    original = model(name)
+    original.save(path, provenance())
+    loaded = load_model(path)
+    assert type(loaded.model) is type(original)
+    for t_us in (-10.0, 0.0, 1234.5, 0.5 * DURATION_US, DURATION_US):
+        image = original.render(camera, t_us)
+        assert image.std() > 0.01, "a test of nothing"
+        np.testing.assert_array_equal(loaded.model.render(camera, t_us), image)
+    assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
+
+
+def test_a_model_keeps_the_filter_that_it_was_fitted_with(tmp_path: Path) -> None:
+    wide = PixelFilter(4.0, compensated=True)
+    customary, fitted = model("paths"), dataclasses.replace(model("paths"), pixel_filter=wide)
+    fitted.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    images = [m.render(WORLD.held_out, 0.5 * DURATION_US) for m in (loaded, fitted, customary)]
+    assert loaded.pixel_filter == wide
+    np.testing.assert_array_equal(images[0], images[1])
+    assert abs(images[1] - images[2]).max() > 0.01, "the filter matters"
+
+
+@pytest.mark.parametrize("name", ["hexplane", "paths", "spacetime"])
+def test_a_model_of_the_version_with_flat_settings_renders_as_then(name: str, tmp_path: Path) -> None:
+    """The same tensors by the same names, other settings; to the bit here, and elsewhere within the processor's."""
+    loaded = load_model(FLAT / f"{name}.safetensors")
+    frames = np.load(FLAT / "frames.npz")
+    loaded.model.save(tmp_path / "m", loaded.provenance)
+    again = load_model(tmp_path / "m").model
+    for share in (0.1, 0.9):
+        image = loaded.model.render(WORLD.held_out, share * DURATION_US)
+        np.testing.assert_allclose(image, frames[f"{name}_{share}"], rtol=0, atol=1e-5)
+        np.testing.assert_array_equal(again.render(WORLD.held_out, share * DURATION_US), image)
+    old, new = (safetensors.torch.load_file(p) for p in (FLAT / f"{name}.safetensors", tmp_path / "m"))
+    assert old.keys() == new.keys() and all(torch.equal(v, new[k]) for k, v in old.items())
+    settings = read_model(tmp_path / "m").config["motion"]["settings"]
+    assert settings == dataclasses.asdict(MOTIONS[name].defaults) | (
+        {"features": 4, "mlp_width": 8} if name == "hexplane" else {}
+    )
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_the_models_of_these_tests_move(name: str) -> None:
+    a, b = (model(name).render(WORLD.held_out, t) for t in (0.2 * DURATION_US, 0.8 * DURATION_US))
+    assert np.abs(a - b).max() > 0.01
+
+
+def test_where_it_comes_from_is_kept(tmp_path: Path) -> None:
+    model("static").save(tmp_path / "m", provenance(fit_seconds=12.25, budget="paper"))
+    found = load_model(tmp_path / "m")
+    expected = provenance(fit_seconds=12.25, budget="paper")
+    assert found.title == "toy+4dgs on toy" and found.provenance.duration_us == DURATION_US
+    same = {k: v for k, v in vars(expected).items() if k != "cameras"}
+    assert {k: v for k, v in vars(found.provenance).items() if k != "cameras"} == same
+    for a, b in zip(found.provenance.cameras, WORLD.cameras, strict=True):
+        assert (a.id, a.width, a.height, a.K.tolist()) == (b.id, b.width, b.height, b.K.tolist())
+        np.testing.assert_allclose(a.w2c, b.w2c, atol=1e-12)
+
+
+def test_a_model_that_refines_views_saves_what_it_holds(tmp_path: Path) -> None:
+    wrapped = RefinableModel(model("hexplane"), Refinement())
+    assert isinstance(wrapped, Savable)
+    wrapped.save(tmp_path / "m", provenance())
+    image = load_model(tmp_path / "m").model.render(WORLD.held_out, 500.0)
+    np.testing.assert_array_equal(image, wrapped.render(WORLD.held_out, 500.0))
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "m.safetensors"
+    model("hexplane").save(path, provenance())
+    return path
+
+
+def refused(path: Path, message: str, device: str = "cpu") -> None:
+    with pytest.raises(UserError, match=message) as found:
+        load_model(path, device)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_a_file_that_was_cut_off_is_refused(saved: Path, share: float) -> None:
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(share * len(data))])
+    refused(saved, r"m\.safetensors: expected a fitted model, found damaged data .*run-benchmark")
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_flipped_bit_is_found(saved: Path, share: float) -> None:
+    data = bytearray(saved.read_bytes())
+    data[int(share * len(data))] ^= 1
+    saved.write_bytes(data)
+    refused(saved, r"m\.safetensors: expected the SHA-256 that it was written with, found damaged data")
+
+
+def test_what_is_no_model_is_refused(saved: Path, tmp_path: Path) -> None:
+    refused(tmp_path / "none", "none: expected a fitted model, found no such file; run-benchmark writes OUT/models")
+    refused(tmp_path, r"expected a model's file, found a folder \(models in it: m.safetensors\); name one file")
+    refused(saved, "device: expected cpu, or a CUDA device", "nonsense")
+    safetensors.torch.save_file({"x": torch.zeros(2)}, saved, metadata={"schema": "somebody/2"})
+    refused(saved, "expected schema spike4dgs-model/1, found 'somebody/2'")
+
+
+def without(key: str) -> Any:
+    return lambda about: about.pop(key)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: {"kind": "ghosts"}, "expected a model of kind gaussians, .* found 'ghosts'"),
+        (lambda f: {"config": {}}, "cannot read .KeyError"),
+        (lambda f: {"config": {"motion": {**f.config["motion"], "name": "warp"}}}, "cannot read .KeyError: 'warp'"),
+        (lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"x": 1}}}}, "found 'x'; correct the name"),
+        (
+            lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}},
+            "cannot read .ValueError: .* in place of",
+        ),
+        (
+            lambda f: {"config": {**f.config, "filter": {"variance": -1.0}}},
+            "ValueError: -1.0 is no number",
+        ),
+        (lambda f: {"config": {**f.config, "filter": {"compensated": 1}}}, "cannot read .ValueError: a filter with"),
+        (lambda f: {"config": {**f.config, "filter": {"sigma": 1.0}}}, "cannot read .TypeError"),
+        (
+            lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
+            "cannot read .KeyError",
+        ),
+        (lambda f: {"provenance": provenance(cameras=())}, "at cameras"),
+        (lambda f: {"provenance": provenance(rate_hz=0.0)}, "at rate_hz"),
+        (lambda f: {"provenance": provenance(method={})}, "at method: 'name' is a required property"),
+    ],
+)
+def test_a_model_of_another_version_is_one_clear_error(saved: Path, change: Any, message: str) -> None:
+    file = read_model(saved)
+    values = {name: getattr(file, name) for name in ("kind", "config", "tensors", "provenance")}
+    write_model(saved, ModelFile(**{**values, **change(file)}))
+    refused(saved, message)
+
+
+class Kept(CountMethod):
+    """Its models can be saved."""
+
+    def fit(self, *args: Any, **kwargs: Any) -> Any:
+        """A toy model that renders what the method's own renders."""
+        fitted, toy = super().fit(*args, **kwargs), model("hexplane")
+        fitted.save = toy.save
+        return fitted
+
+
+def test_a_run_keeps_the_models_that_can_be_saved(tmp_path: Path) -> None:
+    scene = write_small_scene(tmp_path / "scene")
+    run(tmp_path / "out", [scene], Kept("kept"), CountMethod("fleeting"))
+    assert [p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out/models").rglob("*.*")] == [
+        "models/kept/pattern-0.safetensors"
+    ]
+    found = load_model(tmp_path / "out/models/kept/pattern-0.safetensors").provenance
+    about = json.loads((tmp_path / "out/predictions/kept/pattern-0/prediction.json").read_text())
+    assert found.method == about["method"] and found.scene_revision == about["scene_revision"]
+    assert (found.scene, found.split, found.budget) == ("pattern-0", about["split"], about["budget"])
+    assert [c.id for c in found.cameras] == ["cam_00", "cam_01", "cam_02"]
+    assert (found.n_ticks, found.rate_hz, found.radiance_gain) == (80, 20000.0, 0.6)
+    assert found.harness == about["harness"]

@@ -1,0 +1,284 @@
+"""`fit`, end to end: recordings with and without poses, without a file of truth, and killed."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_scenes import write_small_scene
+from toy_world import GAIN, RATE_HZ, ToyWorld
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
+from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.runs.record import read_record
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
+from spike4dgs.benchmark.spikes.folder import write_stream_folder
+from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
+from spike4dgs.cli import main
+from spike4dgs.cli.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
+from spike4dgs.method import load_model
+from spike4dgs.method.recordings.held_out import SHOWN
+from spike4dgs.method.recordings.recording import open_recording, own_frame
+
+WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
+SHORT = ("--budget", "0.02", "--device", "cpu")
+QUICK = (*SHORT, "--poses", "given")
+
+
+def write_streams(folder: Path, name: str = "{}.dat") -> dict[str, SpikeStream]:
+    """Write the streams of the toy world's training cameras."""
+    for camera, stream in zip(WORLD.training.cameras, WORLD.training.streams, strict=True):
+        with SpikeWriter(folder / name.format(camera.id), WORLD.width, WORLD.height) as writer:
+            writer.write(pack(stream.window(0, WORLD.n_ticks)))
+    return dict(zip((c.id for c in WORLD.training.cameras), WORLD.training.streams, strict=True))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene folder of the toy world as a recorder of real cameras leaves it: poses and streams, no truth at all."""
+    root = tmp_path_factory.mktemp("recorded") / "toy"
+    write_streams(root, stream_name("{}"))
+    cameras = WORLD.training.cameras
+    description = SceneDescription(
+        id="toy",
+        title="A toy world",
+        licence="CC0-1.0",
+        cameras=cameras,
+        train=tuple(c.id for c in cameras),
+        test=(),
+        rate_hz=RATE_HZ,
+        n_ticks=WORLD.n_ticks,
+        radiance_gain=GAIN,
+        targets=(),
+        sensor={"model": "toy", "rows_bottom_up": True},
+        source={"kind": "recorder"},
+    )
+    finish_scene(root, description)
+    return root
+
+
+@pytest.fixture(scope="module")
+def fitted(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("fitted") / "out"
+    assert main(["fit", str(recorded), "--method", "tfp+4dgs", "--out", str(out), *SHORT]) == 0
+    return out
+
+
+def tensors(out: Path) -> dict[str, torch.Tensor]:
+    from safetensors.torch import load_file
+
+    return load_file(out / MODEL)
+
+
+def same_model(a: Path, b: Path) -> bool:
+    first, second = tensors(a), tensors(b)
+    return first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
+
+
+def test_a_fit_leaves_a_model_a_sheet_a_video_and_a_report(fitted: Path) -> None:
+    assert {p.name for p in fitted.iterdir()} == {MODEL, SHEET, VIDEO, REPORT, ".lock"}
+    with Image.open(fitted / SHEET) as sheet:
+        assert sheet.width > 1000 and len(set(sheet.convert("L").getdata())) > 100
+    video = cv2.VideoCapture(str(fitted / VIDEO))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 300
+    ok, frame = video.read()
+    assert ok and frame.shape == (120, 192, 3) and frame.std() > 10
+
+
+def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
+    page = (fitted / REPORT).read_text()
+    assert not re.search(r"(src|href)=\"(?!data:image/png;base64,|video\.mp4\")", page) and "url(" not in page
+    assert page.count("<img") == 2 and "<script" not in page and "<link" not in page
+    text = re.sub(r"<[^>]+>", " ", re.sub(r"base64,[^\"]+", "", page))
+    for words in (
+        "given by the scene",
+        "not a score",
+        "60 ticks at 20000 Hz: 3 ms",
+        "tfp+4dgs on toy",
+        "torch",
+        "cpu:",
+    ):
+        assert words in text
+    rows = re.findall(r"<tr><td>(cam_\d\d)</td>((?:<td>[^<]*</td>)+)</tr>", page)
+    assert [name for name, _ in rows] == [c.id for c in WORLD.training.cameras]
+    for (_, row), stream in zip(rows, WORLD.training.streams, strict=True):
+        cells = re.findall(r"<td>([^<]*)</td>", row)
+        assert float(cells[2]) == pytest.approx(stream.window(0, 60).mean(), abs=1e-4)  # the mean rate
+        assert cells[5:9] == ["0", "0", "0", "1.000"]  # bad pixels, by isolation, and the gain
+
+
+def test_residuals_are_those_of_the_saved_model(fitted: Path, recorded: Path) -> None:
+    from spike4dgs.baselines.images.table import IMAGES
+
+    saved, scene = load_model(fitted / MODEL), open_scene(recorded).training
+    ticks = np.rint(np.linspace(10, 49, 5)).astype(int)  # an edge away from the ends, every half a millisecond
+    (cells,) = re.findall(r"<tr><td>cam_00</td>((?:<td>[^<]*</td>)+)</tr>", (fitted / REPORT).read_text())
+    images = IMAGES["tfp"](scene.streams[0], [int(t) for t in ticks], GAIN)
+    rendered = np.stack([saved.model.render(scene.cameras[0], t * 50.0) for t in ticks])
+    error = np.mean((np.clip(images, 0, 1).astype(float) - np.clip(rendered, 0, 1)) ** 2)
+    assert float(re.findall(r"<td>([^<]*)</td>", cells)[-1]) == pytest.approx(-10 * np.log10(error), abs=0.006)
+
+
+def test_other_commands_take_the_model(fitted: Path, recorded: Path, tmp_path: Path) -> None:
+    from spike4dgs.method.viewing.content import open_content
+
+    content = open_content(load_model(fitted / MODEL), recorded)
+    assert content.modes == ("rendered", "spike rate", "error")
+    out = tmp_path / "frames"
+    assert main(["render", str(fitted / MODEL), "--frames", str(out), "--slow-motion", "50", "--scale", "1"]) == 0
+    assert len(list(out.iterdir())) == 5
+
+
+def test_no_file_of_truth_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = write_small_scene(tmp_path / "whole")
+    bare = Path(shutil.copytree(whole, tmp_path / "bare"))
+    for name in ("images", "masks", "geometry", "truth"):
+        shutil.rmtree(bare / name, ignore_errors=True)
+    (bare / open_scene(whole).meta["streams"]["cam_03"]).unlink()  # the held-out camera's stream
+    write_json(bare / "targets.json", {"targets": []})
+    write_manifest(bare)
+    for scene in (whole, bare):
+        arguments = ["fit", str(scene), "--method", "tfp+4dgs", "--out", str(tmp_path / f"{scene.name}-fit"), *QUICK]
+        assert main(arguments) == 0
+    assert same_model(tmp_path / "whole-fit", tmp_path / "bare-fit")
+    said = capsys.readouterr().out
+    assert "the fit does not see the held-out cam_03" in said
+    assert "held-out cam_03 by their own spikes: no score (not computed: the stream or the recordings of cam_03" in said
+
+
+def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bare = write_small_scene(tmp_path / "scene")
+    for name in ("images", "masks"):
+        shutil.rmtree(bare / name)
+    write_json(bare / "targets.json", {"targets": []})
+    write_manifest(bare)
+    out = tmp_path / "out"
+    assert main(["fit", str(bare), "--method", "tfp+static", "--out", str(out), *QUICK]) == 0
+    said = capsys.readouterr().out
+    assert main(["score", str(out / PREDICTIONS), str(bare), "--out", str(tmp_path / "record.json")]) == 0
+    values = read_record(tmp_path / "record.json")["scenes"]["pattern-0"]["metrics"]
+    assert values["psnr"] is None and values["spike_psnr_5_dynamic"] is None
+    assert f"cam_03 by their own spikes: spike_psnr_5 {values['spike_psnr_5']:.3f}" in said
+    page = (out / REPORT).read_text()
+    (cells,) = re.findall(r"<tr><td>cam_03</td><td>3</td>((?:<td>[^<]*</td>)+)</tr>", page)
+    shown = re.findall(r"<td>([^<]*)</td>", cells)
+    assert shown == [METRICS[m].format(values[m]) for m in SHOWN]
+    assert page.count(f"<td>{shown[0]}</td>") == 2, "the mean over cameras too"
+
+
+def test_streams_without_poses_get_estimated_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_stream_folder(tmp_path / "streams", write_streams(tmp_path / "streams"))
+    out = tmp_path / "out"
+    arguments = ["fit", str(tmp_path / "streams"), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "poses: estimated with COLMAP" in said and "white is taken to be" in said
+    assert "estimated with COLMAP" in (out / REPORT).read_text()
+    found = load_model(out / MODEL).provenance.cameras
+    errors = pose_errors(found, WORLD.training.cameras).summary()
+    assert errors["rotation_max_deg"] < 1.5 and errors["translation_max_m"] < 0.05
+
+
+def test_an_array_in_its_own_frame_is_the_same_array() -> None:
+    cameras = WORLD.cameras
+    own = own_frame(cameras)
+    centers = np.stack([c.center for c in own])
+    np.testing.assert_allclose(centers.mean(axis=0), 0, atol=1e-12)
+    assert np.linalg.norm(centers[:, None] - centers[None], axis=-1).max() == pytest.approx(1)
+    mean = np.mean([c.R for c in own], axis=0)
+    np.testing.assert_allclose(
+        mean / np.linalg.norm(mean, axis=1)[:, None], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=0.02
+    )
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    move = align_cameras(cameras, own)
+    for before, after in zip(cameras, own, strict=True):
+        np.testing.assert_allclose(after.project(move(points))[0], before.project(points)[0], atol=1e-6)
+
+
+def test_streams_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    streams = {}
+    for name, ticks in (("a", 8), ("b", 9)):
+        with SpikeWriter(tmp_path / f"{name}.dat", 8, 8) as writer:
+            writer.write(np.zeros((ticks, 8), np.uint8))
+        streams[name] = SpikeStream(np.zeros((ticks, 8), np.uint8), 8, 8, RATE_HZ)
+    write_stream_folder(tmp_path, streams)
+    with pytest.raises(UserError, match="two or more streams of one size, rate and length"):
+        open_recording(tmp_path)
+    write_stream_folder(tmp_path, {"a": streams["a"]})
+    with pytest.raises(UserError, match=r"found 1 stream\(s\)"):
+        open_recording(tmp_path)
+
+
+def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
+    dark = SpikeStream(np.zeros((8, 96 * 60 // 8), np.uint8), 96, 60, RATE_HZ)
+    for name in "ab":
+        with SpikeWriter(tmp_path / f"{name}.dat", 96, 60) as writer:
+            writer.write(dark.packed)
+    write_stream_folder(tmp_path, dict.fromkeys("ab", dark))
+    with pytest.raises(UserError, match="calibrate-rig"):
+        open_recording(tmp_path)
+
+
+def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(fitted, tmp_path / "out"))
+    (out / REPORT).unlink()
+    before = (out / MODEL).stat().st_mtime_ns
+    assert main(["fit", str(recorded), "--method", "tfp+4dgs", "--out", str(out), *QUICK]) == 0
+    assert (out / MODEL).stat().st_mtime_ns == before and (out / REPORT).is_file()
+
+
+def test_what_cannot_be_done_is_said(
+    fitted: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, message in (
+        (("--out", str(fitted), "--seed", "1"), "another --out, or remove it"),
+        (("--out", str(tmp_path / "a"), "--method", "nearest-view"), "a method whose models can be saved"),
+        (("--out", str(tmp_path / "b"), "--method", "magic"), "one of "),
+        (("--out", str(tmp_path / "c"), "--budget", "much"), "--budget"),
+    ):
+        method = () if "--method" in arguments else ("--method", "tfp+4dgs")
+        budget = () if "--budget" in arguments else ("--budget", "0.02")
+        assert main(["fit", str(recorded), *arguments, *method, *budget]) == 2
+        assert message in capsys.readouterr().err
+    (tmp_path / "d").mkdir()
+    with open(tmp_path / "d/.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(["fit", str(recorded), "--out", str(tmp_path / "d")]) == 2
+    assert "a folder that no other fit uses" in capsys.readouterr().err
+
+
+def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    arguments = ["fit", str(recorded), "--method", "tfp+static", "--out", str(out), *QUICK]
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.DEVNULL)
+    while not (clocks := list(out.glob("work/*/fit_clock.json"))) and process.poll() is None:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (out / MODEL).exists()
+    checkpoint = tmp_path / "checkpoint.safetensors"  # of the same fit: one is written only every 15 s, and at the end
+    request = FitRequest(make_budget("0.02"), checkpoint=checkpoint)
+    model = get_method("tfp+static").fit(open_scene(recorded).training, request)
+    shutil.copy(checkpoint, clocks[0].parent)
+    assert main(arguments) == 0
+    assert "resuming after" in capsys.readouterr().out and not (out / "work").exists()
+    camera = WORLD.held_out
+    np.testing.assert_array_equal(load_model(out / MODEL).model.render(camera, 500.0), model.render(camera, 500.0))

@@ -1,0 +1,67 @@
+"""Clocks told from a clip, against those with which a closed-form world was seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clock_world import ClockWorld
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.camera_state import Clock
+from spike4dgs.method.self_calibration.clock_fit import ClockSettings
+from spike4dgs.method.self_calibration.clock_search import SearchSettings, best_offsets
+from spike4dgs.method.self_calibration.clocks import ArrayClocks, clock_of_another, estimate_clocks
+
+FEW = ClockSettings(times=5, moving_patches=25, static_patches=8, prior_drift_ppm=1e4)
+SHORT = SearchSettings(times=3, most_ticks=100, patches=10, depths=6)
+TICKS = {"cam_00": 3.3, "cam_01": -2.0, "cam_02": 7.75, "cam_03": -30.0, "cam_05": 0.0, "cam_06": 12.5, "cam_07": 55.0}
+
+
+def seen(clocks: dict[str, Clock], travel: float = 0.6) -> tuple[ClockWorld, ArrayClocks]:
+    world = ClockWorld(clocks=clocks, travel=travel)
+    return world, estimate_clocks(world.training, FEW, SHORT)
+
+
+def errors(world: ClockWorld, found: ArrayClocks) -> np.ndarray:
+    """Differences of offsets at the middle of the clip, of cameras that are right on average."""
+    middle = world.n_ticks / 2
+    true = np.array([world.clocks.get(c.id, Clock()).local(middle) - middle for c in world.training.cameras])
+    told = np.array([found.cameras[c.id].middle_ticks for c in world.training.cameras])
+    return (told - told.mean()) - (true - true.mean())
+
+
+def test_offsets_come_out_to_a_quarter_of_a_tick_and_a_drift_too() -> None:
+    ppm = 8000.0  # 2 ticks in 240
+    clocks = {camera: Clock(ticks) for camera, ticks in TICKS.items()} | {"cam_08": Clock(-ppm * 1e-6 * 120, ppm)}
+    world, found = seen(clocks)
+    assert np.abs(errors(world, found)).max() < 0.25
+    assert found.px_per_tick > 0.05 and all(e.error_ticks < 0.5 for e in found.cameras.values())
+    assert abs(np.mean([e.middle_ticks for e in found.cameras.values()])) < 1e-6
+    drifts = {camera: e.clock.drift_ppm for camera, e in found.cameras.items()}
+    others = [drift for camera, drift in drifts.items() if camera != "cam_08"]
+    assert drifts["cam_08"] - np.mean(others) == pytest.approx(ppm, rel=0.25)
+
+
+def test_where_nothing_moves_the_standard_errors_say_so() -> None:
+    _, found = seen({"cam_02": Clock(20.0)}, travel=0.0)
+    assert min(e.error_ticks for e in found.cameras.values()) > 2
+
+
+def test_the_clock_of_a_held_out_camera_is_on_the_clock_of_the_others() -> None:
+    world = ClockWorld(clocks={"cam_04": Clock(9.5)})
+    found = clock_of_another(world.training, world.held_out, world.stream(world.held_out, 4), s=FEW, search=SHORT)
+    assert found.middle_ticks == pytest.approx(9.5, abs=0.3)
+
+
+def test_too_little_data_are_refused() -> None:
+    with pytest.raises(UserError, match="clocks of toy: expected 3 cameras"):
+        estimate_clocks(ClockWorld(n_ticks=60).training)
+
+
+def test_the_best_offsets_of_all_pairs_are_found() -> None:
+    rng, true = np.random.default_rng(0), np.array([0, 3, -5, 8, 1])
+    apart = true[None] - true[:, None]
+    offsets = np.arange(-20, 21)
+    costs = 1 - np.exp(-0.5 * (offsets - apart[..., None]) ** 2) + 0.1 * rng.random((5, 5, 41))
+    costs[0, 3] = costs[3, 0] = 1 - np.exp(-0.5 * (offsets + 4) ** 2)  # one pair is wrong
+    assert (best_offsets(costs) == true).all()

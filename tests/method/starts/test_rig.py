@@ -1,0 +1,164 @@
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+import pytest
+from toy_world import GAIN, RATE_HZ, ToyWorld
+
+from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.starts.base import StartRequest
+from spike4dgs.method.starts.plane_sweep import (
+    agreed,
+    find_range,
+    full_range,
+    half_size,
+    lift,
+    plane_homographies,
+    sweep,
+)
+from spike4dgs.method.starts.rig import RigSettings, middle_camera, rig
+
+WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
+
+
+def static_views(world: ToyWorld) -> tuple[np.ndarray, np.ndarray]:
+    """Noise-free images and depths of all cameras at the middle of the clip."""
+    seen = [world.trace(c, 0.5) for c in world.cameras]
+    return np.stack([s[0] for s in seen]).astype(np.float32), np.stack([s[1] for s in seen])
+
+
+def test_homography_maps_pixels_as_projecting_through_the_plane_does():
+    a, b = WORLD.cameras[0], WORLD.cameras[5]
+    uv = np.random.default_rng(0).uniform(0, 60, (20, 2))
+    for inverse in (0.1, 0.4):
+        points = a.unproject(uv, np.full(20, 1 / inverse))
+        mapped = np.column_stack([uv, np.ones(20)]) @ next(plane_homographies(a, b, [inverse])).T
+        assert np.allclose(mapped[:, :2] / mapped[:, 2:], b.project(points)[0], atol=1e-9)
+
+
+def test_half_size_camera_sees_the_same_points_at_half_the_coordinates():
+    c = WORLD.cameras[2]
+    points = np.random.default_rng(0).normal(size=(10, 3))
+    assert np.allclose(half_size(c).project(points)[0], c.project(points)[0] / 2)
+
+
+def test_lifted_pixels_project_back_to_their_centres():
+    camera, mask = WORLD.cameras[1], np.zeros((60, 96), bool)
+    mask[7, 30], mask[50, 2] = True, True
+    uv, z = camera.project(lift(camera, np.full((60, 96), 0.25, np.float32), mask))
+    assert np.allclose(uv, [[30.5, 7.5], [2.5, 50.5]]) and np.allclose(z, 4)
+
+
+def test_sweep_finds_the_depth_of_textured_surfaces():
+    images, depths = static_views(WORLD)
+    found = sweep(WORLD.cameras, images, 4, full_range(WORLD.cameras))
+    error = np.abs(found.inverse * depths[4] - 1)[5:-5, 5:-5]
+    assert np.median(error) < 0.02 and np.mean(error < 0.1) > 0.85
+
+
+def test_sweep_of_a_part_equals_the_whole_sweep_inside_it():
+    images, _ = static_views(WORLD)
+    planes, mask = full_range(WORLD.cameras), np.zeros((60, 96), bool)
+    mask[20:40, 30:50] = True
+    part, whole = (sweep(WORLD.cameras, images, 0, planes, m) for m in (mask, None))
+    inside = part.score > -1
+    assert inside[mask].all() and inside.sum() == 30 * 30
+    assert np.allclose(part.inverse[mask], whole.inverse[mask], atol=1e-6)
+
+
+def test_range_holds_the_scene_and_is_much_smaller_than_everything():
+    images, depths = static_views(WORLD)
+    planes = find_range(WORLD.cameras, images)
+    low, high = np.quantile(1 / depths, [0.01, 0.99])
+    assert planes[0] <= low and planes[-1] >= high and len(planes) < 0.7 * len(full_range(WORLD.cameras))
+
+
+def test_views_agree_on_true_depths_and_not_on_chance():
+    images, depths = static_views(WORLD)
+    planes = full_range(WORLD.cameras)
+    maps = [sweep(WORLD.cameras, images, i, planes) for i in range(9)]
+    kept = agreed(WORLD.cameras, maps, 4)
+    wrong = np.abs(maps[4].inverse * depths[4] - 1) > 0.1
+    assert kept.mean() > 0.6 and wrong[kept].mean() < 0.5 * wrong.mean()
+    noise = np.random.default_rng(0).random(images.shape).astype(np.float32)
+    noise = np.stack([cv2.GaussianBlur(n, (0, 0), 1.0) for n in noise])
+    chance = [sweep(WORLD.cameras, noise, i, planes) for i in range(9)]
+    assert agreed(WORLD.cameras, chance, 4).mean() < 0.1
+
+
+@pytest.fixture(scope="module")
+def start():
+    return rig(WORLD.training)
+
+
+def test_rig_keeps_the_calibrated_poses_and_is_deterministic(start):
+    again = rig(WORLD.training)
+    assert start.cameras == WORLD.training.cameras
+    assert np.array_equal(again.points, start.points) and np.array_equal(again.values, start.values)
+
+
+def test_rig_points_lie_on_the_surfaces_of_the_middle_of_the_clip(start):
+    uv, z = WORLD.held_out.project(start.points.astype(np.float64))
+    inside = (uv >= 0).all(axis=1) & (uv < [96, 60]).all(axis=1) & (z > 0)
+    u, v = uv[inside].astype(int).T
+    image, depth, board = WORLD.trace(WORLD.held_out, 0.5)
+    interior = cv2.erode(board.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
+    error = np.abs(z[inside] / depth[v, u] - 1)
+    assert inside.mean() > 0.6 and np.median(error) < 0.03 and np.mean(error < 0.1) > 0.75
+    assert np.median(error[interior[v, u]]) < 0.05  # what moves is found too
+    assert np.corrcoef(start.values[inside], image[v, u])[0, 1] > 0.8
+
+
+def test_rig_covers_the_image(start):
+    uv, _ = middle_camera(start.cameras).project(start.points.astype(np.float64))
+    seen = np.histogram2d(uv[:, 0], uv[:, 1], bins=(24, 15), range=((0, 96), (0, 60)))[0]
+    assert (seen > 0).mean() > 0.99
+    assert 0.15 < len(start.points) / (96 * 60) < 0.8
+
+
+def test_middle_camera_is_between_the_others():
+    m, centers = middle_camera(WORLD.cameras), np.stack([c.center for c in WORLD.cameras])
+    assert np.allclose(m.center, centers.mean(axis=0)) and np.allclose(m.R @ m.R.T, np.eye(3))
+    assert np.allclose(m.R, WORLD.held_out.R, atol=0.01)
+
+
+@pytest.mark.parametrize("spikes", ["none", "all"])
+def test_scene_without_any_texture_still_gives_points(spikes):
+    packed = np.full((40, 30), 0 if spikes == "none" else 255, np.uint8)
+    cameras = ToyWorld(width=20, height=12).training.cameras
+    streams = tuple(SpikeStream(packed, 20, 12, RATE_HZ) for _ in cameras)
+    start = rig(TrainingScene("flat", "flat", cameras, streams, RATE_HZ, 40, GAIN))
+    assert len(start.points) > 20 and np.isfinite(start.points).all() and np.isfinite(start.values).all()
+
+
+def test_a_recipe_overrides_the_cell_size_and_its_record_shows_it(start):
+    overrides = {"initialization.cell_px": 4.0}
+    method = RecipeMethod(Recipe("mine", "tfp", "rig", "static", "pixel", overrides), PARTS)
+    wide = method.settings["initialization"]
+    coarse = method.initialization.start(StartRequest(WORLD.training, 0, wide))
+    assert len(coarse.points) < 0.7 * len(start.points)
+    assert method.params["settings"]["initialization"] == {**asdict(RigSettings()), "cell_px": 4.0}
+
+
+@pytest.mark.parametrize(
+    ("initialization", "name", "listed"),
+    [
+        ("rig", "min_points", "cell_px"),  # COLMAP's
+        ("dust3r", "cell_px", "ransac_px"),
+        ("colmap", "focal_prior", "min_points"),  # the focal length is known
+        ("msdi", "flat_field", "trained_px"),  # always corrected
+    ],
+)
+def test_a_number_of_a_part_that_does_not_run_is_refused(initialization: str, name: str, listed: str):
+    recipe = Recipe("mine", "tfp", initialization, "static", "pixel", {f"initialization.{name}": 1})
+    with pytest.raises(UserError, match=f"among .*initialization.{listed}.*found 'initialization.{name}'"):
+        RecipeMethod(recipe, PARTS)
+
+
+def test_no_initialization_has_more_than_25_numbers():
+    assert max(len(asdict(part.settings)) for part in PARTS.initialization.values()) <= 25

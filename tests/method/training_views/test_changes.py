@@ -1,0 +1,68 @@
+"""The detector of changes: its variation against numpy, and the limits of its users."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from spike4dgs.method.training_views.changes import (
+    COUNTS,
+    MASKS,
+    POINTS,
+    RAYS,
+    ChangeSettings,
+    changing,
+    variation,
+    without_specks,
+)
+
+
+def averaged(images: torch.Tensor, s: ChangeSettings) -> np.ndarray:
+    """Images blurred plainly, one shift of the window after another."""
+    reach, found = s.blur_px // 2, images.double().numpy()
+    height, width = found.shape[2:]
+    shifts = [(y, x) for y in range(s.blur_px) for x in range(s.blur_px)]
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        padded = np.pad(values, ((0, 0), (0, 0), (reach, reach), (reach, reach)))
+        return np.sum([padded[..., y : y + height, x : x + width] for y, x in shifts], axis=0)
+
+    return summed(found) / (s.blur_px**2 if s.zeros_outside else summed(np.ones_like(found)))
+
+
+@pytest.mark.parametrize("s", [POINTS, MASKS, RAYS])
+def test_variation_is_the_deviation_of_blurred_images(s: ChangeSettings) -> None:
+    images = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
+    tolerance = 1e-12 if s.float64 else 1e-6
+    np.testing.assert_allclose(variation(images, s), averaged(images, s).std(axis=0), atol=tolerance)
+
+
+def test_a_pixel_changes_above_the_limit() -> None:
+    images = torch.zeros(2, 1, 1, 3)
+    images[1, 0, 0] = torch.tensor([0.079, 0.081, 0.5])
+    assert changing(images, RAYS).tolist() == [[[False, True, True]]]
+
+
+def test_counts_of_constant_radiance_do_not_change() -> None:
+    counts = torch.full((4, 1, 2, 2), 20)
+    counts[1, 0, 0] += torch.tensor([1, 2])
+    counts[2, 0, 1] += torch.tensor([-2, 3])
+    assert changing(counts, COUNTS).tolist() == [[[False, False], [False, True]]]
+
+
+def test_the_limit_of_masks_follows_the_noise_within_its_bounds() -> None:
+    g = torch.Generator().manual_seed(0)
+    for noise, limit in ((1e-4, 0.01), (0.015, None), (0.3, 0.05)):
+        images = 0.5 + noise * torch.randn(30, 1, 40, 50, generator=g)
+        found = variation(images, MASKS)
+        expected = limit or MASKS.noise_factor * float(np.quantile(found, MASKS.noise_share))
+        assert 0.01 <= expected <= 0.05
+        assert torch.equal(changing(images, MASKS), found > expected)
+
+
+def test_single_pixels_are_specks() -> None:
+    mask = np.zeros((9, 9), bool)
+    mask[2, 2] = mask[4:8, 4:8] = True
+    cleaned = without_specks(mask)
+    assert not cleaned[:4, :4].any() and cleaned[5:7, 5:7].all()

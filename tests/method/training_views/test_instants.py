@@ -1,0 +1,188 @@
+"""Corrections of means over time against closed forms: light that is a polynomial in time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+
+import pytest
+import torch
+from torch import Tensor
+
+from spike4dgs.method.training_views.instants import REACH, Corrections, correction, node
+from spike4dgs.method.training_views.training_images import Spans
+
+SHAPE = (2, 12, 16)
+
+
+def random(low: float, high: float, seed: int) -> Tensor:
+    return low + (high - low) * torch.rand(SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def polynomial(*coefficients: float) -> list[Tensor]:
+    """Polynomials in ticks from the instant, another at each pixel."""
+    return [c * random(0.5, 1.5, seed) for seed, c in enumerate(coefficients)]
+
+
+def light(p: list[Tensor], ticks: float) -> Tensor:
+    return sum((c * ticks**k for k, c in enumerate(p)), torch.zeros(SHAPE, dtype=torch.float64))
+
+
+def mean(p: list[Tensor], a: Tensor, b: Tensor) -> Tensor:
+    """The exact mean over [a, b]."""
+    return sum(((c * (b ** (k + 1) - a ** (k + 1)) / (k + 1)) for k, c in enumerate(p)), torch.zeros(())) / (b - a)
+
+
+def corrected(p: list[Tensor], a: Tensor, b: Tensor, half: float) -> Tensor:
+    far, spans = node(half), Spans(torch.stack([a, b], 1), half, 100)
+    return mean(p, a, b) + correction(light(p, -far), light(p, 0.0), light(p, far), spans)
+
+
+@pytest.mark.parametrize("half", [5.0, 10.0])
+def test_quadratic_light_over_any_span_becomes_the_instant(half: float) -> None:
+    p, a, b = polynomial(0.5, 0.01, -2e-3), random(-2, -0.2, 7) * half, random(0.1, 1.9, 8) * half
+    torch.testing.assert_close(corrected(p, a, b, half), light(p, 0.0))
+    assert (mean(p, a, b) - light(p, 0.0)).abs().max() > 1e-3, "without it they differ"
+
+
+def test_light_to_the_fifth_power_is_exact_over_the_whole_span() -> None:
+    p, b = polynomial(0.5, 0.01, -2e-3, 1e-4, 3e-5, -2e-6), torch.full(SHAPE, 10.0, dtype=torch.float64)
+    torch.testing.assert_close(corrected(p, -b, b, 10.0), light(p, 0.0))
+
+
+def test_a_span_that_reaches_far_is_not_followed_to_its_end() -> None:
+    p, far = polynomial(0.5, 0.01), random(20, 60, 9)
+    followed = correction(
+        *(light(p, t) for t in (-node(5.0), 0.0, node(5.0))), Spans(torch.stack([-far, far], 1), 5.0, 99)
+    )
+    at_most = correction(
+        *(light(p, t) for t in (-node(5.0), 0.0, node(5.0))),
+        Spans(torch.stack([torch.full(SHAPE, -5.0 * REACH), torch.full(SHAPE, 5.0 * REACH)], 1), 5.0, 99),
+    )
+    torch.testing.assert_close(followed, at_most)
+
+
+def test_still_light_needs_no_correction() -> None:
+    still = random(0, 1, 1)
+    assert not correction(still, still, still, Spans(torch.stack([still - 9, still + 5], 1), 5.0, 99)).any()
+
+
+def test_repeated_corrections_undo_the_mean() -> None:
+    """Van Cittert: a model that follows its corrected images arrives where its mean is what was measured."""
+    times = torch.arange(-40.0, 41.0, dtype=torch.float64)
+    truth, spans = torch.exp(-((times / 14) ** 2)), Spans(torch.tensor([[-10.0, 10.0]]).view(1, 2, 1, 1), 10.0, 99)
+
+    def blurred(signal: Tensor) -> Tensor:
+        wide = torch.nn.functional.pad(signal[None], (10, 10), mode="replicate")[0].unfold(0, 21, 1)
+        weights = torch.ones(21, dtype=torch.float64)
+        weights[[0, -1]] = 0.5
+        return wide @ weights / 20
+
+    def instant(model: Tensor) -> Tensor:
+        """What Corrections makes of the measured means, by a model [T] that is linear between whole ticks."""
+
+        def around(index: int):
+            def views(ticks: float, chosen: object) -> Tensor:
+                at = (index + ticks) * torch.ones(1, dtype=torch.float64)
+                low = at.floor().clamp(0, 79).long()
+                share = (at - low).clamp(0, 1)
+                return torch.lerp(model[low], model[low + 1], share).view(1, 1, 1)
+
+            return views
+
+        every = Spans(spans.ends.expand(81, 1, 2, 1, 1), 10.0, 99)
+        corrections = Corrections(every, around)
+        return measured + torch.stack([corrections.at(k, [0])[0, 0, 0] for k in range(81)])
+
+    measured = blurred(truth)
+    first, model = measured.clone(), measured
+    for _ in range(4):
+        model = instant(model)
+    assert (model - truth).abs().max() < 0.3 * (first - truth).abs().max()
+
+
+def test_corrections_are_made_once_for_each_image() -> None:
+    asked: list[tuple[float, tuple[int, ...]]] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: object) -> Tensor:
+            asked.append((ticks, tuple(chosen)))
+            return torch.full((len(chosen), 2, 2), index + ticks)
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(3, 4, 2, 2, 2), 5.0, 99), around)
+    corrections.at(1, [0, 2])
+    corrections.at(1, [2, 3])
+    assert [views for _, views in asked] == [(0, 2)] * 3 + [(3,)] * 3
+    assert sorted({ticks for ticks, _ in asked}) == [-node(5.0), 0.0, node(5.0)]
+
+
+def test_corrections_made_ahead_are_those_made_when_asked_for() -> None:
+    """Each image is rendered once, by whichever thread comes to it first."""
+    rendered: list[tuple[int, int, float]] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            rendered.extend((index, v, ticks) for v in chosen)
+            return torch.stack([torch.full((2, 2), (index + 2.0) * (v + 1) + 0.01 * ticks**2) for v in chosen])
+
+        return views
+
+    def corrections() -> Corrections:
+        lengths = torch.arange(40 * 4 * 2 * 4).view(40, 4, 2, 2, 2) % 13 - 6.0
+        return Corrections(Spans(lengths, 5.0, 99), around)
+
+    asked = [(7 * k % 40, [k % 4, (k + 1 + k % 3) % 4]) for k in range(300)]
+    alone = corrections()
+    expected = [alone.at(*request) for request in asked]
+    rendered.clear()
+    ahead = corrections()
+    ahead.begin(iter(asked))
+    assert all(torch.equal(ahead.at(*r), e) for r, e in zip(asked, expected, strict=True))
+    ahead.stop()
+    assert len(rendered) == len(set(rendered)) == 3 * len({(index, v) for index, views in asked for v in views})
+
+
+def test_no_more_is_made_ahead_once_stopped() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    rendered: list[int] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            rendered.append(index)
+            begun.set()
+            go_on.wait(60)
+            return torch.zeros(len(chosen), 2, 2)
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(9, 1, 2, 2, 2), 5.0, 99), around)
+    corrections.begin((index, [0]) for index in range(9))
+    begun.wait(60)
+    stopping = threading.Thread(target=corrections.stop)
+    stopping.start()
+    while not corrections._stopped.is_set():
+        pass
+    go_on.set()
+    stopping.join(60)
+    assert rendered == [0, 0, 0], "the one that was begun"
+    assert corrections.at(4, [0]).shape == (1, 2, 2), "what was not made ahead is made when asked for"
+
+
+def test_a_render_that_fails_ahead_fails_where_it_is_asked_for() -> None:
+    failed: list[int] = []
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            failed.append(index)
+            raise ArithmeticError("no such render")
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(3, 1, 2, 2, 2), 5.0, 99), around)
+    corrections.begin([(1, [0])])
+    corrections._thread.join(60)
+    assert failed == [1]
+    with pytest.raises(ArithmeticError, match="no such render"):
+        corrections.at(1, [0])

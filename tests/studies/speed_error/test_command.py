@@ -1,0 +1,83 @@
+"""The command itself: every room's measurements in the smallest size, on a small scene, to the page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.cli import main
+from spike4dgs.studies.speed_error.command import make_speed_error
+from spike4dgs.studies.speed_error.measurement import GROUPS, MS, Measurement, Point, Request, Series
+from spike4dgs.studies.speed_error.runner import measured_from_to
+
+
+def measurements(fail: bool = False) -> tuple[Measurement, ...]:
+    def run(request: Request) -> Iterator[Series]:
+        if fail:
+            raise OSError("no luck")
+        yield Series(request.scene().name, (Point(request.size, {"ms": 1.0}, "chosen"),))
+
+    return (Measurement("one", "Fits", "one", "a", "b", "c", (MS,), "ms", ("ms",), run),)
+
+
+def test_the_whole_command_in_its_smallest_size(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "report"
+    command = ["report", "speed-error", "--size", "tiny", "--scene", str(small_scene), "--out", str(out)]
+    assert main(command) == 0
+    assert f"page: {out / 'index.html'}" in capsys.readouterr().out
+    report = json.loads((out / "speed_error.json").read_text())
+    check_schema(report, load_schema("spike4dgs.benchmark", "speed_error.schema.json"), "the report", "")
+    ids = {m["id"] for m in report["measurements"]}
+    assert {"splat", "images", "sensor", "scores", "budget", "scale-pixels"} <= ids and not ids & {"keys", "msdi"}
+    groups = [m["group"] for m in report["measurements"]]
+    assert groups == sorted(groups, key=GROUPS.index)
+    for m in report["measurements"]:
+        columns = {c["id"] for c in m["columns"]}
+        assert {m["x"], *m["y"], m["cost"], m["error"]} <= columns and m["series"]
+        roles = [p["role"] for s in m["series"] for p in s["points"]]
+        assert ("exact" in roles and "chosen" in roles and m["reason"]) or not m["exact"], m["id"]
+    html = (out / "index.html").read_text()
+    assert all(f'id="{group.lower().replace(" ", "-")}"' in html for group in groups)
+    capsys.readouterr()
+    assert main([*command, "--only", "ssim"]) == 0
+    assert "SSIM and its gradient: kept" in capsys.readouterr().out
+
+
+def test_a_scene_is_made_once_and_only_when_asked(tmp_path: Path) -> None:
+    made: list[tuple[object, ...]] = []
+    command = make_speed_error(lambda *a, **k: made.append((a, k)) or 0, measurements, lambda: ())
+    assert command(out=tmp_path / "a", quick=True) == 0
+    assert made == [((("car",),), {"profile": "tiny", "out": tmp_path / "a/scenes", "seed": 0})]
+    report = json.loads((tmp_path / "a/speed_error.json").read_text())
+    assert report["size"] == "quick" and report["measurements"][0]["series"][0]["name"] == "car-0-tiny"
+    assert command(out=tmp_path / "b", size="tiny", scene=tmp_path) == 0 and len(made) == 1
+
+
+def test_a_failure_is_exit_1_and_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = make_speed_error(lambda *a, **k: 0, lambda: measurements(fail=True))
+    assert command(out=tmp_path / "a", size="tiny") == 1
+    assert "failed, see the page: one" in capsys.readouterr().out
+    assert "OSError: no luck" in (tmp_path / "a/index.html").read_text()
+
+
+def test_what_was_measured_is_measured_again_where_that_is_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = make_speed_error(lambda *a, **k: 0, measurements)
+    for again, kept in ((False, False), (False, True), (True, False)):
+        command(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
+        assert ("one: kept" in capsys.readouterr().out) == kept
+
+
+def test_the_page_says_when_kept_measurements_were_made() -> None:
+    results = [
+        {"measured": "2026-01-31T12:00:00Z", "seconds": 61.0},
+        {"measured": "2026-01-31T13:00:10Z", "seconds": 5000.0},
+    ]
+    assert measured_from_to(results) == ("2026-01-31T11:36:50Z", "2026-01-31T13:00:10Z")

@@ -1,0 +1,84 @@
+"""What faults of an array cost: captures, fits and scores of a tiny scene, and the table of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio
+
+from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli import main
+from spike4dgs.studies import faults as fault_table
+from spike4dgs.studies.faults import CASES, Case, Outcome
+
+
+def test_cases_have_folders_of_their_own_and_begin_without_a_fault() -> None:
+    assert not CASES[0].worse and all(case.worse for case in CASES[1:])
+    names = [case.name for case in CASES]
+    assert len(set(names)) == len(names) and all(name.replace("-", "").replace(".", "").isalnum() for name in names)
+
+
+def clipped(image: np.ndarray) -> np.ndarray:
+    return np.clip(image.astype(np.float64), 0, 1)
+
+
+def test_a_table_of_two_captures(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fault_table, "CASES", (CASES[0], Case("bad pixels", "9 a camera", {"bad_pixels": 9})))
+    scene, out = tiny_data / "car-0-tiny", tmp_path / "faults"
+    command = ["fault-table", str(scene), "--methods", "tfp+static", "--budget", "0.01", "--out", str(out)]
+    assert main(command) == 0
+    with (out / "table.csv").open() as file:
+        exact, worse = csv.DictReader(file)
+    truth = open_scene(scene)
+    seen = open_predictions(out / "fits" / "none" / "tfp+static" / "predictions", truth.targets)
+    pairs = [(clipped(truth.ground_truth(t)), clipped(seen.read(t))) for t in truth.targets]
+    by_hand = np.mean([peak_signal_noise_ratio(*pair, data_range=1) for pair in pairs])
+    assert float(exact["psnr"]) == pytest.approx(by_hand, abs=1e-3) and float(exact["psnr_lost"]) == 0
+    assert float(worse["psnr_lost"]) == pytest.approx(float(exact["psnr"]) - float(worse["psnr"]), abs=2e-4)
+    assert not list((out / "captures" / "bad-pixels-9-a-camera").rglob("*.exr")), "it holds nothing of the truth"
+
+    model = out / "fits" / "none" / "tfp+static" / "model.safetensors"
+    before = model.stat().st_mtime_ns
+    assert main(command) == 0
+    assert model.stat().st_mtime_ns == before, "finished fits are kept"
+
+
+def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fault_table, "CASES", CASES[:1])
+    monkeypatch.setattr(fault_table, "LENS_CASES", (fault_table.LENS_CASES[-1],))
+    curved = tmp_path / "curved"
+    shutil.copytree(tiny_data / "car-0-tiny", curved)
+    lens = {"k1": -0.2}
+    for name in ("train", "test", "all"):
+        file = curved / f"transforms_{name}.json"
+        transforms = json.loads(file.read_text())
+        file.write_text(json.dumps({**transforms, "frames": [f | lens for f in transforms["frames"]]}))
+    write_manifest(curved)
+    out = tmp_path / "faults"
+    options = ["--methods", "tfp+static", "--budget", "0.01", "--out", str(out)]
+    assert main(["fault-table", str(tiny_data / "car-0-tiny"), "--lens-scene", str(curved), *options]) == 0
+    clips = [open_scene(out / "captures" / name / "clip") for name in ("none", "lens-ignored")]
+    assert all(not c.distortion for clip in clips for c in clip.cameras.values()), "the capture says pinhole"
+    with (out / "table.csv").open() as file:
+        exact, ignored = csv.DictReader(file)
+    # The streams are those of the same pinholes: a fit that is told of no lens has the same score.
+    assert (ignored["fault"], ignored["size"]) == ("lens", "ignored")
+    assert float(ignored["psnr"]) == pytest.approx(float(exact["psnr"]), abs=1e-3)
+
+
+def test_a_fit_that_fails_has_a_dash_and_its_reason(tmp_path: Path) -> None:
+    worse = Case("poses", "1°", {"pose_deg": 1})
+    found = [Outcome(CASES[0], "a", 30.0, 25.0), Outcome(worse, "a", None, None, "no points")]
+    fault_table._write(tmp_path, found, {})
+    text = (tmp_path / "table.md").read_text()
+    assert "| none |  | 30.00 | 25.00 |" in text and "| poses | 1° | - | - |" in text
+    assert text.endswith("- poses, 1°, a: no points\n")

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from toy_world import ToyWorld
+
+from spike4dgs.baselines.starts.colmap import clip_means
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Budget
+from spike4dgs.cli import main
+from spike4dgs.studies.poses import measure_poses, poses
+
+WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
+
+
+def test_calibrated_poses_have_no_error() -> None:
+    (row,) = measure_poses(WORLD.training, clip_means(WORLD.training), "rig", 0, calibrated=True)
+    assert row["registered"] == "8 of 8" and int(row["points"] or 0) > 500
+    assert row["rotation_max_deg"] == pytest.approx(0, abs=1e-6) and row["translation_m"] == pytest.approx(0, abs=1e-8)
+    assert row["focal_ratio"] == 1 and row["maa_30"] == 1
+
+
+def test_failures_are_rows_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SPIKE4DGS_DUST3R", raising=False)
+    (row,) = measure_poses(WORLD.training, clip_means(WORLD.training), "dust3r", 0, calibrated=True)
+    assert row["registered"] == "0 of 8" and row["rotation_deg"] is None
+    assert "SPIKE4DGS_DUST3R not set" in str(row["error"])
+    dark = 0 * clip_means(WORLD.training)
+    (row,) = measure_poses(WORLD.training, dark, "colmap", 0, calibrated=True)
+    assert row["registered"] == "0 of 8" and row["error"] == "fewer than two views have poses"
+
+
+def test_command_prints_and_writes_the_table(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "poses.json"
+    arguments = ["poses", str(small_scene), "--initialization", "rig", "colmap", "--images", "tfp", "--out", str(out)]
+    assert main(arguments) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [r["initialization"] for r in rows] == ["rig", "colmap"] and rows[0]["rotation_deg"] < 1e-6
+    assert rows[1]["registered"] == "0 of 3"  # a pattern without parallax that is another one in each view
+    assert "3 of 3" in capsys.readouterr().out
+
+
+def test_refined_poses_are_a_row_of_their_own() -> None:
+    images = clip_means(WORLD.training)
+    before, after = measure_poses(WORLD.training, images, "colmap", 0, calibrated=True, refine=Budget(0.05))
+    assert (before["initialization"], after["initialization"]) == ("colmap", "colmap, refined")
+    assert before["registered"] == after["registered"] == "8 of 8" and before["points"] == after["points"]
+    assert 0 < float(before["rotation_deg"] or 0) < 1 and 0 < float(after["rotation_deg"] or 0) < 1
+    assert after["rotation_deg"] != before["rotation_deg"]
+
+
+def test_unknown_names_are_refused(small_scene: Path) -> None:
+    with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, msdi-matched, found sift"):
+        poses((small_scene,), initialization=("sift",))
+    with pytest.raises(UserError, match="one of clip, flat, tfp"):
+        poses((small_scene,), images="photo")
