@@ -1,8 +1,14 @@
 """The contract and the judge: spike streams, cameras, scene folders, metrics, results and the runner."""
 
+import os
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.lazy import lazy_names
+
+# Before torch loads OpenMP, which reads these once: its threads wait asleep. Spinning, they take the cores from one
+# another and from our own threads as soon as another program runs.
+if "GOMP_SPINCOUNT" not in os.environ:
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from spike4dgs.benchmark.errors import UserError
