@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import shlex
@@ -13,6 +12,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.gpu import missing_rasterizer
@@ -150,7 +151,13 @@ def cpu_name() -> str:
         found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
     except OSError:
         found = None
-    return f"{found[1].strip() if found else platform.machine()}, {len(os.sched_getaffinity(0))} cores"
+    return f"{found[1].strip() if found else platform.machine()}, {available_cores()} cores"
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use; those of the machine where the system does not tell."""
+    process = psutil.Process()
+    return len(process.cpu_affinity()) if hasattr(process, "cpu_affinity") else psutil.cpu_count() or 1
 
 
 def _gpu(device: str) -> tuple[str, str | None]:

@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from platformdirs import user_cache_path
+
 from spike4dgs.benchmark.errors import problem
 
 MOST_BYTES = 16 << 20  # of a text: a record of many scenes has some MB; parsed, JSON can take 25 times its size
@@ -41,9 +43,8 @@ _FAILURES = {  # what writing expected, and what to do; other errors are the pro
 
 
 def user_cache() -> Path:
-    """Return the user's cache folder of this package: `spike4dgs` in XDG_CACHE_HOME or ~/.cache."""
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.path.expanduser(base)) / "spike4dgs"
+    """Return the user's cache folder of this package, on Linux `spike4dgs` in XDG_CACHE_HOME or ~/.cache."""
+    return user_cache_path("spike4dgs", appauthor=False)
 
 
 @contextmanager

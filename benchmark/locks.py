@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import writing
-
-_RETRY_S = 0.05
 
 
 @contextmanager
@@ -25,27 +22,17 @@ def locked(
     holds it after `wait_s` seconds; `where` and `expected` name for the error what is locked, such as "a folder that no
     other run uses".
     """
-    with writing(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        opened = open(file, "w")
-    with opened:
-        deadline = time.monotonic() + wait_s
-        while not _take(opened.fileno()):
-            if time.monotonic() >= deadline:
-                found = "a run in progress" + (f" for {wait_s:.0f} s" if wait_s else "")
-                raise problem(where, expected, found, "wait for it")
-            time.sleep(_RETRY_S)
-        try:
-            yield
-        finally:
-            if temporary:
-                file.unlink(missing_ok=True)
-
-
-def _take(descriptor: int) -> bool:
-    """Take the lock if nobody holds it; return whether it was taken."""
+    lock = FileLock(file, timeout=wait_s)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return os.fstat(descriptor).st_nlink > 0  # else another process removed it since: who comes now locks another file
+        with writing(file.parent):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+    except Timeout:
+        found = "a run in progress" + (f" for {wait_s:.0f} s" if wait_s else "")
+        raise problem(where, expected, found, "wait for it") from None
+    try:
+        yield
+    finally:
+        if temporary:
+            file.unlink(missing_ok=True)
+        lock.release()

@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
+import psutil
 from rich.console import Console
 from rich.text import Text
 
@@ -133,13 +134,8 @@ def _try(part: str, check: Check) -> list[Finding]:
 
 def _processor() -> Iterator[Finding]:
     yield Finding("processor", OK, cpu_name())
-    try:
-        kilobytes = dict(re.findall(r"(\w+):\s+(\d+) kB", Path("/proc/meminfo").read_text()))
-    except OSError:
-        kilobytes = {}
-    if {"MemTotal", "MemAvailable"} <= kilobytes.keys():
-        free, total = (int(kilobytes[key]) / 2**20 for key in ("MemAvailable", "MemTotal"))
-        yield Finding("memory", OK, f"{free:.1f} of {total:.1f} GiB free")
+    memory = psutil.virtual_memory()
+    yield Finding("memory", OK, f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free")
     disk = shutil.disk_usage(Path.cwd())
     yield Finding("disk", OK, f"{disk.free / 2**30:.1f} of {disk.total / 2**30:.1f} GiB free in {Path.cwd()}")
 

@@ -16,6 +16,9 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
+import psutil
+
+from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import UserError, problem
 
 C = TypeVar("C")
@@ -115,9 +118,11 @@ def _start_worker(task: Callable[[Any], Any] | None, started: Any, workers: int,
     threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
     with started.get_lock():
         index, started.value = started.value, started.value + 1
-    cores = sorted(os.sched_getaffinity(0))
+    process = psutil.Process()
+    cores = process.cpu_affinity() if hasattr(process, "cpu_affinity") else list(range(available_cores()))
     share = cores[index % len(cores) :: workers]
-    os.sched_setaffinity(0, share)
+    if hasattr(process, "cpu_affinity"):  # macOS pins no process to cores
+        process.cpu_affinity(share)
     import drjit
 
     drjit.set_thread_count(len(share))

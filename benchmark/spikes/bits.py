@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.compilation import cached_njit
+from spike4dgs.benchmark.environment import available_cores
 
 UInt8 = NDArray[np.uint8]
 UInt64 = NDArray[np.uint64]
@@ -41,7 +42,7 @@ def in_threads(function: Callable[..., None], n: int, *args: object, small: bool
 
     `function` must not call this again: all calls share one pool, whose threads would wait for one another.
     """
-    parts = 1 if small else max(1, min(n, len(os.sched_getaffinity(0))))
+    parts = 1 if small else max(1, min(n, available_cores()))
     edges = [n * i // parts for i in range(parts + 1)]
     jobs = [_pool().submit(function, *args, a, b) for a, b in zip(edges[1:-1], edges[2:], strict=True)]
     try:

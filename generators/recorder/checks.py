@@ -12,7 +12,7 @@ import usb.core
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.clips.layouts import make_layout
-from spike4dgs.generators.recorder.memory import MEMINFO, buffer_seconds, free_bytes, least_seconds
+from spike4dgs.generators.recorder.memory import buffer_seconds, free_bytes, least_seconds
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.transport import udev_fix
 
@@ -78,17 +78,17 @@ def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> Use
     return problem("usbfs_memory_mb", f"{need_mb} MiB for the reads in flight", f"{limit_mb} MiB", fix)
 
 
-def check_memory(profile: RigProfile, seconds: float, continuous: bool, meminfo: Path = MEMINFO) -> UserError | None:
+def check_memory(profile: RigProfile, seconds: float, continuous: bool, free: int | None = None) -> UserError | None:
     """Check the memory for rings and, for a clip with tags, for the frames without tags, made before it is written."""
     layout = make_layout(profile.layout, profile.width, profile.height)
-    kept_s = buffer_seconds(profile, seconds, meminfo) if continuous else seconds
+    free = free_bytes() if free is None else free
+    kept_s = buffer_seconds(profile, seconds, free) if continuous else seconds
     tick_bytes = layout.frame_bytes
     if not continuous and layout.frame_bytes != layout.payload_bytes:
         tick_bytes += layout.payload_bytes
     flying = profile.transfers * profile.transfer_bytes
     need = len(profile.cameras) * (kept_s * profile.fps * tick_bytes + 2 * flying) + _SPARE_BYTES
-    free = free_bytes(meminfo)
-    if free is None or free >= need:
+    if free >= need:
         return None
     lower = "--buffer-s (or ring_seconds in the profile)" if continuous else "--seconds (or record with --continuous)"
     fix = f"end other programs, or lower {lower}"

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import psutil
 
 from spike4dgs.generators.recorder.clips.layouts import make_layout
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 
-MEMINFO = Path("/proc/meminfo")
-
 _SHARE = 0.5  # of the free memory; the rest is left to the page cache and other programs
 _MOST_S = 10.0  # twice the longest stall that the recorder is tested with
-_UNKNOWN_S = 0.5  # where the system does not tell how much is free
 
 
-def free_bytes(meminfo: Path = MEMINFO) -> int | None:
-    """Return the memory that programs can take without swapping; None on a system that does not tell."""
-    try:
-        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
-        return int(lines["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError, ValueError, IndexError):
-        return None
+def free_bytes() -> int:
+    """Return the memory that programs can take without swapping."""
+    return int(psutil.virtual_memory().available)
 
 
 def bytes_per_s(profile: RigProfile) -> int:
@@ -33,14 +26,14 @@ def least_seconds(profile: RigProfile) -> float:
     return 2 * profile.transfers * profile.transfer_bytes / bytes_per_s(profile)
 
 
-def buffer_seconds(profile: RigProfile, seconds: float, meminfo: Path = MEMINFO) -> float:
+def buffer_seconds(profile: RigProfile, seconds: float, free: int | None = None) -> float:
     """Return the seconds of data, of all cameras, that may wait in memory during a clip of `seconds`.
 
-    The profile's `ring_seconds`; where it is None, what half of the free memory holds, but no more than 10 s or the
-    whole clip.
+    The profile's `ring_seconds`; where it is None, what half of the `free` bytes (those of now) holds, but no more than
+    10 s or the whole clip.
     """
     if profile.ring_seconds is not None:
         return profile.ring_seconds
-    free, least = free_bytes(meminfo), least_seconds(profile)
-    held = _UNKNOWN_S if free is None else _SHARE * free / (len(profile.cameras) * bytes_per_s(profile))
+    least = least_seconds(profile)
+    held = _SHARE * (free_bytes() if free is None else free) / (len(profile.cameras) * bytes_per_s(profile))
     return max(min(held, _MOST_S, seconds + least), least)

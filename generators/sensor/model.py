@@ -35,7 +35,6 @@ used, so every processor gives the same bits.
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -44,6 +43,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
 from spike4dgs.benchmark.spikes.stream import UInt8, bytes_per_tick
@@ -112,7 +112,7 @@ def simulate(
     if means:  # the end of the last tick
         ticks = np.append(ticks, ticks[-1:] + 1)
     _check(keys, ticks, n_ticks, sensor, charge, means)
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or available_cores()
     blocks = -(-height * width // BLOCK)
     state = np.zeros(blocks * BLOCK, dtype=np.int32)
     head, unit, noise = _noise_units(sensor)

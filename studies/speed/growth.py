@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.studies.speed.timing import by_turns_ms
 from spike4dgs.studies.speed_error.measurement import (
     MEDIAN_MS,
@@ -20,7 +20,7 @@ from spike4dgs.studies.speed_error.measurement import (
 
 def thread_counts() -> list[int]:
     """Return the numbers of threads to compare: powers of two up to 16, as many as this machine has cores."""
-    return [n for n in (1, 2, 4, 8, 16) if n <= len(os.sched_getaffinity(0))]
+    return [n for n in (1, 2, 4, 8, 16) if n <= available_cores()]
 
 
 def timed(calls: Mapping[float, Callable[[], Any]], name: str, column: str, turns: int) -> Series:

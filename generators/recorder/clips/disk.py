@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import mmap
 import os
 import queue
@@ -202,6 +201,8 @@ class DiskFile:
 
     def _cached(self) -> None:
         """Write through the cache from now on."""
+        import fcntl  # of Linux alone, like O_DIRECT
+
         flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
         fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~os.O_DIRECT)
         self.direct = False

@@ -6,7 +6,6 @@ OpenMP (numba's prange, torch) makes waiting threads spin: on a busy machine tha
 from __future__ import annotations
 
 import math
-import os
 import threading
 from collections.abc import Sequence
 from queue import SimpleQueue
@@ -14,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import problem
 
-_threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 16)
+_threads = min(available_cores(), 16)
 _tasks: SimpleQueue[_Task | None] | None = None  # of the helpers, which are started with the first of them
 _lock = threading.Lock()
 _caller = threading.local()
