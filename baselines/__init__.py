@@ -1,4 +1,4 @@
-"""The systems that the paper compares with, composed from the parts of `method`."""
+"""What Spike4DGS is compared with: images, starts, motions and recipes of others, fitted by the trainer of `method`."""
 
 from typing import TYPE_CHECKING
 

@@ -42,6 +42,7 @@ class SpikeRenderSettings(Settings):
 class SpikeRender(Supervision):
     """The loss of the module's text, for the training views of one scene."""
 
+    label = "SpikeGS's loss"
     defaults = SpikeRenderSettings()
 
     def __init__(self, settings: SpikeRenderSettings, scene: TrainingScene) -> None:

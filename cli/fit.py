@@ -21,6 +21,7 @@ from typing import Any
 from rich.console import Console
 from tyro.conf import Positional
 
+from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.environment import choose_device, command_line, device_type, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
@@ -34,7 +35,7 @@ from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.predictions import MethodInfo
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.held_out_pose import PosedRecipe
+from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.recordings.comparison import compare, mean_residual, residuals, write_sheet
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores, held_out_views, judge_held_out
@@ -85,7 +86,7 @@ def fit(
         with _timed(times, "opening"):
             recording = open_recording(scene, seed)
         with _timed(times, "poses and clocks"):
-            own_poses = isinstance(wanted, PosedRecipe)  # it estimates them anyway
+            own_poses = isinstance(wanted, RecipeMethod) and wanted.initialization.estimates_poses
             checked = self_calibrated(recording, "given" if own_poses else poses, clocks, seed)
             recording = checked.recording
         origin = _poses(recording, wanted, "poses" in checked.changed)
@@ -96,7 +97,7 @@ def fit(
         times["fit"] = saved.provenance.fit_seconds
         cameras = saved.provenance.cameras
         with _timed(times, "sheet"):
-            found = compare(wanted, saved.model, recording.training, cameras, on)
+            found = compare(wanted, saved.model, recording.training, cameras, on, TFP)
             write_sheet(out / SHEET, found, f"{saved.title}: training views, residual {mean_residual(found):.2f} dB")
         with _timed(times, "video"):
             slow_motion = _write_video(out / VIDEO, saved)
@@ -143,7 +144,7 @@ def _scores(judged: HeldOutScores) -> str:
 
 def _poses(recording: Recording, method: Method, adjusted: bool) -> str:
     """Return in words where the poses of a fit come from."""
-    if isinstance(method, PosedRecipe):
+    if isinstance(method, RecipeMethod) and method.initialization.estimates_poses:
         start = method.recipe.initialization
         return f"estimated by the method ({start}), then moved to those {recording.poses}"
     return f"{recording.poses}, then adjusted" if adjusted else recording.poses
@@ -180,7 +181,7 @@ def _fitted(
 
 def _fitted_cameras(model: Any, given: tuple[Camera, ...]) -> tuple[Camera, ...]:
     """Return the training cameras as the fit left them, where the model knows them."""
-    return getattr(getattr(model, "model", model), "cameras", ()) or given
+    return getattr(model, "cameras", ()) or given
 
 
 def _provenance(method: Method, recording: Recording, request: FitRequest, changed: tuple[str, ...]) -> Provenance:

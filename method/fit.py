@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,10 +28,11 @@ from spike4dgs.method.images.training import (
 )
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.supervision.base import Supervision
-from spike4dgs.method.torch_state import kept_random_state, seeded
+from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.made_scene import made_scene
@@ -63,11 +64,14 @@ class Algorithm:
     implements; empty for the trainer, which takes any of the table.
     """
 
+    label: str | None  # in descriptions of recipes; None: the motion's name
     settings: SettingsByPart
     fit: Callable[[FitJob], Model]
     published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
     supervisions: tuple[str, ...] = ()
+    calibrated: bool = False  # its loss compares with spikes of the cameras' calibrated response
     rasterizes: bool = True  # renders Gaussians, which on CUDA needs numba-cuda
+    refines: bool = True  # its models have `refine`
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class RecipeMethod:
     """
 
     def __init__(self, recipe: Recipe, parts: Parts, description: str = "") -> None:
-        self.name, self.recipe, self.description = recipe.name, recipe, description
+        self.name, self.recipe = recipe.name, recipe
         self.images = _part(parts.images, recipe, "images")
         self.initialization = _part(parts.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe, "motion")
@@ -102,7 +106,14 @@ class RecipeMethod:
         self.settings = follow_images(found, recipe.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
         self.rasterizes = self.algorithm.rasterizes
-        self.given: tuple[str, ...] = GIVEN
+        posed = self.initialization.estimates_poses
+        self.refines_views = posed and self.algorithm.refines
+        if self.refines_views:
+            self.params["refinement"] = asdict(REFINEMENT)
+        corrected = [getattr(self.settings[part], FLAT_FIELD, False) for part in ("images", "initialization")]
+        calibrated = any(corrected) or self.initialization.calibrated or self.algorithm.calibrated
+        self.given = tuple(name for name, used in zip(GIVEN, (not posed, calibrated), strict=True) if used)
+        self.description = description or describe(recipe, parts, self.algorithm)
         self.trained_on: tuple[str, ...] = ()
         if learned := getattr(self.images, "learned", lambda: None)():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
@@ -159,6 +170,21 @@ def short(settings: SettingsByPart) -> dict[str, Settings]:
     return scaled({**settings, "images": replace(images, time_spacing_ticks=30)}, 0.005)
 
 
+def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
+    """Return one line that says what a recipe is, from its parts' labels."""
+    images, supervision = parts.images[recipe.images], parts.supervision.get(recipe.supervision)
+    flat = recipe.settings.get("images.flat_field") and recipe.images != "msdi"
+    named = (
+        (getattr(algorithm, "label", None), recipe.motion),
+        (getattr(images, "label", None), recipe.images),
+        (getattr(supervision, "label", None), recipe.supervision),
+        (parts.initialization[recipe.initialization].label, recipe.initialization),
+    )
+    motion, made, loss, start = (name if label is None else label for label, name in named)
+    made = f"images {made}" + (", corrected by calibration" if flat else "")
+    return "; ".join(filter(None, (motion, made, loss, start)))
+
+
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:
     """Return settings whose initialisation corrects images where the fit's are corrected, unless overridden."""
     first = settings["initialization"]
@@ -184,7 +210,7 @@ def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
     def fit(job: FitJob) -> FittedModel:
         return fit_gaussians(job, MotionSpec(recipe.motion, job.extent, job.settings["motion"]), motion, supervision)
 
-    return Algorithm(settings, fit, motion.published)
+    return Algorithm(motion.label, settings, fit, motion.published, calibrated=supervision.calibrated)
 
 
 def fit_gaussians(
@@ -222,15 +248,6 @@ def _part(table: Mapping[str, T], recipe: Recipe, part: str) -> T:
     if name not in table:
         raise problem(f"recipe {recipe.name}", f"{part} among {', '.join(sorted(table))}", repr(name), "correct it")
     return table[name]
-
-
-def check_device(device: str) -> None:
-    """Raise UserError unless torch can compute on `device`."""
-    try:
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as e:
-        found = f"{device!r} ({str(e).splitlines()[0][:80]})"
-        raise problem("device", "cpu, or a CUDA device of this machine", found, "use --device cpu") from None
 
 
 def measure(start: Start, scene: TrainingScene) -> Extent:

@@ -9,6 +9,16 @@ import numpy as np
 import torch
 
 from spike4dgs.benchmark.environment import device_type
+from spike4dgs.benchmark.errors import problem
+
+
+def check_device(device: str) -> None:
+    """Raise UserError unless torch can compute on `device`."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as e:
+        found = f"{device!r} ({str(e).splitlines()[0][:80]})"
+        raise problem("device", "cpu, or a CUDA device of this machine", found, "use --device cpu") from None
 
 
 def seeded(seed: int, step: int) -> torch.Generator:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from rich.table import Table
 from tyro.conf import Positional
 
-from spike4dgs.baselines.recipes import METHODS, SELF_CALIBRATED
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
@@ -24,6 +23,7 @@ from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.recipes import METHODS, SELF_CALIBRATED
 
 Float64 = NDArray[np.float64]
 Row = dict[str, float | str]

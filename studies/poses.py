@@ -13,7 +13,6 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.starts.colmap import UNCALIBRATED, clip_means, map_views
 from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
@@ -29,6 +28,7 @@ from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.starts.msdi import infer, matched_poses, unposed
 from spike4dgs.method.starts.rig import rig, window_means
+from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
 from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
 
 Row = dict[str, float | int | str | None]
@@ -50,7 +50,7 @@ def _rig(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> 
 
 
 def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    focal = None if calibrated else UNCALIBRATED.focal_prior
+    focal = None if calibrated else FOCAL_PRIOR
     found = map_views(scene, images, seed, focal_prior=focal)
     return Estimate(found.cameras, len(found.points))
 

@@ -143,4 +143,5 @@ TFI = ImageMaker(
     definition="1 / (the inter-spike interval that contains the start of tick t)",
     source="Zhu, Dong, Huang, Tian: A retina-inspired sampling method for visual texture reconstruction, ICME 2019",
     rate=lambda stream, tick, _: tfi_image(stream, tick),
+    label="from spike intervals",
 )

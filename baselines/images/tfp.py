@@ -137,4 +137,5 @@ TFP = ImageMaker(
     source="Zhu, Dong, Huang, Tian: A retina-inspired sampling method for visual texture reconstruction, ICME 2019",
     rate=lambda stream, tick, settings: tfp_image(stream, tick, settings.half_window),
     settings=TfpSettings(),
+    label="from spike counts",
 )

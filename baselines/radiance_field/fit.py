@@ -165,4 +165,6 @@ SETTINGS = {
     "supervision": FieldSpikeSettings(),
     "occupancy": OccupancySettings(),
 }
-RADIANCE_FIELD = Algorithm(SETTINGS, fit_radiance_field, PUBLISHED, ("spike",), rasterizes=False)
+RADIANCE_FIELD = Algorithm(
+    "a deforming radiance field", SETTINGS, fit_radiance_field, PUBLISHED, ("spike",), rasterizes=False, refines=False
+)

@@ -232,3 +232,6 @@ class RadianceModel:
             lambda: DynamicField(shape, Bounds(**values), brightest, torch.Generator()), file.part("field")
         )
         return cls(field.to(device), file.provenance.duration_us, device)
+
+
+KINDS = {RadianceModel.KIND: RadianceModel.from_file}  # for the entry points `spike4dgs.models`

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.starts.colmap import clip_means
 from spike4dgs.baselines.starts.dust3r_network import Dust3r, load_dust3r
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
@@ -33,6 +32,7 @@ from spike4dgs.benchmark.weights import NamedWeights, WeightFile, find_weights
 from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.structure_from_motion import clip_means
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

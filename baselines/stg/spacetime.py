@@ -105,6 +105,7 @@ class SpacetimeLite(PolynomialMotion):
 class Spacetime(SpacetimeLite):
     """The motion `spacetime`: albedo, a view feature and a time feature, and the decoder."""
 
+    label = "spacetime Gaussians"
     defaults = SpacetimeSettings()
     settings: SpacetimeSettings
 
@@ -137,3 +138,6 @@ class Spacetime(SpacetimeLite):
         """Return the decoder's layers and their learning rate."""
         rate = self.settings.lr_decoder
         return {"decoder": (list(self.decoder.parameters()), Decay(rate, rate))}
+
+
+MOTIONS = {"spacetime": Spacetime, "spacetime-lite": SpacetimeLite}  # for the entry points `spike4dgs.motions`

@@ -250,4 +250,4 @@ SETTINGS = {
     "motion": TrackingSettings(),
     "supervision": PixelSettings(),
 }
-TRACKING = Algorithm(SETTINGS, fit_tracking, PUBLISHED, ("pixel",))
+TRACKING = Algorithm("Dynamic 3D Gaussians", SETTINGS, fit_tracking, PUBLISHED, ("pixel",))

@@ -6,18 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.runs.provenance import Provenance
-from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
-from spike4dgs.method.models.fitted_model import count_bytes
+from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
-from spike4dgs.method.splat import PixelFilter, Splats, Views, render
-from spike4dgs.method.training_views.pinholes import through_lens
+from spike4dgs.method.splat import Splats
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +90,7 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedModel:
+class TrackedModel(GaussianModel):
     """The Gaussians of the first time and their tracks."""
 
     KIND: ClassVar = "tracking"
@@ -104,7 +100,7 @@ class TrackedModel:
     duration_us: float
 
     @property
-    def device(self) -> str:
+    def device(self) -> str:  # type: ignore[override]
         """The device of the model's tensors."""
         return str(self.gaussians.means.device)
 
@@ -122,29 +118,9 @@ class TrackedModel:
         colors[self.tracks.rows] = values["colors"]
         return replace(g, means=means, quats=quats, colors=colors)
 
-    @through_lens
-    @torch.no_grad()
-    def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
-        views = Views.from_cameras([camera], device=self.device)
-        return self.rendered(self.splats(t_us), views)[0].clamp(min=0).cpu().numpy()
-
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
         return self.at(t_us).splats()
-
-    @property
-    def pixel_filter(self) -> PixelFilter:
-        """The customary one."""
-        return PixelFilter()
-
-    def rendered(self, splats: Splats, views: Views) -> Tensor:
-        """Return gray radiance [V, H, W] of what `splats` returns."""
-        return self.image(render(splats, views).image, views)
-
-    def image(self, image: Tensor, views: Views) -> Tensor:
-        """Return gray radiance [V, H, W] of the rendered channel [V, H, W, 1]."""
-        return image[..., 0]
 
     def save(self, path: Path, provenance: Provenance) -> None:
         """Write the model to one file; see `saved_model.load_model`."""
@@ -160,3 +136,6 @@ class TrackedModel:
         tracks = Tracks(**{k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()})
         tracks.check(gaussians)
         return cls(gaussians, tracks, file.provenance.duration_us)
+
+
+KINDS = {TrackedModel.KIND: TrackedModel.from_file}  # for the entry points `spike4dgs.models`

@@ -153,4 +153,5 @@ ADAPTIVE = ImageMaker(
     "nonparametric regression, Math. Methods Stat. 6, 1997",
     rate=adaptive_image,
     settings=AdaptiveSettings(),
+    label="from the longest windows of constant light",
 )

@@ -65,6 +65,7 @@ class ImageMaker:
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
     rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
+    label: str | None = None  # in descriptions of recipes, after "images"; None: the name
 
     def with_settings(self, settings: Settings) -> ImageMaker:
         """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""

@@ -115,4 +115,5 @@ INTERVALS = ImageMaker(
     rate=interval_image,
     rate_over=intervals,
     settings=IntervalSettings(),
+    label="from the longest windows of constant light, and known spans where light changes",
 )

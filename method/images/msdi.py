@@ -53,6 +53,7 @@ def msdi_maker(device: str) -> ImageMaker:
         learned=partial(learned_from, WEIGHTS.in_use, read_card),
         corrected=partial(msdi_image, device=device),
         made_on=msdi_maker,
+        label="by MSDI",
     )
 
 

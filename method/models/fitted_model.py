@@ -8,7 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.runs.provenance import Provenance
@@ -19,7 +21,9 @@ from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
 from spike4dgs.method.models.modules import make_filled
 from spike4dgs.method.models.names import BACKGROUND, from_file_names, motion_settings, to_file_names
-from spike4dgs.method.motion.table import MOTIONS, Extent, Motion
+from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.motion.table import motion_named
+from spike4dgs.method.pose_refinement import refine_pose
 from spike4dgs.method.settings import Settings, make_settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Repeated, join
@@ -34,7 +38,7 @@ _MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
 class MotionSpec:
     """The source of a motion model: with it and the model's state, the model can be built again."""
 
-    name: str  # in `motion.table.MOTIONS`
+    name: str  # as `motion.table.motion_named` knows it
     extent: Extent
     settings: Settings  # the motion's own
 
@@ -56,7 +60,7 @@ class MotionSpec:
         extent = Extent(low, high, scale, ticks, whole(e.pop("width"), 1, MAX_SIDE))
         if e or len(low) != 3 or len(high) != 3:
             raise ValueError(f"an extent of low, high, scale, n_ticks and width, and not {shown(value['extent'])}")
-        defaults = MOTIONS[value["name"]].defaults
+        defaults = motion_named(value["name"]).defaults
         settings = make_settings(motion_settings(dict(value["settings"]), defaults), where, defaults)
         for setting in asdict(settings).values():
             if type(setting) is int:  # of layers, levels, features: loops have so many turns
@@ -64,8 +68,48 @@ class MotionSpec:
         return cls(value["name"], extent, settings)
 
 
+class GaussianModel:
+    """A model that renders what its `splats` are at a time."""
+
+    duration_us: float
+    device: str
+    pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
+
+    def splats(self, t_us: float) -> Splats:
+        """Return what is rendered at `t_us`."""
+        raise NotImplementedError
+
+    def image(self, image: Tensor, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
+        return image[..., 0]
+
+    def rendered(self, splats: Splats, views: Views) -> Tensor:
+        """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
+        f = self.pixel_filter
+        return self.image(render(splats, views, eps2d=f.variance, antialiased=f.compensated).image, views)
+
+    @through_lens
+    @torch.no_grad()
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
+        views = Views.from_cameras([camera], device=self.device)
+        with one_torch_thread():
+            return self._render(views, t_us)[0].clamp(min=0).cpu().numpy()
+
+    def _render(self, view: Views, t_us: float) -> Tensor:
+        return self.rendered(self.splats(t_us), view)
+
+    def refine(self, camera: Camera, image: Float32, background: NDArray[np.bool_], t_us: float) -> Camera:
+        """Return the camera near `camera` whose render is most like `image` [H, W]; see `refine_pose`."""
+        with torch.no_grad():
+            splats = self.splats(t_us)
+        _, z = camera.project(splats.means.double().cpu().numpy())
+        depth_m = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+        return refine_pose(lambda v: self.rendered(splats, v), camera, image, background, depth_m, device=self.device)
+
+
 @dataclass(frozen=True, eq=False)
-class FittedModel:
+class FittedModel(GaussianModel):
     """Gaussians and how they move, and others that do not."""
 
     KIND: ClassVar = "gaussians"
@@ -86,25 +130,12 @@ class FittedModel:
         tensors = [t for g in (*self.pieces, self.background) for t in g.tensors().values()]
         return count_bytes([*tensors, *self.motion.state_dict().values()])
 
-    @through_lens
-    @torch.no_grad()
-    def render(self, camera: Camera, t_us: float) -> Float32:
-        """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""
-        views = Views.from_cameras([camera], device=self.device)
-        with one_torch_thread():
-            return self._render(views, t_us)[0].clamp(min=0).cpu().numpy()
-
     def _render(self, view: Views, t_us: float) -> Tensor:
         """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
         still = self._repeated.in_view(view) if len(self.background) and self.device == "cpu" else None
         if still is None:
             return self.rendered(self.splats(t_us), view)
         return self.image(still.render(self._moving(t_us), [0]).image, view)
-
-    def rendered(self, splats: Splats, views: Views) -> Tensor:
-        """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
-        f = self.pixel_filter
-        return self.image(render(splats, views, eps2d=f.variance, antialiased=f.compensated).image, views)
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
@@ -140,7 +171,7 @@ class FittedModel:
         """
         spec = MotionSpec.from_dict(file.config["motion"], file.provenance.name)
         motion = make_filled(
-            lambda: MOTIONS[spec.name](spec.extent, spec.settings, torch.Generator()), file.part("motion")
+            lambda: motion_named(spec.name)(spec.extent, spec.settings, torch.Generator()), file.part("motion")
         )
         count = whole(file.config["pieces"], 1, len(file.tensors))
         *pieces, background = (

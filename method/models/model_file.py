@@ -1,7 +1,6 @@
 """Fitted models on disk: one safetensors file with tensors, their meaning and their provenance.
 
-Nothing in it is code. `kind` names the class that reads the tensors (`saved_model.KINDS`), `config` holds its other
-arguments.
+Nothing in it is code. `kind` names the reader of the tensors (`saved_model.GROUP`), `config` holds its other arguments.
 """
 
 from __future__ import annotations

@@ -6,21 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from spike4dgs.baselines.radiance_field.model import RadianceModel
-from spike4dgs.baselines.tracking.model import TrackedModel
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Model
+from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.benchmark.runs.provenance import Provenance
-from spike4dgs.method.fit import check_device
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.model_file import FIX, ModelFile, read_model
+from spike4dgs.method.torch_state import check_device
 
-# Readers of the tensors of each kind: file, device -> model. Its class writes that kind in `save`.
-KINDS: dict[str, Callable[[ModelFile, str], Model]] = {
-    FittedModel.KIND: FittedModel.from_file,
-    TrackedModel.KIND: TrackedModel.from_file,
-    RadianceModel.KIND: RadianceModel.from_file,
-}
+# Entry points, of this package too: mappings from kind to a reader (file, device) -> model. Its class writes that kind
+# in `save`.
+GROUP = "spike4dgs.models"
+KINDS: dict[str, Callable[[ModelFile, str], Model]] = {FittedModel.KIND: FittedModel.from_file}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +41,11 @@ def load_model(path: Path | str, device: str = "cpu") -> SavedModel:
     """
     check_device(device)
     file = read_model(Path(path))
-    if file.kind not in KINDS:
-        raise problem(path, f"a model of kind {', '.join(KINDS)}", repr(file.kind), FIX)
+    readers = find_plugins(GROUP, "model", lambda *_: None)
+    if file.kind not in readers:
+        raise problem(path, f"a model of kind {', '.join(readers)}", repr(file.kind), FIX)
     try:
-        return SavedModel(KINDS[file.kind](file, device), file.provenance)
+        return SavedModel(readers[file.kind].value(file, device), file.provenance)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as e:  # another version
         found = f"one that this version cannot read ({type(e).__name__}: {e})"
         raise problem(path, "a fitted model", found[:400], FIX) from None

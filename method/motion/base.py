@@ -36,6 +36,7 @@ class Motion(nn.Module):
     settings that it was made from: a saved model is built again from these.
     """
 
+    label: ClassVar[str | None] = None  # in descriptions of recipes; None: the name
     defaults: ClassVar[Settings] = Settings()  # of the model's own settings
     published: ClassVar[Mapping[str, Any]] = {}  # overrides that give the step counts of the publication
     moves: ClassVar[bool] = True  # False: all times are the same, and only the static stage is trained

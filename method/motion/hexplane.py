@@ -166,6 +166,7 @@ class HexPlaneDeformation(nn.Module):
 class HexPlaneMotion(HexPlaneDeformation, Motion):
     """The motion `hexplane`: the deformation with 4DGS's learning rates and regularisers."""
 
+    label = "4DGS"
     defaults = HexPlaneSettings()
     # 4DGS's preset for several views sees 3,000 and 15,000 single images: steps of four here.
     published = {"trainer.coarse_steps": 750, "trainer.fine_steps": 3750}

@@ -35,6 +35,7 @@ class PathSettings(PolynomialSettings):
 class Paths(PolynomialMotion):
     """Polynomial paths through the whole clip, in pieces where it is long."""
 
+    label = "Gaussians on paths before a fixed background"
     defaults = PathSettings()
     settings: PathSettings
 

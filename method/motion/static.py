@@ -13,6 +13,7 @@ from spike4dgs.method.splat import Splats
 class Static(Motion):
     """Gaussians that are the same at all times; it has no settings."""
 
+    label = "3DGS, nothing moves"
     published = {"trainer.coarse_steps": 7500}  # a static 3DGS sees 30,000 single images: steps of four here
     moves = False
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from spike4dgs.baselines.stg.spacetime import Spacetime, SpacetimeLite
-from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.benchmark.plugins import find_plugins
+from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.hexplane import HexPlaneMotion
 from spike4dgs.method.motion.paths import Paths
 from spike4dgs.method.motion.static import Static
 
-MOTIONS: dict[str, type[Motion]] = {
-    "static": Static,
-    "hexplane": HexPlaneMotion,
-    "spacetime": Spacetime,
-    "spacetime-lite": SpacetimeLite,
-    "paths": Paths,
-}
+GROUP = "spike4dgs.motions"  # entry points of other packages, and of `baselines`
+MOTIONS: dict[str, type[Motion]] = {"static": Static, "hexplane": HexPlaneMotion, "paths": Paths}
 
-__all__ = ["MOTIONS", "Extent", "Motion"]
+
+def motion_named(name: str) -> type[Motion]:
+    """Return a motion of this package or of another one. Raises KeyError for an unknown name."""
+    if name in MOTIONS:
+        return MOTIONS[name]
+    found: type[Motion] = find_plugins(GROUP, "motion", lambda *_: None, MOTIONS)[name].value
+    return found

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.method import Method, Model
 from spike4dgs.benchmark.reports.error_map import show_error, show_error_scale
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
@@ -21,11 +20,10 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32, encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.images.training import ImageSettings, as_measured, make_images
+from spike4dgs.method.images.training import ImageMaker, ImageSettings, as_measured, make_images
 
 TIMES = 9  # of the clip, that residuals are taken at
 SHOWN = (1, 4, 7)  # those of them that the sheet shows
-OTHER = "tfp"  # images for a method that is no recipe
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +37,16 @@ class Comparison:
     maker: str  # of the images
 
 
-def compare(method: Method, model: Model, scene: TrainingScene, cameras: Sequence[Camera], device: str) -> Comparison:
-    """Return the model's images of the training cameras beside those made from their spikes."""
+def compare(
+    method: Method, model: Model, scene: TrainingScene, cameras: Sequence[Camera], device: str, other: ImageMaker
+) -> Comparison:
+    """Return the model's images of the training cameras beside those made from their spikes.
+
+    Those are the recipe's own; `other` makes them for a method that is no recipe.
+    """
     recipe = method if isinstance(method, RecipeMethod) else None
-    maker = recipe.recipe.images if recipe else OTHER
-    make = recipe.images if recipe else IMAGES[OTHER]
+    maker = recipe.recipe.images if recipe else other.name
+    make = recipe.images if recipe else other
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
     ticks, images = make_images(scene, make, replace(settings, max_times=TIMES), device)
     times = tuple(tick * 1e6 / scene.rate_hz for tick in ticks)

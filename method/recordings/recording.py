@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from spike4dgs.baselines.starts.colmap import UNCALIBRATED, clip_means, map_views
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file, sha256_json
 from spike4dgs.benchmark.metrics.pose_error import Sim3
@@ -23,6 +22,7 @@ from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.recordings.camera_facts import CameraFacts, camera_facts
 from spike4dgs.method.recordings.survey import survey_gains, survey_streams
+from spike4dgs.method.starts.structure_from_motion import FEATURES, FOCAL_PRIOR, clip_means, map_views
 
 GIVEN = "given by the scene"
 ESTIMATED = "estimated with COLMAP, the focal length too: the unit of length is the array's largest distance"
@@ -81,7 +81,7 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     scene = surveyed.scene
     rates = clip_means(scene)
     white = max(float(np.percentile(rates, WHITE_PERCENTILE)), 1e-6)
-    cameras = map_views(scene, rates / np.float32(white), seed, UNCALIBRATED, UNCALIBRATED.focal_prior).cameras
+    cameras = map_views(scene, rates / np.float32(white), seed, FEATURES, FOCAL_PRIOR).cameras
     if len(cameras) < 2:
         fix = "calibrate the array with `spike4dgs calibrate-rig`, and record with its calibration"
         raise problem(root, "poses, or views in which COLMAP finds them", f"poses of {len(cameras)} views", fix)
@@ -102,7 +102,7 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
 def _guess(names: Sequence[str], stream: SpikeStream) -> tuple[Camera, ...]:
     """Return cameras side by side that look along y: only a frame for what COLMAP finds."""
     size, R = (stream.width, stream.height), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    focal, middle = UNCALIBRATED.focal_prior * stream.width, (stream.width / 2, stream.height / 2)
+    focal, middle = FOCAL_PRIOR * stream.width, (stream.width / 2, stream.height / 2)
     return tuple(
         Camera(name, *size, focal, focal, *middle, R, -R @ np.array([float(i), 0.0, 0.0]))
         for i, name in enumerate(names)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.starts.features import FeatureSettings, find_features
 from spike4dgs.method.starts.matched_poses import Seen, read_matches
+from spike4dgs.method.starts.structure_from_motion import FeatureSettings, find_features
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

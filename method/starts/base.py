@@ -40,3 +40,6 @@ class Initialization:
 
     start: Callable[[StartRequest], Start]
     settings: Settings = Settings()
+    label: str | None = None  # in descriptions of recipes; None: the name
+    estimates_poses: bool = False  # those given serve for nothing but the frame
+    calibrated: bool = False  # takes the cameras' calibrations, whether `flat_field` or not

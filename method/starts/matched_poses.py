@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.msdi.pose import LEAST_POINTS, solve_pose
-from spike4dgs.method.starts.features import (
+from spike4dgs.method.starts.structure_from_motion import (
     NOTHING,
     Features,
     FeatureSettings,

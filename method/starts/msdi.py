@@ -41,7 +41,6 @@ from spike4dgs.method.msdi.shrink import shrink
 from spike4dgs.method.msdi.weights import load_network, weights_path
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
-from spike4dgs.method.starts.features import Mapping
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
 from spike4dgs.method.starts.rig import (
     Cloud,
@@ -53,6 +52,7 @@ from spike4dgs.method.starts.rig import (
     thin,
     window_means,
 )
+from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
 Float32 = NDArray[np.float32]

@@ -32,6 +32,8 @@ Render = Callable[[float], Tensor]  # t in [0, 1] -> the sample's views at that 
 class Supervision(nn.Module):
     """A loss, with parameters of its own where it needs some. It is made from (settings, scene)."""
 
+    label: ClassVar[str | None] = None  # in descriptions of recipes; None: the name
+    calibrated: ClassVar[bool] = False  # compares with spikes of the cameras' calibrated response
     defaults: ClassVar[Settings] = Settings()  # of the supervision's own settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:

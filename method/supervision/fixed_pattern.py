@@ -73,6 +73,7 @@ class FixedPatternSettings(PixelSettings):
 class FixedPattern(Supervision):
     """The loss of the module's text, for the training views of one scene."""
 
+    label = "the cameras' fixed patterns estimated from the clip"
     defaults = FixedPatternSettings()
     gain: Tensor  # γ [C, H, W]
     dark: Tensor  # d [C, H, W], in white

@@ -25,6 +25,7 @@ class Pixel(Supervision):
     w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14). An `ease` makes |d| Huber's loss.
     """
 
+    label = ""
     defaults = PixelSettings()
 
     def __init__(self, settings: PixelSettings, scene: TrainingScene) -> None:

@@ -35,6 +35,8 @@ class SpikeSettings(Settings):
 class SpikeRate(Supervision):
     """Mean squared difference of simulated and recorded mean spikes per tick, after the published gamma."""
 
+    label = "SpikeNeRF's loss"
+    calibrated = True
     defaults = SpikeSettings()
 
     def __init__(self, settings: SpikeSettings, scene: TrainingScene) -> None:

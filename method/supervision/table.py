@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from spike4dgs.baselines.spike_render import SpikeRender
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
@@ -42,6 +41,8 @@ class PixelAndSpikeSettings(SpikeSettings, PixelSettings):
 class PixelAndSpike(Sum):
     """`pixel` + `spike`: the combination in Table 4 of the Spike4DGS paper."""
 
+    label = "pixel loss and SpikeNeRF's"
+    calibrated = True
     defaults = PixelAndSpikeSettings()
 
     def __init__(self, settings: PixelAndSpikeSettings, scene: TrainingScene) -> None:
@@ -56,6 +57,8 @@ class SynergySettings(SpikeVariationSettings, PixelSettings):
 class Synergy(Sum):
     """Spike-pixel synergy supervision of Spike4DGS: pixel loss + spike variation loss (eq. 18)."""
 
+    label = "SPSS"
+    calibrated = True
     defaults = SynergySettings()
 
     def __init__(self, settings: SynergySettings, scene: TrainingScene) -> None:
@@ -66,7 +69,6 @@ SUPERVISIONS: dict[str, type[Supervision]] = {
     "pixel": Pixel,
     "fixed-pattern": FixedPattern,
     "spike": SpikeRate,
-    "spike-render": SpikeRender,
     "pixel+spike": PixelAndSpike,
     "spss": Synergy,
 }

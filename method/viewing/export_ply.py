@@ -19,10 +19,9 @@ import torch
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
-from spike4dgs.baselines.tracking.model import TrackedModel
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_bytes
-from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.models.fitted_model import GaussianModel
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.splat.types import ALPHA_MIN
@@ -51,7 +50,7 @@ def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: s
     """
     saved = load_model(model, device)
     about, fitted = saved.provenance, saved.model
-    if not isinstance(fitted, FittedModel | TrackedModel):
+    if not isinstance(fitted, GaussianModel):
         fix = "`spike4dgs render` makes videos of it"
         raise problem(model, "a model of Gaussians", f"{about.name}, a radiance field", fix)
     if not 1 <= times <= about.n_ticks:

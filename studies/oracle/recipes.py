@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from spike4dgs.baselines.recipes import METHODS, PARTS
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.method import FitRequest, Model
+from spike4dgs.benchmark.method import FitRequest, Model, find_methods
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.calibration import Calibration
@@ -132,12 +132,16 @@ def _ladder(name: str, truth: Path, samples: int) -> Ladder:
 
 def _recipe_method(name: str) -> RecipeMethod:
     """Return the method of a recipe. Raises UserError where it has no oracles."""
-    known = {n: m for n, m in METHODS.items() if type(m) is RecipeMethod and m.recipe.motion not in PARTS.algorithms}
+    known = {
+        name: method
+        for name, method in find_methods().items()
+        if isinstance(method, RecipeMethod)
+        and not method.initialization.estimates_poses
+        and method.recipe.motion not in PARTS.algorithms
+    }
     if name not in known:
         raise problem("--oracle", f"methods among {', '.join(sorted(known))}", repr(name), "name one of them")
-    method = known[name]
-    assert isinstance(method, RecipeMethod)
-    return method
+    return known[name]
 
 
 # ---------------------------------------------------------------- what an oracle puts in the place of a part

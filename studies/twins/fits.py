@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS
+from spike4dgs.baselines.recipes import METHODS, PARTS
 from spike4dgs.benchmark.environment import peak_memory_mb, reset_peak_memory
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, training_for
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
@@ -22,10 +22,10 @@ from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.motion.paths import Paths
+from spike4dgs.method.recipes import SPIKE4DGS_X
 from spike4dgs.studies.speed_error.measurement import Column, Measurement, Point, Request, Series, Size
 
 GROUP = "Fits"
-X_RECIPE = next(recipe for recipe in BEYOND if recipe.name == "spike4dgs-x")
 _COLUMNS = (
     Column("seconds", "fit, s"),
     Column("rms", "RMS error, radiance"),
@@ -53,7 +53,6 @@ def fitted(recipe: Recipe, trial: Trial, scene: Scene, request: Request, warm_up
     parts = PARTS if trial.pieces is None else replace(PARTS, motion={**PARTS.motion, "paths": cut_in(trial.pieces)})
     changed = replace(recipe, settings={**recipe.settings, **trial.settings})
     method = RecipeMethod(changed, parts)
-    method.given = METHODS[recipe.name].given  # type: ignore[attr-defined]
     fit = FitRequest(Budget(trial.scale), request.device, request.seed)
     if warm_up:
         method.warm_up(fit)
@@ -102,11 +101,11 @@ def _steps(request: Request) -> float:
 def _budgets(request: Request) -> Iterator[Series]:
     shares = {0.1: "", 0.3: "", 1.0: "chosen", request.pick(2.0, 3.0, 4.0): "exact"}
     trials = tuple(Trial(f"{s:g} x quick", {}, s * _steps(request), role=role) for s, role in shares.items())
-    yield from _series(request, X_RECIPE, trials)
+    yield from _series(request, SPIKE4DGS_X, trials)
 
 
 def _caps(request: Request) -> Iterator[Series]:
-    usual, own = DensitySettings(), X_RECIPE.settings
+    usual, own = DensitySettings(), SPIKE4DGS_X.settings
     trials = []
     for factor, role in ((1 / 16, ""), (1 / 4, ""), (1.0, "chosen"), (100.0, "exact")):
         limits = {
@@ -116,7 +115,7 @@ def _caps(request: Request) -> Iterator[Series]:
         }
         name = f"{factor * usual.max_per_pixel:g} a pixel" if factor <= 1 else "no limit"
         trials.append(Trial(name, limits, _steps(request), role=role))
-    yield from _series(request, X_RECIPE, tuple(trials))
+    yield from _series(request, SPIKE4DGS_X, tuple(trials))
 
 
 def _freezing(request: Request) -> Iterator[Series]:
@@ -126,13 +125,13 @@ def _freezing(request: Request) -> Iterator[Series]:
         for name, v in limits.items()
     ]
     off = Trial("nothing frozen", {"trainer.freeze_background": False}, _steps(request), role="exact")
-    yield from _series(request, X_RECIPE, (*on, off))
+    yield from _series(request, SPIKE4DGS_X, (*on, off))
 
 
 def _pieces(request: Request) -> Iterator[Series]:
     roles = {1: "chosen", 3: "", 5: "exact"}
     trials = (Trial(f"{n} piece{'s' if n > 1 else ''}", {}, _steps(request), n, role) for n, role in roles.items())
-    yield from _series(request, X_RECIPE, tuple(trials))
+    yield from _series(request, SPIKE4DGS_X, tuple(trials))
 
 
 def _widths(request: Request) -> Iterator[Series]:

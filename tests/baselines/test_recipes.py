@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from spike4dgs.baselines.images.tfp import tfp_image
-from spike4dgs.baselines.recipes import BEYOND, METHODS, PARTS, POSED, RECIPES, SPIKE4DGS, SUPERVISED
+from spike4dgs.baselines.recipes import CALIBRATED, PARTS, POSED, RECIPES, SUPERVISED
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods, get_method
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.recipes import RECIPES as OURS
+
+METHODS = find_methods()
+ALL = (*OURS, *RECIPES, *CALIBRATED, *SUPERVISED, *POSED)
 
 TINY = Budget(scale=0.01)
 # One of each kind of fit that needs nothing that a user brings, and no features in the images.
@@ -42,12 +46,13 @@ def test_every_row_of_the_papers_tables_is_a_method() -> None:
     main = {recipe.name for recipe in RECIPES} - {"tfp+static"} | {"spike4dgs", "spike4dgs-x"}
     for number in (1, 2):
         assert set(published(number).rows) == main
-        assert set(published(number, "estimated").rows) <= {recipe.name for recipe in POSED}
+        posed = {recipe.name for recipe in POSED} | {"spike4dgs-uncalibrated"}
+        assert set(published(number, "estimated").rows) <= posed
     for number in (3, 4, 5, 7):
         assert set(published(number).rows) <= set(METHODS)
 
 
-@pytest.mark.parametrize("recipe", [*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED, *POSED], ids=lambda r: r.name)
+@pytest.mark.parametrize("recipe", ALL, ids=lambda r: r.name)
 def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
     motions = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane", "static": "static"}
     if recipe.name.startswith(("dy-", "spike4dgs")):
@@ -59,7 +64,10 @@ def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
         expected = ("+".join(middle[:at]) or ("msdi" if images == "msdi" else "rig")).removesuffix("-flat")
         assert recipe.initialization == expected
         assert recipe.supervision == ("+".join(middle[at + 1 :]) or "pixel")
-    assert (recipe.initialization not in ("rig", "msdi")) == (recipe in POSED)
+    method = METHODS[recipe.name]
+    assert isinstance(method, RecipeMethod) and method.initialization.estimates_poses == (
+        recipe.initialization not in ("rig", "msdi")
+    )
     assert recipe.images in PARTS.images and recipe.initialization in PARTS.initialization
     assert recipe.motion in {**PARTS.motion, **PARTS.algorithms}
 
@@ -211,7 +219,7 @@ def test_a_fit_resumes_from_its_own_checkpoint_only(scene: Scene, tmp_path: Path
 
 
 def test_recipes_that_are_compared_differ_in_one_part() -> None:
-    recipes = {r.name: r.as_dict() for r in (*RECIPES, *SPIKE4DGS, *BEYOND, *SUPERVISED, *POSED)}
+    recipes = {r.name: r.as_dict() for r in ALL}
 
     def differ(a: str, b: str) -> set[str]:
         return {k for k in recipes[a] if recipes[a][k] != recipes[b][k]} - {"name"}

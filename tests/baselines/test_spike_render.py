@@ -8,10 +8,12 @@ import pytest
 import torch
 from toy_world import GAIN, ToyWorld, run_neurons
 
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.spike_render import SpikeRender, SpikeRenderSettings
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.supervision.spike_cameras import fire
-from spike4dgs.method.supervision.table import SUPERVISIONS
+
+SUPERVISIONS = PARTS.supervision
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
 SETTINGS = SpikeRenderSettings()

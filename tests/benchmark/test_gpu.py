@@ -29,14 +29,14 @@ importlib.util.find_spec = lambda name, *a: None if name == "numba_cuda" else fo
 """
 _RUN = """
 from types import SimpleNamespace
-from spike4dgs.baselines.recipes import METHODS, PARTS
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark import plugins
 from spike4dgs.cli import main
-from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.method import Recipe, find_methods
 from spike4dgs.method.fit import RecipeMethod
 steps = {"trainer.coarse_steps": 4, "trainer.fine_steps": 4, "images.time_spacing_ticks": 20}
 tiny = RecipeMethod(Recipe("tiny", "msdi", "rig", "static", "pixel", steps), PARTS)
-methods = {"tiny": tiny, "nearest-view": METHODS["nearest-view"]}
+methods = {"tiny": tiny, "nearest-view": find_methods()["nearest-view"]}
 entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
 plugins.entry_points = lambda group: [entry]
 sys.exit(main(sys.argv[1:]))

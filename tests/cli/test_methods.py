@@ -7,9 +7,12 @@ from types import SimpleNamespace
 import pytest
 from dummy_methods import CountMethod
 
-from spike4dgs.baselines.recipes import METHODS, POSED, RECIPES
+from spike4dgs.baselines.recipes import POSED, RECIPES
 from spike4dgs.benchmark import plugins
+from spike4dgs.benchmark.method import find_methods
 from spike4dgs.cli import main
+
+METHODS = find_methods()
 
 
 def test_every_installed_method_has_one_line(capsys: pytest.CaptureFixture[str]) -> None:

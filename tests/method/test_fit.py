@@ -7,11 +7,12 @@ import pytest
 import torch
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import Budget, FitRequest, Model
+from spike4dgs.benchmark.method import Budget, FitRequest, Model, find_methods
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.splat import PixelFilter, set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
+
+METHODS = find_methods()
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.4)  # 10 px in 12 ms
 SHORT = Budget(scale=0.005)

@@ -12,6 +12,7 @@ from toy_fits import silent, surfaces
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -19,12 +20,13 @@ from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.splat import render
-from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+
+MOTIONS = PARTS.motion
+SUPERVISIONS = PARTS.supervision
 
 SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, piece_steps=3, views_per_step=3)
 SMALL = {"hexplane": {"mlp_width": 8, "features": 4}}  # of the motion

@@ -26,11 +26,11 @@ from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.lens import resample
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.method.fit import Parts
+from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.hard_cases.splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
-from spike4dgs.method.held_out_pose import PosedRecipe, RefinableModel, Refinement, refine_pose
+from spike4dgs.method.models.fitted_model import GaussianModel
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.pose_refinement import rigid_motion
+from spike4dgs.method.pose_refinement import Refinement, refine_pose, rigid_motion
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.starts.rig import rig
@@ -186,16 +186,22 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
         cameras = tuple(replace(c, t=c.t - c.R @ shift) for c in request.scene.cameras)
         return rig(replace(request.scene, cameras=cameras))
 
-    parts = Parts(IMAGES, {"shifted": Initialization(shifted)}, MOTIONS, SUPERVISIONS, {"tracking": TRACKING})
+    parts = Parts(
+        IMAGES,
+        {"shifted": Initialization(shifted, estimates_poses=True)},
+        MOTIONS,
+        SUPERVISIONS,
+        {"tracking": TRACKING},
+    )
     steps = {"trainer.coarse_steps": 60} if motion == "static" else {"motion.first_steps": 60, "motion.later_steps": 2}
     recipe = Recipe("posed", "tfp", "shifted", motion, "pixel", steps)
-    method = PosedRecipe(recipe, parts)
+    method = RecipeMethod(recipe, parts)
     assert method.refines_views and method.params["refinement"]["steps"] == 100
 
     world = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1)
     model = method.fit(world.training, FitRequest())
     truth = world.trace(world.held_out, 0.5)[0].astype(np.float32)
-    assert isinstance(model, RefinableModel)
+    assert isinstance(model, GaussianModel)
     found = model.refine(world.held_out, truth, np.ones_like(truth, bool), 3000.0)
     assert np.linalg.norm(found.center - world.held_out.center - shift) < 0.5 * np.linalg.norm(shift)
     before, after = (np.abs(model.render(c, 3000.0) - truth).mean() for c in (world.held_out, found))

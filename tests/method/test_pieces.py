@@ -19,8 +19,9 @@ from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.motion import paths as paths_module
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.paths import Paths, PathSettings
-from spike4dgs.method.motion.table import MOTIONS, Extent
+from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.schedule import choose_time, stages
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.starts.base import Initialization, Start

@@ -10,23 +10,25 @@ import pytest
 import torch
 from toy_fits import PARTS, SMALL_PLANES, WORLD, images, method, request, silent, surfaces
 
+from spike4dgs.baselines.recipes import PARTS as BASELINE_PARTS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.fit import RecipeMethod, measure
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
-from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.schedule import Stage, choose_time, stages
 from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.splat import render
-from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.instants import Corrections, correction, node
 from spike4dgs.method.training_views.lookup import variation_at
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages
+
+MOTIONS = BASELINE_PARTS.motion
+SUPERVISIONS = BASELINE_PARTS.supervision
 
 
 @cache

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from toy_fits import WORLD, images, method, request, silent, surfaces
 
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference
 from spike4dgs.method.supervision.base import Render, Sample
@@ -21,6 +21,8 @@ from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+
+MOTIONS = PARTS.motion
 
 SETTINGS = TrainerSettings(coarse_steps=15, fine_steps=35, views_per_step=2)
 

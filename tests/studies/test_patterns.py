@@ -8,14 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import training_for
+from spike4dgs.benchmark.method import find_methods, training_for
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.calibration import Calibration, Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.studies import patterns as pattern_report
 from spike4dgs.studies.patterns import pattern_errors
+
+METHODS = find_methods()
 
 
 def test_errors_are_of_gains_of_mean_one_and_in_part_what_cameras_share() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.starts.colmap import clip_means
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.cli import main
+from spike4dgs.method.starts.structure_from_motion import clip_means
 from spike4dgs.studies.poses import measure_poses, poses
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)

@@ -12,15 +12,18 @@ from torch import nn
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.radiance_field.model import Bounds, DynamicField, FieldShape, RadianceModel
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.hexplane import HexPlaneSettings, HexPlaneShape
-from spike4dgs.method.motion.table import MOTIONS, Extent
 from spike4dgs.method.splat import Views
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.training_images import TrainingImages
+
+MOTIONS = PARTS.motion
 
 WORLD = ToyWorld(width=40, height=24, side=2, n_ticks=100)
 DURATION_US = WORLD.n_ticks * 1e6 / RATE_HZ

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 from toy_world import ToyWorld
 
+from spike4dgs.baselines.recipes import PARTS as BASELINE_PARTS
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.starts.base import Initialization, Start
-from spike4dgs.method.supervision.table import SUPERVISIONS
+
+MOTIONS = BASELINE_PARTS.motion
+SUPERVISIONS = BASELINE_PARTS.supervision
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)
 

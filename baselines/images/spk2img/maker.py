@@ -45,6 +45,7 @@ def spk2img_maker(device: str) -> ImageMaker:
         rate=lambda stream, tick, _: spk2img_image(stream, tick, device),
         learned=partial(learned_from, WEIGHTS.in_use, read_card),
         made_on=spk2img_maker,
+        label="by Spk2ImgNet",
     )
 
 

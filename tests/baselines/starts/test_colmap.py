@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.starts import colmap as module
-from spike4dgs.baselines.starts.colmap import ColmapSettings, Mapping, clip_means, colmap, map_views
+from spike4dgs.baselines.starts.colmap import ColmapSettings, colmap
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -19,6 +19,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.starts.rig import RigSettings, rig
+from spike4dgs.method.starts.structure_from_motion import Mapping, clip_means, map_views
 
 WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.starts import dust3r as module
-from spike4dgs.baselines.starts.colmap import clip_means
 from spike4dgs.baselines.starts.dust3r import Dust3rSettings, Pair, dust3r, predictor, resized, solve
 from spike4dgs.baselines.starts.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r
 from spike4dgs.benchmark.errors import UserError
@@ -21,6 +20,7 @@ from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi.dpt import unpack
 from spike4dgs.method.msdi.pose import solve_pose
 from spike4dgs.method.msdi.transformer import rotate
+from spike4dgs.method.starts.structure_from_motion import clip_means
 
 TINY = Dust3rShape(2, 32, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
 SMALL = Dust3rSettings(long_side_px=96)

@@ -8,7 +8,7 @@ from spike4dgs.baselines.stg.guided_sampling import BAD_PIXELS, PATCH, along_ray
 from spike4dgs.baselines.stg.spacetime import SpacetimeLite
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
-from spike4dgs.method.motion.table import Extent
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.training_images import TrainingImages

@@ -13,19 +13,22 @@ from small_scenes import array_cameras
 from torch import Tensor
 from toy_world import ToyWorld
 
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.stg.spacetime import Spacetime, SpacetimeLite, SpacetimeSettings
 from spike4dgs.baselines.stg.spacetime_decoder import Decoder, rays
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.polynomial import move_to
-from spike4dgs.method.motion.table import MOTIONS, Extent
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.lookup import look_up, variation_at
 from spike4dgs.method.training_views.projection import project
 from spike4dgs.method.training_views.training_images import TrainingImages
+
+MOTIONS = PARTS.motion
 
 WORLD = ToyWorld(width=64, height=40, side=2, n_ticks=200)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 2.0, 200, 64)

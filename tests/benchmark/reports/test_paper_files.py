@@ -11,12 +11,14 @@ from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
 from small_scenes import write_small_scene
 
-from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import run_benchmark as run_command
 from spike4dgs.cli.run_benchmark import RunBenchmark
+
+METHODS = find_methods()
 
 COMMAND = RunBenchmark(
     submit=lambda results, **options: 0,

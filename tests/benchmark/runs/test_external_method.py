@@ -19,12 +19,13 @@ from skimage.metrics import peak_signal_noise_ratio
 from small_scenes import write_small_scene
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest, check_protocol, find_methods, get_method
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import main
+
+METHODS = find_methods()
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 

@@ -13,13 +13,13 @@ from dummy_methods import CountMethod, run
 from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 from small_scenes import write_small_scene
 
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.runs.provenance import Savable
-from spike4dgs.method.held_out_pose import RefinableModel, Refinement
 from spike4dgs.method.models.model_file import ModelFile, read_model, write_model
 from spike4dgs.method.models.saved_model import load_model
-from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.splat import PixelFilter
+
+MOTIONS = PARTS.motion
 
 FLAT = Path(__file__).parent / "flat_settings_models"  # of a version with one flat list of settings
 MOVING = [name for name in MODELS if name != "static"]
@@ -85,14 +85,6 @@ def test_where_it_comes_from_is_kept(tmp_path: Path) -> None:
     for a, b in zip(found.provenance.cameras, WORLD.cameras, strict=True):
         assert (a.id, a.width, a.height, a.K.tolist()) == (b.id, b.width, b.height, b.K.tolist())
         np.testing.assert_allclose(a.w2c, b.w2c, atol=1e-12)
-
-
-def test_a_model_that_refines_views_saves_what_it_holds(tmp_path: Path) -> None:
-    wrapped = RefinableModel(model("hexplane"), Refinement())
-    assert isinstance(wrapped, Savable)
-    wrapped.save(tmp_path / "m", provenance())
-    image = load_model(tmp_path / "m").model.render(WORLD.held_out, 500.0)
-    np.testing.assert_array_equal(image, wrapped.render(WORLD.held_out, 500.0))
 
 
 @pytest.fixture

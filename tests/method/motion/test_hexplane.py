@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.hexplane import (
     HexPlane,
     HexPlaneDeformation,
@@ -17,7 +18,7 @@ from spike4dgs.method.motion.hexplane import (
 )
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.motion.mlp import perceptron, perceptron_reference
-from spike4dgs.method.motion.table import MOTIONS, Extent
+from spike4dgs.method.motion.table import MOTIONS
 
 SHAPE = HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
 

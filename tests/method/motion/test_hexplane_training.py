@@ -8,6 +8,7 @@ from toy_world import ToyWorld
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.hexplane import (
     HexPlaneMotion,
     HexPlaneSettings,
@@ -16,7 +17,6 @@ from spike4dgs.method.motion.hexplane import (
     time_sparsity,
 )
 from spike4dgs.method.motion.static import Static
-from spike4dgs.method.motion.table import Extent
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded

@@ -12,15 +12,14 @@ import torch
 from numpy.typing import NDArray
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.starts.colmap import clip_means
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import PoseErrors, pose_errors
 from spike4dgs.method.msdi.training.data import points_of
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.starts import matched_poses as module
-from spike4dgs.method.starts.features import Mapping
 from spike4dgs.method.starts.matched_poses import Pose, Seen, bundle
 from spike4dgs.method.starts.msdi import shrunk
+from spike4dgs.method.starts.structure_from_motion import Mapping, clip_means
 
 WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
 SCENE = WORLD.training

@@ -10,6 +10,7 @@ import pytest
 import torch
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
+from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -20,10 +21,11 @@ from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.motion.static import Static
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.supervision.base import Sample, Supervision
-from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
+
+SUPERVISIONS = PARTS.supervision
 
 WIDTH, HEIGHT = 16, 12
 CAMERAS = ToyWorld(width=WIDTH, height=HEIGHT, side=2).cameras[:3]

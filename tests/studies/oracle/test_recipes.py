@@ -13,7 +13,7 @@ import pytest
 import torch
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.recipes import INITIALIZATIONS, METHODS, PARTS
+from spike4dgs.baselines.recipes import INITIALIZATIONS, PARTS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
@@ -35,6 +35,8 @@ from spike4dgs.studies.oracle.recipes import (
     with_calibrations,
 )
 from spike4dgs.studies.oracle.truth import Surfaces, Truth
+
+METHODS = find_methods()
 
 WORLD = ToyWorld(width=48, height=30, n_ticks=240, side=2)
 SCENE, SAMPLES = WORLD.training, 64

@@ -6,21 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import Budget, FitRequest, training_for
+from spike4dgs.benchmark.method import Budget, FitRequest, find_methods, training_for
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.motion.base import Extent
+from spike4dgs.method.recipes import SPIKE4DGS_X
 from spike4dgs.studies.speed_error.measurement import Request
-from spike4dgs.studies.twins.fits import FITS, X_RECIPE, Trial, cut_in, fitted
+from spike4dgs.studies.twins.fits import FITS, Trial, cut_in, fitted
+
+METHODS = find_methods()
 
 
 def test_a_trial_is_the_recipes_fit_judged_against_the_ground_truth(small_scene: Path) -> None:
     scene = open_scene(small_scene)
     request = Request("tiny", 5, "cpu", lambda: small_scene)
-    method = METHODS[X_RECIPE.name]
+    method = METHODS[SPIKE4DGS_X.name]
     model = method.fit(training_for(method, scene.training), FitRequest(Budget(0.004), seed=5))
-    whole = fitted(X_RECIPE, Trial("as it is", {}, 0.004, role="chosen"), scene, request, warm_up=False)
+    whole = fitted(SPIKE4DGS_X, Trial("as it is", {}, 0.004, role="chosen"), scene, request, warm_up=False)
     assert (whole.name, whole.role) == ("as it is", "chosen")
     assert whole.values["gaussians"] == len(model.splats(0.5 * scene.n_ticks / scene.rate_hz * 1e6))
     squares = []
@@ -42,10 +44,10 @@ def test_a_clip_is_cut_as_asked_whatever_its_length(pieces: int) -> None:
 
 def test_the_chosen_settings_are_the_recipes() -> None:
     """The page marks what the recipe has; where the recipe changes, this says so."""
-    assert X_RECIPE.settings["density.max_gaussians"] == 36_000
-    assert X_RECIPE.settings["density.max_moving_per_pixel"] == 0.5
-    assert "density.max_per_pixel" not in X_RECIPE.settings and DensitySettings.max_per_pixel == 0.8
-    assert X_RECIPE.settings["trainer.moving_change"] == 0.012
+    assert SPIKE4DGS_X.settings["density.max_gaussians"] == 36_000
+    assert SPIKE4DGS_X.settings["density.max_moving_per_pixel"] == 0.5
+    assert "density.max_per_pixel" not in SPIKE4DGS_X.settings and DensitySettings.max_per_pixel == 0.8
+    assert SPIKE4DGS_X.settings["trainer.moving_change"] == 0.012
     hexplane = METHODS["tfp+4dgs"].settings["motion"]  # type: ignore[attr-defined]
     assert (hexplane.mlp_width, hexplane.features) == (32, 16)
     assert [m.id for m in FITS] == ["budget", "cap", "freezing", "pieces", "hexplane"]

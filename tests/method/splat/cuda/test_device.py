@@ -16,9 +16,8 @@ import torch
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.gpu import missing_rasterizer
-from spike4dgs.benchmark.method import Budget, FitRequest
+from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views
 from spike4dgs.method.models.saved_model import load_model
@@ -28,6 +27,8 @@ from spike4dgs.method.msdi.training.train import Training, TrainingSettings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.splat.ssim import ssim, ssim_reference
+
+METHODS = find_methods()
 
 
 def _why_not() -> str:

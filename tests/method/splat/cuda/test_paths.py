@@ -10,13 +10,14 @@ import torch
 from pretend_device import DEVICE, pretend_device
 from toy_bursts import write_toy_shard
 
-from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import FitRequest
+from spike4dgs.benchmark.method import FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.msdi import TINY
 from spike4dgs.method.msdi.training.data import Bursts
 from spike4dgs.method.msdi.training.train import Training, TrainingSettings
+
+METHODS = find_methods()
 
 # HexPlane, STG, tracking, paths over a frozen background, the radiance field, and each loss.
 PATHS = [

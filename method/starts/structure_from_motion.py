@@ -1,7 +1,9 @@
-"""SIFT features of one image per view, and their matches between views, in a database of COLMAP's.
+"""Structure from motion by COLMAP: SIFT features of one image per view, their matches, poses and points.
 
 Images are enlarged before features are found, and all pairs are matched. Everything runs in one thread, so that the
-same seed gives the same matches.
+same seed gives the same matches. One global mapping (rotation averaging, global positioning, bundle adjustment) solves
+for all views at once: an array is small beside its distance to the scene, and the pair that incremental mapping begins
+with then easily ends in a wrong but locally best pose.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.training_views.pinholes import undistorted
 
 if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
     import pycolmap
@@ -38,6 +41,10 @@ class FeatureSettings(Settings):
     peak_threshold: float = 0.002  # of SIFT's contrast, a third of COLMAP's: gray images of dim scenes are soft
     pair_error_px: float = 2.0  # of a match in an enlarged image to its epipolar line
     min_angle_deg: float = 0.5  # between a point's rays: the array is narrow
+
+
+FEATURES = FeatureSettings()
+FOCAL_PRIOR = 1.2  # image widths, COLMAP's own
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,50 @@ def _camera(image: pycolmap.Image, K: NDArray[np.float64], like: Camera) -> Came
 def _at(image: Float32, xy: NDArray[np.float64]) -> float:
     u, v = np.clip(xy.astype(int), 0, [image.shape[1] - 1, image.shape[0] - 1])
     return float(image[v, u])
+
+
+def clip_means(scene: TrainingScene) -> Float32:
+    """Return the mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
+    ticks = min(scene.n_ticks, 65535)
+    counts = np.stack([s.counts(0, ticks) for s in scene.streams]).astype(np.float32)
+    return undistorted(scene, counts / np.float32(ticks * scene.radiance_gain), unseen=None)
+
+
+def map_views(
+    scene: TrainingScene,
+    images: Float32,
+    seed: int,
+    settings: FeatureSettings = FEATURES,
+    focal_prior: float | None = None,
+) -> Mapping:
+    """Return the structure from motion on one image of each training view [C, H, W], linear radiance.
+
+    Intrinsics are the calibrated ones; with `focal_prior`, in image widths, they are unknown and one is estimated.
+    The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
+    nothing can be aligned and the mapping is empty.
+    """
+    import pycolmap
+
+    with find_features(scene.cameras, images, seed, settings, focal_prior) as found:
+        options = _options(seed, settings.min_angle_deg, refine_focal=focal_prior is not None)
+        models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", options)
+        if not models:
+            return NOTHING
+        largest = max(models.values(), key=lambda m: m.num_reg_images())
+        return in_scene(largest, scene.cameras, found.names, images, settings.enlarge)
+
+
+def _options(seed: int, min_angle_deg: float, *, refine_focal: bool) -> pycolmap.GlobalPipelineOptions:
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = 1, seed
+    options.mapper.num_threads, options.mapper.random_seed = 1, seed
+    options.mapper.min_tri_angle_deg = min_angle_deg
+    options.mapper.retriangulation.min_angle = min_angle_deg
+    options.mapper.bundle_adjustment.refine_focal_length = refine_focal
+    options.mapper.bundle_adjustment.refine_extra_params = False
+    return options
 
 
 @contextmanager
