@@ -21,13 +21,13 @@ COMPILED_IN_A_FIT = """
 import gc
 from numba.core.dispatcher import Dispatcher
 from toy_world import ToyWorld
-from spike4dgs.baselines.recipes import METHODS
-from spike4dgs.benchmark.method import Budget, FitRequest
+from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 
 def compiled():
     found = [d for d in gc.get_objects() if type(d).__module__ == "numba.core.registry" and hasattr(d, "py_func")]
     return {(d.py_func.__module__, d.py_func.__qualname__, str(s)) for d in found for s in d.overloads}
 
+METHODS = find_methods()
 world = ToyWorld()
 _ = world.training.streams
 for name in NAMES:
