@@ -17,6 +17,7 @@ ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard", "cli",
 SOURCES = ROOT / "build" / "docs" / "spike4dgs"  # links to the rooms, under the name that they are imported by
 PAGES = {  # files outside docs/ that have a page on the site
     "CONTRIBUTING.md": "docs/contributing.md",
+    "CHANGELOG.md": "docs/changelog.md",
     "examples/README.md": "docs/external_methods.md",
     "method/msdi/README.md": "docs/methods/msdi_card.md",
     "baselines/images/spk2img/README.md": "docs/methods/spk2img_card.md",
