@@ -12,7 +12,7 @@ from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.scene.shared_time import local_ticks
-from spike4dgs.method.images.training import ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +38,12 @@ class NearestView:
 
     name: str
     images: ImageMaker
-    images_name: str
     description: str = "the nearest training camera's image, without any reconstruction"
     given: tuple[str, ...] = ("poses",)
     params: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.params = {"name": self.name, "images": self.images_name}
+        self.params = {"name": self.name, "images": self.images.name}
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> NearestViewModel:
         """Return the model at once; nothing but the progress of the request is used."""

@@ -120,5 +120,5 @@ POSED = (
 )
 METHODS: dict[str, Method] = {
     **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *CALIBRATED, *SUPERVISED, *POSED)},
-    "nearest-view": NearestView("nearest-view", IMAGES["tfp"], "tfp"),
+    "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
 }

@@ -18,14 +18,8 @@ from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images.training import (
-    ImageMaker,
-    ImageSettings,
-    make_training_images,
-    maker_settings,
-    wanted_images,
-    with_settings,
-)
+from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
@@ -100,8 +94,8 @@ class RecipeMethod:
         self.algorithm = parts.algorithms.get(recipe.motion) or trainer_algorithm(recipe, parts)
         _part(dict.fromkeys(self.algorithm.supervisions) or parts.supervision, recipe, "supervision")
         defaults = {**self.algorithm.settings, "initialization": self.initialization.settings}
-        if own := maker_settings(self.images):
-            defaults["image_maker"] = own
+        if fields(self.images.settings):
+            defaults["image_maker"] = self.images.settings
         found = override(defaults, recipe.settings, f"recipe {recipe.name}")
         self.settings = follow_images(found, recipe.settings)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
@@ -115,7 +109,7 @@ class RecipeMethod:
         self.given = tuple(name for name, used in zip(GIVEN, (not posed, calibrated), strict=True) if used)
         self.description = description or describe(recipe, parts, self.algorithm)
         self.trained_on: tuple[str, ...] = ()
-        if learned := getattr(self.images, "learned", lambda: None)():
+        if learned := self.images.learned():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
         self._warm: set[str] = set()  # the devices whose kernels are compiled
 
@@ -147,7 +141,7 @@ class RecipeMethod:
     def _fit(self, scene: TrainingScene, start: Start, settings: Mapping[str, Any], request: FitRequest) -> Model:
         """Fit from given cameras and points."""
         request.progress(0, 1, "images")
-        maker = with_settings(self.images, settings.get("image_maker"))
+        maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
         images = make_training_images(scene, start.cameras, maker, settings["images"], request.device)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
         extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
@@ -172,11 +166,11 @@ def short(settings: SettingsByPart) -> dict[str, Settings]:
 
 def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
     """Return one line that says what a recipe is, from its parts' labels."""
-    images, supervision = parts.images[recipe.images], parts.supervision.get(recipe.supervision)
+    supervision = parts.supervision.get(recipe.supervision)
     flat = recipe.settings.get("images.flat_field") and recipe.images != "msdi"
     named = (
-        (getattr(algorithm, "label", None), recipe.motion),
-        (getattr(images, "label", None), recipe.images),
+        (algorithm.label, recipe.motion),
+        (parts.images[recipe.images].label, recipe.images),
         (getattr(supervision, "label", None), recipe.supervision),
         (parts.initialization[recipe.initialization].label, recipe.initialization),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -26,6 +26,7 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.hard_cases.splat import differentiate
 from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.models.saved_model import load_model
@@ -57,10 +58,13 @@ def silent(done: int, total: int, note: str = "") -> None:
     """Hear about progress and say nothing."""
 
 
-def window_mean(stream: SpikeStream, ticks: Sequence[int], gain: float, camera: object = None) -> Float32:
-    """Return the mean of the spikes 12 ticks around each tick [n, H, W] as radiance: images without a maker's room."""
-    spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
-    return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
+def window_mean(stream: SpikeStream, tick: int, settings: object) -> Float32:
+    """Return the mean of the spikes 12 ticks around a tick [H, W]."""
+    a, b = max(0, tick - 12), min(stream.n_ticks, tick + 12)
+    return (stream.counts(a, b) / (b - a)).astype(np.float32)
+
+
+MEAN = ImageMaker(name="mean", rate=window_mean)
 
 
 def start_of(scene: TrainingScene) -> Start:
@@ -72,7 +76,7 @@ def small_trainer(motion: str, supervision: str, seed: int, extra: Mapping[str, 
     """Return a trainer of few steps on the made scene, densification included."""
     scene = made_scene()[0]
     start, s = start_of(scene), replace(_STEPS, **extra)
-    images = make_training_images(scene, start.cameras, window_mean, ImageSettings(time_spacing_ticks=20), device)
+    images = make_training_images(scene, start.cameras, MEAN, ImageSettings(time_spacing_ticks=20), device)
     kind, loss = MOTIONS[motion], SUPERVISIONS[supervision]
     settings = replace(kind.defaults, **_SMALL.get(motion, {}))
     extent = measure(start, scene)
@@ -232,7 +236,7 @@ def _other_seeds(setting: Setting) -> Outcome:
     scene = made_scene()[0]
     held_out = replace(scene.cameras[0], id="held out", t=-scene.cameras[0].R @ np.array([0.05, 0.02, 0.0]))
     truth = radiance_of(held_out)
-    parts = Parts({"mean": window_mean}, {"made": Initialization(lambda r: start_of(r.scene))}, MOTIONS, SUPERVISIONS)
+    parts = Parts({"mean": MEAN}, {"made": Initialization(lambda r: start_of(r.scene))}, MOTIONS, SUPERVISIONS)
     recipe = Recipe("hard-cases", "mean", "made", "paths", "pixel", _PSNR_STEPS)
     scores, images = [], set()
     for seed in range(setting.seed, setting.seed + _SEEDS):

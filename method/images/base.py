@@ -39,13 +39,17 @@ def learned_from(find: Callable[[], FoundWeights], read_card: Callable[[Path], A
         return None
 
 
-@dataclass(frozen=True)
+def _no_rate(stream: SpikeStream, tick: int, settings: Any) -> Float32:
+    raise NotImplementedError("an image maker without `rate` makes its images in a subclass")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImageMaker:
-    """A named way from spikes to images.
+    """A named way from spikes to images. A table of recipes' parts holds these.
 
     `rate` returns spikes per tick [H, W] float32 at the start of a tick. A pixel's own rate can be corrected by its
     calibration afterwards. A maker that looks at neighbours needs the calibration before: `corrected` returns the rate
-    that an ideal camera's pixels would have.
+    that an ideal camera's pixels would have. A maker of something else than rates is a subclass with its own call.
 
     >>> from spike4dgs.baselines.images.tfp import TFP, TfpSettings
     >>> from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -57,10 +61,10 @@ class ImageMaker:
     """
 
     name: str
-    definition: str  # may refer to fields of the settings by their names
-    source: str
-    rate: Callable[[SpikeStream, int, Any], Float32]  # of a stream, a tick and the settings
-    settings: Settings = Settings()  # the maker's own numbers; this class itself where it has none
+    definition: str = ""  # may refer to fields of the settings by their names
+    source: str = ""
+    rate: Callable[[SpikeStream, int, Any], Float32] = _no_rate  # of a stream, a tick and the settings
+    settings: Settings = Settings()  # the maker's own numbers (prefix `image_maker`)
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
     rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]

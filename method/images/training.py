@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,8 +14,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.scene.shared_time import local_ticks
-from spike4dgs.benchmark.spikes.calibration import Calibration
-from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
@@ -36,54 +34,6 @@ class ImageSettings(Settings):
     flat_field: bool = False  # correct the images by each camera's calibrated gain n(x, y) and dark rate, if known
 
 
-class ImageMaker(Protocol):
-    """Images from spikes, corrected if the camera's calibration is given; `spike_to_image.base` says more."""
-
-    def __call__(
-        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
-    ) -> Float32:
-        """Return linear radiance [n, H, W]; `gain` is spikes per tick of white."""
-        ...
-
-
-@runtime_checkable
-class TunableImageMaker(ImageMaker, Protocol):
-    """An image maker with numbers of its own (prefix `image_maker`)."""
-
-    @property
-    def settings(self) -> Settings:
-        """Return the maker's own numbers."""
-        ...
-
-    def with_settings(self, settings: Any) -> ImageMaker:
-        """Return the same maker with other numbers."""
-        ...
-
-
-@runtime_checkable
-class SpannedImageMaker(ImageMaker, Protocol):
-    """An image maker whose values may be means over known spans of time."""
-
-    def with_spans(
-        self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
-    ) -> tuple[Float32, Float32 | None]:
-        """Return the images, and the first and last instant of each pixel's span: [n, 2, H, W] in ticks from `ticks`.
-
-        None: the images show instants.
-        """
-        ...
-
-
-def maker_settings(maker: ImageMaker) -> Settings | None:
-    """Return the maker's own numbers; None where it has none."""
-    return maker.settings if isinstance(maker, TunableImageMaker) and fields(maker.settings) else None
-
-
-def with_settings(maker: ImageMaker, settings: Settings | None) -> ImageMaker:
-    """Return the maker with other numbers, or as it is where they are None."""
-    return maker.with_settings(settings) if settings and isinstance(maker, TunableImageMaker) else maker
-
-
 def wanted_images(n_ticks: int, settings: ImageSettings) -> float:
     """Return how many images of a view a clip has room for, edges included."""
     return min(settings.max_times, n_ticks / settings.time_spacing_ticks)
@@ -95,11 +45,6 @@ def choose_ticks(n_ticks: int, settings: ImageSettings) -> tuple[int, ...]:
     span = n_ticks - 2 * edge
     count = min(settings.max_times, max(1, round(span / settings.time_spacing_ticks) + 1))
     return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
-
-
-def on_device(make: ImageMaker, device: str) -> ImageMaker:
-    """Return a maker that computes on the device of a fit; one that has no choice of device as it is."""
-    return make.on(device) if hasattr(make, "on") else make
 
 
 def make_training_images(
@@ -131,7 +76,7 @@ def _make(
     scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
 ) -> tuple[tuple[int, ...], Float32, list[Half] | None]:
     """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
-    make = on_device(make, device)
+    make = make.on(device)
     ticks = choose_ticks(scene.n_ticks, settings)
     images: list[Float32] = []
     spans: list[Half] = []
@@ -140,19 +85,11 @@ def _make(
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
         calibration = scene.calibrations[len(images)] if settings.flat_field and scene.calibrations else None
         gain = scene.radiance_gain * (1.0 if calibration else state.gain)
-        image, over = _with_spans(make, stream, own, gain, calibration)
+        image, over = make.with_spans(stream, own, gain, calibration)
         images.append(image)
         if over is not None:
             spans.append(over.astype(np.float16))
     return ticks, np.stack(images, axis=1), spans or None
-
-
-def _with_spans(
-    make: ImageMaker, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None
-) -> tuple[Float32, Float32 | None]:
-    if isinstance(make, SpannedImageMaker):
-        return make.with_spans(stream, ticks, gain, camera)
-    return make(stream, ticks, gain, *((camera,) if camera else ())), None
 
 
 def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:

@@ -20,7 +20,8 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32, encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.images.training import ImageMaker, ImageSettings, as_measured, make_images
+from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.training import ImageSettings, as_measured, make_images
 
 TIMES = 9  # of the clip, that residuals are taken at
 SHOWN = (1, 4, 7)  # those of them that the sheet shows

@@ -27,6 +27,7 @@ from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import FLAT_FIELD, RecipeMethod
 from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import choose_ticks
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.paths import Paths
@@ -94,7 +95,8 @@ class OracleMethod:
             scene = with_calibrations(scene, truth.calibrations(scene.radiance_gain))
         recipe, parts = self._recipe, PARTS
         if "images" in self.oracle:
-            parts = replace(parts, images={**parts.images, recipe.images: TrueImages(truth, scene.streams)})
+            true = TrueImages(truth=truth, streams=scene.streams)
+            parts = replace(parts, images={**parts.images, recipe.images: true})
         if "points" in self.oracle:
             own = parts.initialization[recipe.initialization]
             start = Initialization(partial(true_points, truth.surfaces()), own.settings)
@@ -147,9 +149,11 @@ def _recipe_method(name: str) -> RecipeMethod:
 # ---------------------------------------------------------------- what an oracle puts in the place of a part
 
 
-@dataclass(frozen=True, eq=False)
-class TrueImages:
-    """True images in the place of those from spikes; `method.images.ImageMaker` of the given streams alone."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrueImages(ImageMaker):
+    """True images in the place of those from spikes, of the given streams alone."""
+
+    name: str = "truth"
 
     truth: Truth
     streams: tuple[SpikeStream, ...]  # of the training cameras, in the order of the truth's

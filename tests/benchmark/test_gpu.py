@@ -18,7 +18,6 @@ from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.gpu import Missing, missing_rasterizer
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.images.training import on_device
 
 # A PyTorch that claims a GPU, in an environment that has no numba-cuda.
 _CLAIM = """
@@ -103,11 +102,11 @@ def test_networks_take_the_gpu_without_kernels(monkeypatch: pytest.MonkeyPatch) 
 def test_image_makers_with_a_network_follow_the_fit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     stream = SpikeStream(pack(np.ones((50, 8, 8), np.uint8)), 8, 8, 20_000.0)
-    on_cpu = on_device(IMAGES[name], "cpu")
+    on_cpu = IMAGES[name].on("cpu")
     assert on_cpu.name == name and on_cpu(stream, [25], 1.0).shape == (1, 8, 8)
     with pytest.raises(UserError, match="found 'cuda:7'"):
-        on_device(IMAGES[name], "cuda:7")(stream, [25], 1.0)
-    assert on_device(IMAGES["tfp"], "cuda:7") is IMAGES["tfp"]
+        IMAGES[name].on("cuda:7")(stream, [25], 1.0)
+    assert IMAGES["tfp"].on("cuda:7") is IMAGES["tfp"]
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import pytest
 import torch
 from gaussian_clouds import cloud
 from saved_models import DURATION_US, gaussian_model, provenance
+from toy_fits import images
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.method import FitRequest, Recipe
@@ -32,12 +33,6 @@ from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
-
-
-def images(stream, ticks, gain, camera=None):  # type: ignore[no-untyped-def]
-    """Mean of the spikes 12 ticks around."""
-    spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
-    return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
 
 
 def surfaces(scene: TrainingScene, seed: int) -> Start:

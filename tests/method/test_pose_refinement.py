@@ -17,6 +17,7 @@ from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.pose_refinement import Poses, rigid_motion
@@ -52,10 +53,15 @@ def test_poses_start_where_the_views_are_and_the_first_stays() -> None:
     np.testing.assert_allclose(poses.cameras(SCENE.cameras)[3].w2c, found[3].detach().numpy())
 
 
-def truth(stream: object, ticks: list[int], gain: float) -> np.ndarray:
+class Truth(ImageMaker):
     """A stand-in for the images part: what the camera sees without noise."""
-    index = next(i for i, s in enumerate(SCENE.streams) if s is stream)
-    return np.stack([WORLD.trace(SCENE.cameras[index], 0.5)[0]] * len(ticks)).astype(np.float32)
+
+    def __call__(self, stream: object, ticks: list[int], *_: object) -> np.ndarray:
+        index = next(i for i, s in enumerate(SCENE.streams) if s is stream)
+        return np.stack([WORLD.trace(SCENE.cameras[index], 0.5)[0]] * len(ticks)).astype(np.float32)
+
+
+truth = Truth(name="truth")
 
 
 def off(camera: Camera, seed: int) -> Camera:
@@ -118,7 +124,7 @@ def test_a_resumed_fit_has_the_same_poses(tmp_path: Path) -> None:
         assert a.id == "cam_00" or not np.array_equal(a.w2c, start.w2c)
 
 
-class Spanned:
+class Spanned(ImageMaker):
     """A stand-in for the images part whose values are means over ten ticks."""
 
     def __call__(self, *args: object) -> np.ndarray:
@@ -133,6 +139,6 @@ class Spanned:
 @pytest.mark.parametrize(("images", "freeze"), [("truth", True), ("spanned", False)])
 def test_backgrounds_and_means_over_time_have_fixed_poses(images: str, freeze: bool) -> None:
     recipe = method(freeze_background=freeze).recipe
-    parts = replace(PARTS, images={"truth": truth, "spanned": Spanned()})
+    parts = replace(PARTS, images={"truth": truth, "spanned": Spanned(name="spanned")})
     with pytest.raises(UserError, match="either trainer.refine_poses, or .* found both"):
         RecipeMethod(replace(recipe, images=images), parts).fit(SCENE, FitRequest())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.starts.base import Initialization, Start
 
 MOTIONS = BASELINE_PARTS.motion
@@ -25,10 +26,13 @@ def silent(done: int, total: int, note: str = "") -> None:
     pass
 
 
-def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
-    """A stand-in for the images part: mean of the spikes 12 ticks around."""
-    spans = [(max(0, t - 12), min(stream.n_ticks, t + 12)) for t in ticks]
-    return np.stack([stream.counts(a, b) / ((b - a) * gain) for a, b in spans]).astype(np.float32)
+def around(stream: SpikeStream, tick: int, settings: object) -> np.ndarray:
+    """Mean of the spikes 12 ticks around."""
+    a, b = max(0, tick - 12), min(stream.n_ticks, tick + 12)
+    return (stream.counts(a, b) / (b - a)).astype(np.float32)
+
+
+images = ImageMaker(name="short", rate=around)  # a stand-in for the images part
 
 
 def surfaces(scene: TrainingScene, seed: int) -> Start:

@@ -1,4 +1,4 @@
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,9 +23,9 @@ from spike4dgs.baselines.tracking.settings import PUBLISHED, TrackingSettings
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, measure
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
 from spike4dgs.method.starts.base import Initialization, Start
@@ -253,9 +253,7 @@ def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
 
 
 def test_a_recipe_runs_it_from_spikes_to_images() -> None:
-    def images(stream: SpikeStream, ticks: Sequence[int], gain: float) -> np.ndarray:
-        return np.stack([stream.counts(t - 10, t + 10) / (20 * gain) for t in ticks]).astype(np.float32)
-
+    images = ImageMaker(name="mean", rate=lambda stream, t, _: stream.counts(t - 10, t + 10) / np.float32(20))
     parts = Parts(
         {"mean": images}, {"true": Initialization(lambda request: shown()[1])}, {}, SUPERVISIONS, {"tracking": TRACKING}
     )

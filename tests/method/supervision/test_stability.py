@@ -17,6 +17,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.motion.static import Static
 from spike4dgs.method.starts.base import Start
@@ -163,14 +164,14 @@ def test_training_keeps_every_parameter_a_number(name: str, make_scene: Callable
     points = rng.uniform([-0.8, -0.2, 0.2], [0.8, 0.6, 1.2], (60, 3)).astype(np.float32)
     start = Start(CAMERAS, points, rng.random(60).astype(np.float32))
 
-    def images(stream: SpikeStream, ticks: object, gain: float) -> np.ndarray:
-        image = stream.counts(0, scene.n_ticks) / np.float32(scene.n_ticks * gain)
+    def rate(stream: SpikeStream, tick: int, settings: object) -> np.ndarray:
+        image = stream.counts(0, scene.n_ticks) / np.float32(scene.n_ticks)
         image[0, :3] = np.nan
-        return np.repeat(image[None], len(list(ticks)), 0).astype(np.float32)  # type: ignore[call-overload]
+        return image
 
     extent = measure(start, scene)
     motion = Static(extent, Static.defaults, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, spaced, "cpu")
+    training_images = make_training_images(scene, start.cameras, ImageMaker(name="mean", rate=rate), spaced, "cpu")
     gaussians = from_points(points, start.values, opacity=0.5)
     loss, density = SUPERVISIONS[name](SUPERVISIONS[name].defaults, scene), DensitySettings()
     trainer = Trainer(training_images, gaussians, motion, loss, s, density, scale=extent.scale, seed=0)

@@ -80,7 +80,7 @@ def truth(root: Path) -> Truth:
 
 
 def test_the_images_of_a_fit_are_the_true_ones(truth: Truth) -> None:
-    make = TrueImages(truth, SCENE.streams)
+    make = TrueImages(truth=truth, streams=SCENE.streams)
     images = make_training_images(SCENE, SCENE.cameras, make, ImageSettings(), "cpu")
     assert images.ticks == TICKS
     for camera, found in zip(SCENE.cameras, images.images[3:5].transpose(0, 1), strict=True):
