@@ -13,7 +13,7 @@ A recipe overrides the numbers of its parts by name, PART.NAME:
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import Found, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -46,6 +47,7 @@ class Recipe:
         return {**asdict(self), "settings": dict(self.settings)}
 
 
+DEFAULT_BUDGET = "quick"
 SCALES = {"quick": 1.0, "standard": 4.0}  # quick: at most 90 s a fit on two cores, 200x125 pixels, 20 ms
 PAPER = "paper"
 MAX_BUDGET = 1e6  # as in common.schema.json
@@ -185,3 +187,8 @@ def get_method(name: str) -> Method:
     if name not in methods:
         raise problem("method", f"one of {', '.join(sorted(methods))}", repr(name), "see `spike4dgs methods`")
     return methods[name]
+
+
+def choose_device_for(methods: Iterable[Method], device: str) -> str:
+    """Return the device that methods are fitted on, as `choose_device` does."""
+    return choose_device(device, rasterizes=any(getattr(m, "rasterizes", True) for m in methods))

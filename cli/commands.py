@@ -10,6 +10,12 @@ from __future__ import annotations
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.measurements import MEASUREMENTS
 
+# What had another name: a command, or an option of one -> what to type today.
+MOVED = {
+    "run-benchmark --oracle": "report oracle-ladder",
+    "run-benchmark --oracle-samples": "report oracle-ladder",
+}
+
 COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
         "spike4dgs.generators.make_dataset:make_dataset",
@@ -57,16 +63,9 @@ COMMANDS: dict[str, Command] = {
         "train-msdi --data data/msdi --out runs/msdi",
     ),
     "run-benchmark": Command(
-        "spike4dgs.cli.run_benchmark:make_run_benchmark",
+        "spike4dgs.cli.run_benchmark:run_benchmark",
         "fit methods on scenes, score them, enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
-        needs=(
-            "spike4dgs.leaderboard.submit_command:submit_all",
-            "spike4dgs.studies.speed.images:images",
-            "spike4dgs.leaderboard.tracks:track_scenes",
-            "spike4dgs.studies.oracle.recipes:oracle_ladders",
-            "spike4dgs.studies.oracle.rendering:find_truth",
-        ),
     ),
     "methods": Command(
         "spike4dgs.cli.methods:methods",

@@ -16,7 +16,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.untrusted.numbers import shown
 from spike4dgs.cli.command import Command
-from spike4dgs.cli.commands import COMMANDS
+from spike4dgs.cli.commands import COMMANDS, MOVED
 from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY
 
 _MOST = 1e12  # of a number on the command line
@@ -62,6 +62,9 @@ def _dispatch(arguments: list[str]) -> int:
             name, rest = f"{name} {rest[0]}", rest[1:]
         elif name not in COMMANDS:
             return _verbs(name, rest, verbs)
+    for old in (name, *(f"{name} {word}" for word in rest)):
+        if old in MOVED:
+            raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
     command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
 
     import tyro

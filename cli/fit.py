@@ -22,11 +22,11 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from spike4dgs.baselines.images.tfp import TFP
-from spike4dgs.benchmark.environment import choose_device, command_line, device_type, environment, harness, utc_now
+from spike4dgs.benchmark.environment import command_line, device_type, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.locks import locked
-from spike4dgs.benchmark.method import FitRequest, Method, get_method, make_budget
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, Method, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.video import video_writer
@@ -56,7 +56,7 @@ def fit(
     *,
     method: str = "spike4dgs-x",
     out: Path = Path("runs/fit"),
-    budget: str = "quick",
+    budget: str = DEFAULT_BUDGET,
     seed: int = 0,
     device: str = "auto",
     poses: Source = "auto",
@@ -80,7 +80,7 @@ def fit(
         clocks: auto (the cameras' clocks are estimated from what moves, and used where they differ) or given.
     """
     wanted, steps = get_method(method), make_budget(budget)
-    on = choose_device(device, rasterizes=getattr(wanted, "rasterizes", True))
+    on = choose_device_for([wanted], device)
     console, times = make_console(), dict[str, float]()
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         with _timed(times, "opening"):

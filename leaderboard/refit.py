@@ -10,10 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
-from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.method import PAPER, Budget, Method, get_method
+from spike4dgs.benchmark.method import PAPER, Budget, Method, choose_device_for, get_method
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.record import COSTS, Record
 from spike4dgs.benchmark.runs.refinement import SUFFIX
@@ -71,7 +70,7 @@ def _fit_scene(
         fix = "submit without --refit"
         raise problem(where, "a scored cell with budget and seed", "none", fix)
     budget = Budget(published=True) if claimed["budget"] == PAPER else Budget(float(claimed["budget"]))
-    device = choose_device(claimed["device"] or "cpu", rasterizes=getattr(method, "rasterizes", True))
+    device = choose_device_for([method], claimed["device"] or "cpu")
     variants = {v.name: v for v in Job(method, scene, wanted["seed"], device, budget).variants}
     found = variants[wanted["name"]].as_dict() if wanted["name"] in variants else {}
     if other := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):

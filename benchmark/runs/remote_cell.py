@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_bytes
 from spike4dgs.benchmark.locks import locked
-from spike4dgs.benchmark.method import Budget, Method, find_methods, get_method, no_progress
+from spike4dgs.benchmark.method import Budget, Method, choose_device_for, find_methods, get_method, no_progress
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, run_job
 from spike4dgs.benchmark.runs.predictions import PredictionWriter
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
@@ -121,7 +120,7 @@ def _job(order: Order) -> Job:
     scene = _open(order.scene, order.split, order.revision, worker)
     try:
         method = get_method(order.method) if isinstance(order.method, str) else pickle.loads(order.method)
-        device = choose_device(order.device, rasterizes=getattr(method, "rasterizes", True))
+        device = choose_device_for([method], order.device)
         job = Job(method, scene, order.seed, device, order.budget)
         if job.key == order.key:
             return job

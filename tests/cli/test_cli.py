@@ -5,19 +5,16 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from dummy_methods import CountMethod, run
 
-from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.record import read_record
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import COMMANDS, SPEED, Command, main
 from spike4dgs.cli import dispatch as cli
-from spike4dgs.cli.run_benchmark import RunBenchmark
 from spike4dgs.cli.score import score
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
@@ -171,36 +168,6 @@ def test_a_command_is_given_the_functions_of_other_rooms_that_it_needs(monkeypat
         cli, "COMMANDS", {"double": Command(f"{here}:make_double", "", "double", needs=(f"{here}:add",))}
     )
     assert cli.load("double")(4) == 8
-
-
-def test_what_a_command_needs_is_imported_only_when_it_is_called() -> None:
-    imported = "print([m for m in sys.modules if m.startswith(('spike4dgs.leaderboard', 'spike4dgs.baselines'))])"
-    done = python("-c", f"import sys; from spike4dgs.cli import load; load('run-benchmark'); {imported}")
-    assert done.stdout.strip() == "[]", done.stderr
-
-
-def test_the_runner_submits_and_measures_by_the_functions_of_its_command(
-    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    submitted: list[Path] = []
-    measured: list[Sequence[str]] = []
-    command = RunBenchmark(
-        submit=lambda results, **options: submitted.extend(results) or 0,
-        measure_images=lambda arguments: measured.append(arguments) or 0,
-        track_scenes={"moon": {small_scene.name: open_scene(small_scene).revision}}.__getitem__,
-        make_ladders=lambda names, truth, samples: (),
-        find_truth=lambda scene: None,
-    )
-    monkeypatch.setattr("spike4dgs.cli.run_benchmark.find_methods", lambda: {"counts": CountMethod()})
-    out = tmp_path / "out"
-    assert command.run_benchmark((small_scene,), out=out, device="cpu", metrics=("psnr",)) == 0
-    assert submitted == [out / "results/counts.json"] and not measured
-    assert command.run_benchmark((small_scene,), table=6, out=out) == 0
-    assert measured == [[str(small_scene), "--out", str(out)]] and len(submitted) == 1
-    assert command.run_benchmark(track="moon", data=small_scene.parent, out=out, device="cpu", metrics=("psnr",)) == 0
-    assert len(submitted) == 2, "the scenes of the track are those in the folder"
-    with pytest.raises(UserError, match="--track: expected neither scenes nor a table beside it, found --table 1"):
-        command.run_benchmark(track="moon", table=1)
 
 
 def test_speed_passes_the_rest_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,14 +16,15 @@ import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
+from run_command import run_benchmark
 from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.cli import load
-
-run_benchmark = load("run-benchmark")
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli import main
+from spike4dgs.cli import run_benchmark as command
 
 
 @pytest.fixture
@@ -221,3 +223,25 @@ def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device("auto") == "cpu" == choose_device("cpu")
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_track_and_table_6_are_modes_of_their_own(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, measured = tmp_path / "out", list[Sequence[str]]()
+    monkeypatch.setattr("spike4dgs.studies.speed.images.images", lambda arguments: measured.append(arguments) or 0)
+    monkeypatch.setattr(command, "track_scenes", lambda name: {small_scene.name: open_scene(small_scene).revision})
+    assert run_benchmark((small_scene,), table=6, out=out) == 0 and not out.exists()
+    assert measured == [[str(small_scene), "--out", str(out)]]
+    options = {"data": small_scene.parent, "methods": ("counts",), "device": "cpu", "metrics": ("psnr",)}
+    assert run_benchmark(track="moon", out=out, **options) == 0
+    assert (out / "leaderboard/local").is_dir(), "the scenes of the track are those in the folder"
+    with pytest.raises(UserError, match="--track: expected neither scenes nor a table beside it, found --table 1"):
+        run_benchmark(track="moon", table=1)
+
+
+@pytest.mark.parametrize("options", [["--oracle"], ["--oracle-samples", "64"]])
+def test_an_oracle_is_a_report(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run-benchmark", "scene", *options]) == 2
+    assert "use `spike4dgs report oracle-ladder`" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from dummy_methods import CountMethod, FailingMethod
 from PIL import Image
+from run_command import run_benchmark
 from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
@@ -16,17 +17,9 @@ from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import run_benchmark as run_command
-from spike4dgs.cli.run_benchmark import RunBenchmark
 
 METHODS = find_methods()
 
-COMMAND = RunBenchmark(
-    submit=lambda results, **options: 0,
-    measure_images=lambda arguments: 0,
-    track_scenes=lambda name: {},
-    make_ladders=lambda names, truth, samples: (),
-    find_truth=lambda scene: None,
-)
 VIEWS = tuple(f"views-{n}" for n in range(3, 9))
 
 
@@ -64,7 +57,7 @@ def test_rows_without_msdi_are_methods_and_rows_of_ours_have_no_published_values
 @pytest.mark.parametrize("number", [None, 6, 4])
 def test_a_track_belongs_to_tables_1_and_2(number: int | None, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--poses: expected (--table 1 or 2 beside it|given for table 4)"):
-        COMMAND.run_benchmark(table=number, poses="estimated", out=tmp_path / "out")
+        run_benchmark(table=number, poses="estimated", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -87,8 +80,9 @@ def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
     monkeypatch.setattr(run_command, "published", lambda number, track: table)
     monkeypatch.setattr(run_command, "table_scenes", lambda table, data, profile: (path,))
     monkeypatch.setattr(run_command, "find_methods", lambda: methods)
+    monkeypatch.setattr(run_command, "submit_all", lambda results, **options: 0)
     monkeypatch.setattr(run_command, "open_scenes", lambda paths, gaps, split: [scenes[split]])
-    assert COMMAND.run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",)) == 1, "one method fails"
+    assert run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",)) == 1, "one method fails"
     content = json.loads((out / "table.json").read_text())
     assert content["scenes"] == {"pattern-0, views-3": "views-3", "pattern-0, views-4": "views-4"}
     assert content["dataset"]["split"] == "views-3, views-4"

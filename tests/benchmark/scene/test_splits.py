@@ -12,6 +12,7 @@ from dummy_methods import CountMethod
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from run_command import run_benchmark
 from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
@@ -24,7 +25,7 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription
-from spike4dgs.cli import load, main
+from spike4dgs.cli import main
 from spike4dgs.leaderboard.submit_command import submit_all
 
 
@@ -261,7 +262,7 @@ def test_run_benchmark_keeps_the_splits_apart(
 ) -> None:
     monkeypatch.setattr("spike4dgs.cli.run_benchmark.find_methods", lambda: {"counts": CountMethod()})
     for split in (None, "corner"):
-        assert load("run-benchmark")((scene,), out=tmp_path / "out", split=split, device="cpu") == 0
+        assert run_benchmark((scene,), out=tmp_path / "out", split=split, device="cpu") == 0
     records = {p.parent.parent.name: json.loads(p.read_text()) for p in (tmp_path / "out").rglob("results/counts.json")}
     assert {name: r["dataset"]["split"] for name, r in records.items()} == {"out": "center", "corner": "corner"}
     assert "Results, split corner" in capsys.readouterr().out
