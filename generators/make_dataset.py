@@ -84,9 +84,9 @@ def make_dataset(
 
     from spike4dgs.benchmark.runs.executors import executor
     from spike4dgs.benchmark.scene.cameras import check_lens
-    from spike4dgs.generators.check.check import check_scenes, find_references
     from spike4dgs.generators.render_tasks import cameras_of
     from spike4dgs.generators.rendering.mitsuba_variant import choose_device, pick_variant
+    from spike4dgs.generators.scene_check import check_scenes, find_references
 
     console = Console(highlight=False, soft_wrap=True)
     if all and worlds:

@@ -34,15 +34,13 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import render_tasks, streams
-from spike4dgs.generators.audit import audit
-from spike4dgs.generators.contact_sheet import contact_sheet
-from spike4dgs.generators.ground_truth import mask_file, write_truth
-from spike4dgs.generators.preview import preview
+from spike4dgs.generators.previews import contact_sheet, preview
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import StaticViews
+from spike4dgs.generators.truth import audit, mask_file, write_truth
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 LICENCE = "CC0-1.0"

@@ -15,12 +15,12 @@ from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.generators import conventional, events
+from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, THRESHOLD, events, exposures
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
-from spike4dgs.generators.sensor import calibration
-from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor import calibration as calibration
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
@@ -38,9 +38,9 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
     write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
     instants = store.instants(view, plan)
-    for tick, image in conventional.exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
+    for tick, image in exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
         write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(image))
-    found = events.events(store.instants(view, plan).keys, instants.ticks, job.n_ticks, RATE_HZ)
+    found = events(store.instants(view, plan).keys, instants.ticks, job.n_ticks, RATE_HZ)
     write_events(scene / f"events/{camera.id}.npz", found)
     clip, charge = store.view(view, plan), random_charge(*size, entropy)
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
@@ -81,8 +81,8 @@ def extras(job: Job) -> dict[str, dict[str, Any]]:
             "geometry": "Z: metres along the optical axis; id: see instances; flow.x, flow.y: px to 1 ms later",
             "sparse_every_ticks": job.profile.sparse_every,
         },
-        "conventional": {"fps": conventional.FPS, "exposure_s": conventional.EXPOSURE_S, "coding": "8-bit sRGB gray"},
-        "events": {"threshold": events.THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"},
+        "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S, "coding": "8-bit sRGB gray"},
+        "events": {"threshold": THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"},
         "calibration": {
             "flat_radiance": calibration.FLAT_RADIANCE,
             "flat_ticks": calibration.FLAT_TICKS,

@@ -21,7 +21,6 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.generators.audit import errors
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, Job
 from spike4dgs.generators.render_tasks import (
     RenderKeys,
@@ -35,6 +34,7 @@ from spike4dgs.generators.render_tasks import (
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.truth import errors
 
 _TICKS = 3
 MORE = 4  # times the profile's samples, for the truth

@@ -25,8 +25,8 @@ MAY_IMPORT = {
 ORDER = {
     "benchmark": "errors lazy plugins variants files compilation locks schemas inputs gpu environment weights array "
     "spikes scene identity release imports metrics method results hard_cases reports runs cli speed",
-    "generators": "profiles sensor worlds rig conventional events recorder rendering bursts streams tasks "
-    "second_renderings oracle ground_truth audit reports twins hard_cases scene_maker check make_dataset",
+    "generators": "profiles sensor worlds other_sensors recorder rendering msdi_data streams render_tasks "
+    "second_renderings truth previews hard_cases scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state settings splat gaussians training_views motion supervision pose_refinement trainer_settings "
     "schedule models checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings "
     "viewing",
@@ -96,7 +96,7 @@ def test_no_room_imports_what_it_may_not(path: Path) -> None:
     ("source", "package", "caught"),
     [
         ("from spike4dgs.method.fit import Parts", "spike4dgs.benchmark", True),
-        ("def f():\n    import spike4dgs.generators.rig", "spike4dgs.method", True),
+        ("def f():\n    import spike4dgs.generators.profiles", "spike4dgs.method", True),
         ("def f():\n    from spike4dgs import baselines", "spike4dgs.method", True),
         ("from ..method import fit", "spike4dgs.benchmark", True),
         ("from ...method import fit", "spike4dgs.generators.worlds", True),

@@ -12,8 +12,8 @@ from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, refused
 from spike4dgs.benchmark.hard_cases.cores import core_counts, equal_bytes
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.generators.events import events
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.other_sensors import events
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference
 

@@ -29,7 +29,7 @@ from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VA
 from spike4dgs.generators.profiles import RATE_HZ
 
 if TYPE_CHECKING:
-    from spike4dgs.generators.msdi_data.render import BurstRenderer
+    from spike4dgs.generators.msdi_data.rigs import BurstRenderer
     from spike4dgs.generators.worlds import WorldScene
 
 DURATION_S = 0.1  # of the clips that the instants are drawn from
@@ -74,8 +74,7 @@ class MakeBursts:
 
     def _renderer(self, world: WorldScene, rng: np.random.Generator) -> BurstRenderer:
         """Return a renderer for a rig with a free view; each further attempt is closer to the world's own rig."""
-        from spike4dgs.generators.msdi_data.render import BurstRenderer
-        from spike4dgs.generators.msdi_data.rig_jitter import jittered_cameras
+        from spike4dgs.generators.msdi_data.rigs import BurstRenderer, jittered_cameras
 
         amount = 1.0
         while True:

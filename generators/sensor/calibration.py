@@ -1,4 +1,10 @@
-"""Calibration recordings of the simulated cameras, and the command that turns recordings into maps.
+"""Gain and dark maps: drawn for simulated cameras, and estimated from flat-field and dark recordings.
+
+Fixed-pattern maps of the simulated cameras: gain and dark rate of every pixel.
+
+The gain is a smooth shading times independent pixels; the dark rate is log-normal with a few hot pixels. The constants
+are those of `benchmark.spikes.sensor_model`. The outliers along the edges of the real camera's chip are not modelled.
+A camera keeps its maps: they depend on the seed, the camera and the resolution, not on the world.
 
 `calibrate` estimates the maps of a scene's cameras (`benchmark.scene.calibration`) and, where the truth is known, their
 errors.
@@ -17,10 +23,45 @@ from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.calibration import Calibration, estimate
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
-from spike4dgs.generators.sensor.maps import write_maps
-from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
+
+
+def gain_map(height: int, width: int, seed: int, camera: str) -> Float32:
+    """Return the relative sensitivity [H, W], mean 1."""
+    rng = _rng("gain", seed, camera)
+    y, x = np.linspace(0, np.pi, height)[:, None], np.linspace(0, np.pi, width)[None]
+    waves = [(i, j) for i in range(3) for j in range(3) if 0 < i + j <= 2]
+    shading = np.zeros((height, width))
+    for i, j in waves:
+        shading += rng.normal() * np.cos(i * y) * np.cos(j * x)
+    shading -= np.mean(shading)
+    shading *= np.sqrt(SENSOR.gain_spread**2 - SENSOR.gain_local_spread**2) / max(np.std(shading), 1e-9)
+    gain = np.exp(shading) * (1 + SENSOR.gain_local_spread * np.clip(rng.normal(size=(height, width)), -6, 6))
+    return np.asarray(gain / gain.mean(), dtype=np.float32)
+
+
+def dark_map(height: int, width: int, seed: int, camera: str) -> Float32:
+    """Return the dark rate [H, W] in spikes per tick."""
+    rng = _rng("dark", seed, camera)
+    dark = SENSOR.dark_median * np.exp(SENSOR.dark_log_spread * rng.normal(size=(height, width)))
+    hot = rng.random((height, width)) < SENSOR.hot_share
+    dark[hot] *= np.minimum(SENSOR.hot_factor * (1 + rng.pareto(SENSOR.hot_tail, hot.sum())), SENSOR.hot_most)
+    return np.asarray(dark, dtype=np.float32)
+
+
+def write_maps(path: Path, maps: dict[str, Float32 | None]) -> None:
+    """Write the maps that are on as `.npz` (equal maps give equal bytes), or no file if all are off."""
+    if on := {name: m for name, m in maps.items() if m is not None}:
+        with atomic_path(path) as part:
+            np.savez(part, allow_pickle=False, **on)
+
+
+def _rng(name: str, seed: int, camera: str) -> np.random.Generator:
+    return np.random.default_rng([seed, *f"{camera} {name}".encode()])
+
 
 FLAT_RADIANCE = 0.7
 FLAT_TICKS = 500  # 25 ms

@@ -11,9 +11,7 @@ import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
-from spike4dgs.generators.worlds.primitives.lamp import Lamp
-from spike4dgs.generators.worlds.primitives.materials import Colour, Material
-from spike4dgs.generators.worlds.primitives.meshes import (
+from spike4dgs.generators.worlds.parts.meshes import (
     Mesh,
     box,
     disc,
@@ -22,7 +20,8 @@ from spike4dgs.generators.worlds.primitives.meshes import (
     rotation,
     translation,
 )
-from spike4dgs.generators.worlds.primitives.textures import Canvas, cloth, fractal, mix, plain
+from spike4dgs.generators.worlds.parts.surfaces import Colour, Lamp, Material
+from spike4dgs.generators.worlds.parts.textures import Canvas, cloth, fractal, mix, plain
 
 DISC_RADIUS_M, DISC_TOP_M = 0.32, 0.05
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
 from spike4dgs.benchmark.spikes.stream import UInt8, count_bits, pack
 from spike4dgs.generators.sensor import model as camera
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Float32, Int32, Keys, Sensor, random_charge
 from spike4dgs.generators.sensor.reference import fire, tick_means
 from spike4dgs.studies.speed.timing import module_of, show_table, time_ms

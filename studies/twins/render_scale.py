@@ -7,7 +7,7 @@ from typing import Any
 
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.studies.speed.growth import growth, thread_counts, timed
 from spike4dgs.studies.speed.simulate import pattern

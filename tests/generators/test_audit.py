@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spike4dgs.generators.audit import errors
+from spike4dgs.generators.truth import errors
 
 
 def test_audit_errors_against_closed_forms():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spike4dgs.generators.conventional import EXPOSURE_S, FPS, exposures
+from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, exposures
 from spike4dgs.generators.sensor.reference import tick_means
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.generators.events import THRESHOLD, events
+from spike4dgs.generators.other_sensors import THRESHOLD, events
 
 RATE = 20_000
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spike4dgs.generators.ground_truth import moving_region
+from spike4dgs.generators.truth import moving_region
 
 
 def test_moving_region_has_the_object_and_its_moving_shadow_only():

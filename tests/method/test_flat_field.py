@@ -12,7 +12,7 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.starts.rig import RigSettings, rig

@@ -11,12 +11,19 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.shops import shops
-from spike4dgs.generators.worlds.parts.street_furniture import furniture, trees
-from spike4dgs.generators.worlds.parts.street_plan import FRONT_Y, PAVEMENT_Z, ROAD_X, ROAD_Y, WHITE
-from spike4dgs.generators.worlds.primitives.materials import Material
-from spike4dgs.generators.worlds.primitives.meshes import merge, quad
-from spike4dgs.generators.worlds.primitives.textures import Canvas, asphalt, fractal, mix, paving, plain
+from spike4dgs.generators.worlds.parts.meshes import merge, quad
+from spike4dgs.generators.worlds.parts.street_furniture import (
+    FRONT_Y,
+    PAVEMENT_Z,
+    ROAD_X,
+    ROAD_Y,
+    WHITE,
+    furniture,
+    shops,
+    trees,
+)
+from spike4dgs.generators.worlds.parts.surfaces import Material
+from spike4dgs.generators.worlds.parts.textures import Canvas, asphalt, fractal, mix, paving, plain
 
 _TEXELS = 56  # per metre on the ground
 

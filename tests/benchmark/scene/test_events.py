@@ -16,7 +16,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.events import Events, EventStream, read_events, write_events
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.generators.events import THRESHOLD, events
+from spike4dgs.generators.other_sensors import THRESHOLD, events
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.streams import extras
 

@@ -13,7 +13,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import decode_srgb, encode_srgb, write_png
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.generators.conventional import EXPOSURE_S, FPS, exposures
+from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, exposures
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.streams import extras
 

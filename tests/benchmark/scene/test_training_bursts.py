@@ -15,8 +15,8 @@ from spike4dgs.benchmark.scene.training_bursts import (
     open_folder,
     write_bursts,
 )
-from spike4dgs.generators.msdi_data.rig_jitter import jittered_cameras
-from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.msdi_data.rigs import jittered_cameras
+from spike4dgs.generators.profiles import cameras
 from spike4dgs.generators.worlds import WORLDS
 
 

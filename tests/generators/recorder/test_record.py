@@ -20,7 +20,7 @@ from spike4dgs.generators.recorder import sources
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import Fault
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
-from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor import calibration as calibration
 from spike4dgs.generators.sensor.model import Sensor
 
 

@@ -14,8 +14,8 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
-from spike4dgs.generators.sensor import calibration
-from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor import calibration as calibration
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
 from spike4dgs.generators.sensor.model import Sensor
 
 WIDTH, HEIGHT = 200, 125

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.generators.sensor.maps import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import fire, simulate_reference, tick_means
 

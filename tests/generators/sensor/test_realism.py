@@ -10,7 +10,7 @@ from small_scenes import shared_file
 from spike4dgs.benchmark.spikes.calibration import rates
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import open_stream
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.statistics import WINDOWS, excess_variance, local_spread, stream_statistics
 

@@ -23,8 +23,8 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.calibration import estimate
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
-from spike4dgs.generators.sensor import calibration
-from spike4dgs.generators.sensor.maps import dark_map, gain_map
+from spike4dgs.generators.sensor import calibration as calibration
+from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor
 from spike4dgs.method.settings import Settings
 from spike4dgs.studies.speed import images, rows

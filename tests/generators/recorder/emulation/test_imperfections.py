@@ -17,7 +17,7 @@ from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.cli import main
 from spike4dgs.generators.recorder.emulation.array import scene_profile
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections, draw, with_wrong_calibrations
-from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor import calibration as calibration
 from spike4dgs.generators.sensor.model import Sensor
 
 

@@ -18,9 +18,9 @@ from spike4dgs.benchmark.scene.images import read_exr, read_geometry, write_exr,
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.stream import pack
-from spike4dgs.generators.check.check import NOISE_FOLDER, check_scenes, find_references
-from spike4dgs.generators.check.facts import differing_facts
 from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.scene_check import NOISE_FOLDER, check_scenes, find_references
+from spike4dgs.generators.scene_differences import differing_facts
 
 JOB = Job("pattern", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 

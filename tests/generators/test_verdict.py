@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from spike4dgs.generators.check.differences import Difference
-from spike4dgs.generators.check.report import to_markdown
-from spike4dgs.generators.check.verdict import (
+from spike4dgs.generators.scene_check import (
     CHANGE,
     EQUAL,
     MOST_OF_BLOCKS,
@@ -14,7 +12,9 @@ from spike4dgs.generators.check.verdict import (
     NOISE,
     Comparison,
     beyond_noise,
+    to_markdown,
 )
+from spike4dgs.generators.scene_differences import Difference
 
 FLOOR = Difference(0.17, 1e-3, 4e-3, 5e-3, 1e-3, 4e-3)
 

@@ -1,4 +1,4 @@
-"""Materials of surfaces, and their conversion to Mitsuba."""
+"""Materials of surfaces, and lamps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from spike4dgs.generators.worlds.primitives.meshes import Mesh
+    from spike4dgs.generators.worlds.parts.meshes import Mesh
 
 Colour = tuple[float, float, float]
 
@@ -52,7 +52,7 @@ def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
     """Return a `mitsuba.Mesh` that can be a value in a scene dictionary, also inside a shape group."""
     import mitsuba as mi
 
-    from spike4dgs.generators.worlds.primitives.meshes import vertex_normals
+    from spike4dgs.generators.worlds.parts.meshes import vertex_normals
 
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material.to_mitsuba())
@@ -73,3 +73,51 @@ def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
         buffers["vertex_normals"] = np.ascontiguousarray(vertex_normals(mesh), np.float32).ravel()
     buffers.update()
     return shape
+
+
+_HALF_M = 0.16
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A hanging lamp: its position in metres, its strength, and the point that it shines on."""
+
+    position: tuple[float, float, float] = (-0.85, -0.75, 1.7)
+    power: float = 1.0
+    target: tuple[float, float, float] = (0.0, 0.0, 0.1)
+
+    @property
+    def frame(self) -> np.ndarray:
+        """Pose [4, 4] of the square: its z axis points at the target."""
+        origin = np.array(self.position)
+        forward = np.array(self.target) - origin
+        forward /= np.linalg.norm(forward)
+        left = np.cross([0.0, 0.0, 1.0], forward)
+        left /= np.linalg.norm(left)
+        pose = np.eye(4)
+        pose[:3] = np.stack([left, np.cross(forward, left), forward, origin], 1)
+        return pose
+
+    @property
+    def points(self) -> np.ndarray:
+        """Homogeneous points [5, 4]: the middle and the corners of the lamp."""
+        corners = np.array([(0, 0, 0, 1)] + [(a, b, 0, 1) for a in (-1, 1) for b in (-1, 1)], np.float64)
+        corners[:, :2] *= _HALF_M
+        return np.asarray(corners @ self.frame.T)
+
+    def emitters(self, room: float = 1.0) -> dict[str, dict[str, Any]]:
+        """Return Mitsuba emitters: the lamp, sampled, and weak room light, found by BSDF sampling only."""
+        power = 62.0 * self.power
+        scale = np.diag([_HALF_M, _HALF_M, 1.0, 1.0])
+        return {
+            "lamp": {
+                "type": "rectangle",
+                "to_world": self.frame @ scale,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [power, power * 0.95, power * 0.88]}},
+            },
+            "room": {
+                "type": "constant",
+                "radiance": {"type": "rgb", "value": [0.40 * room, 0.43 * room, 0.48 * room]},
+                "sampling_weight": 0.0,
+            },
+        }

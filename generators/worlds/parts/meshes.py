@@ -1,7 +1,4 @@
-"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the image.
-
-Every surface is shaded on both sides, so winding only has to be consistent within one mesh.
-"""
+"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the image."""
 
 from __future__ import annotations
 

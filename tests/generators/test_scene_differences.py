@@ -12,7 +12,7 @@ from spike4dgs.benchmark.scene.images import read_exr, write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.generators.check.differences import bits_that_differ, block_means, difference, images_of
+from spike4dgs.generators.scene_differences import bits_that_differ, block_means, difference, images_of
 
 
 def opened(root: Path) -> Scene:

@@ -1,1 +1,0 @@
-"""Building blocks of every world: meshes, materials, textures, rigid bodies, the lamp."""
