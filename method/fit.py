@@ -29,9 +29,9 @@ from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
-from spike4dgs.method.training_views.made_scene import made_scene
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.training_views.training_images import TrainingImages
+from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
@@ -131,7 +131,7 @@ class RecipeMethod:
             return
         check_device(request.device)
         request.progress(0, 1, "compilation")
-        scene, *points = made_scene()
+        scene, *points = warm_up_scene()
         start = Start(scene.cameras, *points)
         with kept_random_state(request.device):
             model = self._fit(scene, start, short(self.settings), FitRequest(device=request.device))
@@ -216,7 +216,7 @@ def fit_gaussians(
     motion = make_motion(spec.extent, spec.settings, seeded(request.seed, -1)).to(request.device)
     points, values = at_most(density.max_gaussians, start, request.seed)
     initial = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
-    first = motion.attach(from_points(points, values, **initial, device=request.device), job.training_images)
+    first = motion.initialize(from_points(points, values, **initial, device=request.device), job.training_images)
     loss = supervise(job.settings["supervision"], job.scene).to(request.device)
     scale = job.extent.scale
     trainer = Trainer(job.training_images, first, motion, loss, settings, density, scale=scale, seed=request.seed)

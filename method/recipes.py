@@ -129,7 +129,7 @@ SPIKE4DGS_X = Recipe(
         **_PATHS,
         # Corrected means of a clip have hardly any noise: a road's grain is enough to find its depth.
         "initialization.noise": 3e-5,
-        "supervision.ease": 0.02,  # a span's noise, which is off by up to a spike: the median of few is one of them
+        "supervision.huber_delta": 0.02,  # a span's noise, off by up to a spike: the median of few is one of them
     },
 )
 # The same without the calibrations: it estimates the cameras' fixed patterns from the clip, beside the scene. Its first

@@ -61,8 +61,9 @@ class Trainer:
         if settings.refine_poses and (settings.freeze_background or images.spans is not None):
             expected = "either trainer.refine_poses, or trainer.freeze_background and images of known spans"
             raise problem("settings", expected, "both", "choose one: the latter are rendered from the given poses")
-        if settings.average > 1 - density.until:
-            expected = f"trainer.average of at most {1 - density.until:g}, as density.until is {density.until:g}"
+        if settings.average > 1 - density.refine_stop:
+            stop = density.refine_stop
+            expected = f"trainer.average of at most {1 - stop:g}, as density.refine_stop is {stop:g}"
             raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")
         self.training_images, self.motion, self.supervision = images, motion, supervision
         self.settings, self.density, self.scale, self.seed = settings, density, scale, seed
@@ -114,7 +115,7 @@ class Trainer:
                 self._freeze()
             return
         self.ended[self.plan[self.plan.index(stage) - 1].piece] = self.gaussians.detached()
-        first = self.motion.continued(self.ended[stage.neighbour], forward=stage.piece > stage.neighbour)
+        first = self.motion.next_piece(self.ended[stage.neighbour], forward=stage.piece > stage.neighbour)
         self.gaussians = first.trainable()
 
     def pieces(self) -> tuple[Gaussians, ...]:
@@ -230,9 +231,9 @@ class Trainer:
         limit = s.limit(views.width, views.height, background=bool(self.projected))
         rng = seeded(self.seed, self.step)
         for edit in adapt_density(self.gaussians, self.statistics, s, self.scale, limit, rng):
-            self.gaussians = apply_edit(self.adam, self.motion.born(edit, rng))
-        if stage.deforms and 2 <= done // s.every < 2 + self.motion.guided_rounds:
-            more = self.motion.guide(self.gaussians, self.training_images, rng)
+            self.gaussians = apply_edit(self.adam, self.motion.after_densification(edit, rng))
+        if stage.deforms and 2 <= done // s.refine_every < 2 + self.motion.guided_rounds:
+            more = self.motion.guided_samples(self.gaussians, self.training_images, rng)
             self.gaussians = apply_edit(self.adam, appended(more, len(self.gaussians)))
         self.coherence.forget()
         self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)

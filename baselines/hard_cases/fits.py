@@ -19,14 +19,14 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.self_calibration.clocks import estimate_clocks
 from spike4dgs.method.starts.base import Initialization, Start
-from spike4dgs.method.training_views.made_scene import made_scene
+from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
 
 _FEW: dict[str, Any] = {
     "trainer.coarse_steps": 4,
     "trainer.fine_steps": 8,
     "trainer.piece_steps": 3,
     "trainer.views_per_step": 2,
-    "density.every": 3,
+    "density.refine_every": 3,
     "images.time_spacing_ticks": 20,
     "images.max_times": 4,
     "images.flat_field": True,
@@ -43,7 +43,7 @@ def _with_spikes(make: Callable[[np.random.Generator, tuple[int, int, int]], Any
     """Return a function that puts spikes into the first `views` cameras of the made scene, or into all of them."""
 
     def scene(rng: np.random.Generator) -> TrainingScene:
-        usual = made_scene()[0]
+        usual = warm_up_scene()[0]
         stream = usual.streams[0]
         spikes = np.asarray(make(rng, (usual.n_ticks, stream.height, stream.width)), np.uint8)
         count = len(usual.streams) if views is None else views
@@ -54,7 +54,7 @@ def _with_spikes(make: Callable[[np.random.Generator, tuple[int, int, int]], Any
 
 
 def _one_view(rng: np.random.Generator) -> TrainingScene:
-    usual = made_scene()[0]
+    usual = warm_up_scene()[0]
     return replace(usual, cameras=usual.cameras[:1], streams=usual.streams[:1], recordings=usual.recordings[:1])
 
 
@@ -102,7 +102,7 @@ def _fit_case(recipe: str, name: str) -> Case:
 def _fitted(recipe: Recipe, scene: TrainingScene, setting: Setting) -> Outcome:
     """Fit, save, render; count what is not finite in the losses, the model's tensors and the images."""
     notes: list[str] = []
-    start = Initialization(lambda request: Start(request.scene.cameras, *made_scene()[1:]))
+    start = Initialization(lambda request: Start(request.scene.cameras, *warm_up_scene()[1:]))
     method = RecipeMethod(recipe, replace(PARTS, initialization={"made": start}))
     request = FitRequest(
         seed=setting.seed, device=setting.device, progress=lambda done, total, note="": notes.append(note)
@@ -129,7 +129,7 @@ def _provenance(scene: TrainingScene, setting: Setting) -> Provenance:
 
 
 def _refused_clocks(setting: Setting) -> Outcome:
-    usual = made_scene()[0]
+    usual = warm_up_scene()[0]
     two = replace(usual, cameras=usual.cameras[:2], streams=usual.streams[:2], recordings=usual.recordings[:2])
     short = _with_spikes(lambda rng, shape: rng.random((40, *shape[1:])) < 0.5)(setting.rng())
     return refused({"two cameras": lambda: estimate_clocks(two), "40 ticks": lambda: estimate_clocks(short)})

@@ -21,8 +21,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.untrusted.numbers import MAX_LENGTH, positive, whole
 from spike4dgs.method.models.fitted_model import count_bytes
-from spike4dgs.method.models.model_file import ModelFile, group, write_model
-from spike4dgs.method.models.modules import make_filled
+from spike4dgs.method.models.model_file import ModelFile, group, make_filled, write_model
 from spike4dgs.method.motion.hexplane import HexPlaneShape
 from spike4dgs.method.torch_state import one_torch_thread
 

@@ -30,7 +30,7 @@ from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSettings, move_to
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.changes import POINTS
-from spike4dgs.method.training_views.lookup import look_up, variation_at
+from spike4dgs.method.training_views.points import look_up, variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 
@@ -59,7 +59,7 @@ class SpacetimeLite(PolynomialMotion):
 
     defaults = SpacetimeLiteSettings()
     # STG sees 30,000 pairs of images and densifies 6 or 12 times, which is 7 times here.
-    published = {"trainer.coarse_steps": 0, "trainer.fine_steps": 15000, "density.every": 1250}
+    published = {"trainer.coarse_steps": 0, "trainer.fine_steps": 15000, "density.refine_every": 1250}
     rests_first = False
     settings: SpacetimeLiteSettings
 
@@ -68,7 +68,7 @@ class SpacetimeLite(PolynomialMotion):
         """The settings' number."""
         return self.settings.guided_rounds
 
-    def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+    def initialize(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
         """Return Gaussians with a time, a temporal scale and a path at rest; moving ones are there at several times."""
         s = self.settings
         shift = variation_at(gaussians.means, images) > s.moving_change
@@ -83,13 +83,13 @@ class SpacetimeLite(PolynomialMotion):
             parts.append(self.timed(replace(part, colors=colors), times, s.moving_temporal_scale))
         return concatenate(parts)
 
-    def guide(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
+    def guided_samples(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
         """Return the Gaussians followed by new ones where the worst views lack some (`guided_sampling`)."""
         duration = self.settings.moving_temporal_scale
         new = guide(self, gaussians, images, generator)
         return concatenate([gaussians, *(self.timed(g, torch.full((len(g),), t), duration) for g, t in new)])
 
-    def born(self, edit: Edit, generator: torch.Generator) -> Edit:
+    def after_densification(self, edit: Edit, generator: torch.Generator) -> Edit:
         """Return the edit with the added Gaussians moved to random times, along their paths."""
         g = edit.gaussians
         times = g.extra["times"].clone()

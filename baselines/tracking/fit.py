@@ -222,7 +222,7 @@ class Tracker:
             splats = Splats(*everything, scales, opacities, torch.cat([leaves["colors"], self.flag], 1))
             views = Views(every.w2c[chosen], every.K[chosen], every.width, every.height)
             image, silhouette = render(splats, views).image.unbind(-1)
-            total = s.image_weight * difference(image, self.images[index][chosen], pixel.ssim_weight, pixel.ease)
+            total = s.image_weight * difference(image, self.images[index][chosen], pixel.ssim_weight, pixel.huber_delta)
             total = total + s.silhouette_weight * (silhouette * self.quiet[chosen]).mean()
             # A mean over whole images, as published: outside of the window nothing changes.
             total = self.share * total + physical_loss(self.graph, before, means[:n], quats[:n], weights)

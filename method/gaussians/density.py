@@ -15,24 +15,24 @@ from spike4dgs.method.splat import RenderOutput
 
 @dataclass(frozen=True)
 class DensitySettings(Settings):
-    """When, where and how far Gaussians become denser (prefix `density`)."""
+    """When, where and how far Gaussians become denser (prefix `density`). Names are gsplat's where it has them."""
 
-    every: int = 100  # steps
-    until: float = 0.6  # share of a stage
-    grow_gradient: float = 2e-4  # mean screen-space gradient (half-image units) above which a Gaussian is densified
-    split_scale: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
-    min_opacity: float = 0.005  # fainter ones are removed
+    refine_every: int = 100  # steps
+    refine_stop: float = 0.6  # share of a stage
+    grow_grad2d: float = 2e-4  # mean screen-space gradient (half-image units) above which a Gaussian is densified
+    grow_scale3d: float = 0.01  # x scene scale: larger ones are split, smaller ones cloned
+    prune_opacity: float = 0.005  # fainter ones are removed
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
     max_moving_per_pixel: float = 0.4  # the same of those before a background, which is not counted
     max_gaussians: int = 1_000_000  # whatever the images' size; half as many before a background
 
     def due(self, done: int, steps: int) -> bool:
         """Return whether the density changes after `done` of a stage's `steps`."""
-        return done % self.every == 0 and self.ahead(done, steps)
+        return done % self.refine_every == 0 and self.ahead(done, steps)
 
     def ahead(self, done: int, steps: int) -> bool:
         """Return whether the density changes after `done` of a stage's `steps` or later in it."""
-        return done <= self.until * steps
+        return done <= self.refine_stop * steps
 
     def limit(self, width: int, height: int, background: bool) -> int:
         """Return the most Gaussians for views of a size, with a background behind them or not."""
@@ -81,17 +81,17 @@ def adapt_density(
 
     Faint Gaussians are relocated instead of deleted while the number is at its `limit`, and deleted before.
     """
-    dead = gaussians.logits.detach().sigmoid() < settings.min_opacity
+    dead = gaussians.logits.detach().sigmoid() < settings.prune_opacity
     grow = statistics.mean() * ~dead
     room = limit - (len(gaussians) - int(dead.sum()))
     if room <= 0:
         return [relocate(gaussians, dead, rng)]
-    want = grow > settings.grow_gradient
+    want = grow > settings.grow_grad2d
     if int(want.sum()) > room:
         want = torch.zeros_like(dead).index_fill(0, torch.topk(grow, room).indices, True)
-    large = gaussians.log_scales.detach().amax(-1) > math.log(settings.split_scale * scale)
+    large = gaussians.log_scales.detach().amax(-1) > math.log(settings.grow_scale3d * scale)
     first = densify(gaussians, want & ~large, want & large, rng)
-    dead_then = first.gaussians.logits.sigmoid() < settings.min_opacity
+    dead_then = first.gaussians.logits.sigmoid() < settings.prune_opacity
     second = prune(first.gaussians, ~dead_then)
     source = first.source[second.source]
     return [Edit(second.gaussians, source, int((source < 0).sum()))]

@@ -39,7 +39,7 @@ from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
-from spike4dgs.method.training_views.made_scene import made_scene, radiance_of
+from spike4dgs.method.training_views.warm_up_scene import radiance_of, warm_up_scene
 
 STOPS = (10, 20, 30)  # steps after which a fit is interrupted
 _STEPS = TrainerSettings(coarse_steps=15, fine_steps=25, piece_steps=10, views_per_step=3)
@@ -69,21 +69,21 @@ MEAN = ImageMaker(name="mean", rate=window_mean)
 
 def start_of(scene: TrainingScene) -> Start:
     """Return a start on the made scene's wall."""
-    return Start(scene.cameras, *made_scene()[1:])
+    return Start(scene.cameras, *warm_up_scene()[1:])
 
 
 def small_trainer(motion: str, supervision: str, seed: int, extra: Mapping[str, Any], device: str) -> Trainer:
     """Return a trainer of few steps on the made scene, densification included."""
-    scene = made_scene()[0]
+    scene = warm_up_scene()[0]
     start, s = start_of(scene), replace(_STEPS, **extra)
     images = make_training_images(scene, start.cameras, MEAN, ImageSettings(time_spacing_ticks=20), device)
     kind, loss = MOTIONS[motion], SUPERVISIONS[supervision]
     settings = replace(kind.defaults, **_SMALL.get(motion, {}))
     extent = measure(start, scene)
     model = kind(extent, settings, seeded(seed, -1)).to(device)
-    gaussians = model.attach(from_points(start.points, start.values, opacity=0.5, device=device), images)
+    gaussians = model.initialize(from_points(start.points, start.values, opacity=0.5, device=device), images)
     compare_with = loss(loss.defaults, scene).to(device)
-    density = DensitySettings(every=4)
+    density = DensitySettings(refine_every=4)
     return Trainer(images, gaussians, model, compare_with, s, density, scale=extent.scale, seed=seed)
 
 
@@ -233,7 +233,7 @@ def _seed_cases() -> list[Case]:
 
 
 def _other_seeds(setting: Setting) -> Outcome:
-    scene = made_scene()[0]
+    scene = warm_up_scene()[0]
     held_out = replace(scene.cameras[0], id="held out", t=-scene.cameras[0].R @ np.array([0.05, 0.02, 0.0]))
     truth = radiance_of(held_out)
     parts = Parts({"mean": MEAN}, {"made": Initialization(lambda r: start_of(r.scene))}, MOTIONS, SUPERVISIONS)
@@ -254,7 +254,7 @@ def _other_seeds(setting: Setting) -> Outcome:
 def _saved_case(motion: str) -> Case:
     def run(setting: Setting) -> Outcome:
         model = _moving_model(motion)
-        path, camera = setting.folder / "model.safetensors", made_scene()[0].cameras[0]
+        path, camera = setting.folder / "model.safetensors", warm_up_scene()[0].cameras[0]
         model.save(path, _provenance())
         loaded = load_model(path).model
         times = (-10.0, 0.0, 0.37 * model.duration_us, model.duration_us, 1e9)
@@ -276,14 +276,14 @@ def _saved_case(motion: str) -> Case:
 def _moving_model(motion: str) -> FittedModel:
     trainer = small_trainer(motion, "pixel", 0, {"freeze_background": True}, "cpu")
     trainer.run(silent)
-    scene = made_scene()[0]
+    scene = warm_up_scene()[0]
     settings = replace(MOTIONS[motion].defaults, **_SMALL.get(motion, {}))
     spec = MotionSpec(motion, measure(start_of(scene), scene), settings)
     return FittedModel(trainer.pieces(), trainer.background, trainer.motion, scene.duration_us, "cpu", spec)
 
 
 def _provenance() -> Provenance:
-    scene = made_scene()[0]
+    scene = warm_up_scene()[0]
     method = {"name": "hard-cases", "version": "0", "params": {}, "seed": 0, "trained_on": []}
     return Provenance(
         method, scene.id, "0" * 64, "none", scene.cameras, scene.rate_hz, scene.n_ticks, scene.radiance_gain, 1.0,

@@ -18,9 +18,16 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.untrusted.numbers import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
 from spike4dgs.method.gaussians.parameters import Gaussians
-from spike4dgs.method.models.model_file import ModelFile, group, write_model
-from spike4dgs.method.models.modules import make_filled
-from spike4dgs.method.models.names import BACKGROUND, from_file_names, motion_settings, to_file_names
+from spike4dgs.method.models.model_file import (
+    BACKGROUND,
+    ModelFile,
+    from_file_names,
+    group,
+    make_filled,
+    motion_settings,
+    to_file_names,
+    write_model,
+)
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.table import motion_named
 from spike4dgs.method.pose_refinement import refine_pose

@@ -6,20 +6,32 @@ Nothing in it is code. `kind` names the reader of the tensors (`saved_model.GROU
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import parse_json
 from spike4dgs.benchmark.runs.provenance import Provenance, read_provenance
 from spike4dgs.method.models.tensor_file import part, read_tensors, write_tensors
+from spike4dgs.method.settings import Settings
 
 SCHEMA = "spike4dgs-model/1"
 FIX = "fit it again with `spike4dgs run-benchmark`"
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+WITHOUT_MEMORY = torch.device("meta")
+
+# Names in files, where they differ from those in the code. The files of all versions have the same tensors.
+BACKGROUND = "still"  # the group of the background's tensors
+TENSORS = {"log_temporal_scales": "lives", "coefficients": "paths", "angular_velocities": "spins"}  # code -> file
+_FROM_FILE = {saved: name for name, saved in TENSORS.items()}
+
+# A setting of the trainer, which no motion has: earlier files hold one flat list of the settings of all parts.
+_ONLY_FLAT = "coarse_steps"
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,3 +76,40 @@ def read_model(path: Path) -> ModelFile:
     except (ValueError, KeyError, TypeError) as e:
         raise problem(path, "kind, config and provenance of a model", repr(e)[:200], FIX) from None
     return ModelFile(str(kind), config, tensors, read_provenance(origin, str(path), FIX))
+
+
+def to_file_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors under their names in files."""
+    return {TENSORS.get(name, name): value for name, value in tensors.items()}
+
+
+def from_file_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a file under their names in the code."""
+    return {_FROM_FILE.get(name, name): value for name, value in tensors.items()}
+
+
+def motion_settings(saved: Mapping[str, Any], defaults: Settings) -> dict[str, Any]:
+    """Return a motion's settings from a file, of this version or of one with a flat list of all settings.
+
+    Of a flat list all that rendering needs has the same name here; learning rates had others and are left out.
+    """
+    if _ONLY_FLAT not in saved:
+        return dict(saved)
+    return {f.name: saved[f.name] for f in fields(defaults) if f.name in saved}
+
+
+def make_filled(make: Callable[[], ModuleT], tensors: Mapping[str, Tensor]) -> ModuleT:
+    """Return the module that `make` makes, with these tensors. Raises ValueError where they are not all of its own.
+
+    It is made without memory first, so that a file's numbers allocate no more than its tensors.
+    """
+    with WITHOUT_MEMORY:
+        wanted = {name: tuple(t.shape) for name, t in make().state_dict().items()}
+    found = {name: tuple(t.shape) for name, t in tensors.items()}
+    if wrong := sorted(n for n in wanted.keys() | found.keys() if wanted.get(n) != found.get(n)):
+        raise ValueError(
+            f"{wrong[0]} {found.get(wrong[0], 'missing')} in place of {wanted.get(wrong[0], 'none')}"[:200]
+        )
+    made = make()
+    made.load_state_dict(dict(tensors))
+    return made

@@ -65,19 +65,19 @@ class Motion(nn.Module):
         """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
         return image[..., 0]
 
-    def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+    def initialize(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
         """Return the first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
         return gaussians
 
-    def born(self, edit: Edit, generator: torch.Generator) -> Edit:
+    def after_densification(self, edit: Edit, generator: torch.Generator) -> Edit:
         """Return the edit after a change of the Gaussians that densification added."""
         return edit
 
-    def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
+    def next_piece(self, gaussians: Gaussians, forward: bool) -> Gaussians:
         """Return the Gaussians with which the next piece begins, or, not forward, the one before."""
         raise NotImplementedError
 
-    def guide(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
+    def guided_samples(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
         """Return the Gaussians followed by new ones where renders are bad."""
         return gaussians
 

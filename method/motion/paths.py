@@ -52,7 +52,7 @@ class Paths(PolynomialMotion):
         """See the base."""
         return self.settings.coherence
 
-    def continued(self, gaussians: Gaussians, forward: bool) -> Gaussians:
+    def next_piece(self, gaussians: Gaussians, forward: bool) -> Gaussians:
         """Return the Gaussians as they are at the piece's end, or beginning, going straight on at their velocities."""
         end, ahead = (1.0, 0.5) if forward else (0.0, -0.5)
         with torch.no_grad():
@@ -64,7 +64,7 @@ class Paths(PolynomialMotion):
             new.extra["coefficients"][:, :3], new.extra["angular_velocities"][:] = velocities, turning
         return new
 
-    def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+    def initialize(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
         """Return all Gaussians at rest in the middle of the clip, for as long as it lasts."""
         return self.timed(gaussians, torch.full((len(gaussians),), 0.5), self.settings.static_temporal_scale)
 

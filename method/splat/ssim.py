@@ -34,7 +34,7 @@ _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SSIM_SIGMA) ** 2)
 _WINDOW /= _WINDOW.sum()
 # From the window's edge to its middle. An argument of the kernel: numba's cache would keep constants of another module.
 _HALF = tuple(np.float32(w) for w in _WINDOW[: RADIUS + 1])
-_SHARP = 2.0**-100  # an ease at which Huber's loss is |d|, bit for bit
+_SHARP = 2.0**-100  # a delta at which Huber's loss is |d|, bit for bit
 _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 
 
@@ -51,22 +51,22 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     return value
 
 
-def l1_and_ssim(image: Tensor, target: Tensor, w: float, ease: float = 0.0) -> Tensor:
+def l1_and_ssim(image: Tensor, target: Tensor, w: float, delta: float = 0.0) -> Tensor:
     """Return (1 - w) mean h(image - target) + w (1 - SSIM); images and errors as `ssim`.
 
-    h is |d|, which makes it the loss of 3DGS, or with an `ease` above 0 Huber's: d^2 / 2 ease up to it, |d| - ease / 2
-    beyond.
+    h is |d|, which makes it the loss of 3DGS, or with a `delta` above 0 Huber's over delta: d^2 / 2 delta up to it,
+    |d| - delta / 2 beyond.
     """
     _check("l1_and_ssim", image, target)
     if image.device.type != "cpu":
-        return (1 - w) * huber(image, target, ease) + w * (1 - _mean_ssim(image, target, _banded))
-    value: Tensor = _Fused.apply(image, target, -w, 1 - w, max(ease, _SHARP))  # type: ignore[no-untyped-call]
+        return (1 - w) * huber(image, target, delta) + w * (1 - _mean_ssim(image, target, _banded))
+    value: Tensor = _Fused.apply(image, target, -w, 1 - w, max(delta, _SHARP))  # type: ignore[no-untyped-call]
     return w + value
 
 
-def huber(image: Tensor, target: Tensor, ease: float) -> Tensor:
+def huber(image: Tensor, target: Tensor, delta: float) -> Tensor:
     """Return the mean of h, see `l1_and_ssim`, by torch."""
-    return functional.huber_loss(image, target, delta=ease) / ease if ease else (image - target).abs().mean()
+    return functional.huber_loss(image, target, delta=delta) / delta if delta else (image - target).abs().mean()
 
 
 def _check(name: str, image: Tensor, target: Tensor) -> None:
@@ -116,13 +116,13 @@ def _mean_ssim(image: Tensor, target: Tensor, blur: Callable[[Tensor], Tensor]) 
 
 
 class _Fused(torch.autograd.Function):
-    """`of_ssim` x mean SSIM + `of_l1` x mean h(image - target), |d| but for an `ease`.
+    """`of_ssim` x mean SSIM + `of_l1` x mean h(image - target), |d| but for a `delta`.
 
     The gradient is computed with the value, while the blurred images are at hand.
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, of_ssim: float, of_l1: float, ease: float) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, of_ssim: float, of_l1: float, delta: float) -> Tensor:
         batch, height, width = image.shape
         a = np.ascontiguousarray(image.detach().numpy(), dtype=np.float32)
         b = np.ascontiguousarray(target.numpy(), dtype=np.float32)
@@ -138,7 +138,7 @@ class _Fused(torch.autograd.Function):
             )
             for _ in range(workers)
         ]
-        weights = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size), np.float32(ease), np.float32(1 / ease)
+        weights = np.float32(of_ssim / a.size), np.float32(of_l1 / a.size), np.float32(delta), np.float32(1 / delta)
         threads.run(_loss_kernel, (a, b, _HALF, weights, sums, gradient), scratch)
         if image.requires_grad:
             ctx.save_for_backward(torch.from_numpy(gradient))
@@ -208,10 +208,10 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
 ):
     """Sums of SSIM and h(image - target) of each image, and their gradient with the `weights`, if it is wanted.
 
-    `gradients` is empty where it is not. The last of the weights are the ease of h and its inverse.
+    `gradients` is empty where it is not. The last of the weights are the delta of h and its inverse.
     """
     batch, height, width = images.shape
-    of_ssim, of_l1, ease, steep = weights
+    of_ssim, of_l1, delta, steep = weights
     one, half_of = np.float32(1), np.float32(0.5)
     m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
     while True:
@@ -226,7 +226,7 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
                 q2[y, x] = b[y, x] * b[y, x]
                 q12[y, x] = a[y, x] * b[y, x]
                 far = abs(a[y, x] - b[y, x])
-                near = min(far, ease)
+                near = min(far, delta)
                 m1[y, x] = near * steep * (far - half_of * near)
             total += _row_sum(m1[y])
         sums[i, 1] = total

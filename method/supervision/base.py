@@ -49,12 +49,14 @@ class Supervision(nn.Module):
         return {}
 
 
-def difference(rendered: Tensor, image: Tensor, w: float, ease: float = 0.0) -> Tensor:
-    """Return (1 - w) mean h(rendered - image) + w (1 - SSIM) of batches [V, H, W]; h is |d|, eased Huber's loss.
+def difference(rendered: Tensor, image: Tensor, w: float, delta: float = 0.0) -> Tensor:
+    """Return (1 - w) mean h(rendered - image) + w (1 - SSIM) of batches [V, H, W].
+
+    h is |d|, or with a `delta` Huber's loss over delta.
 
     A pixel of `image` that is no number counts as met, and has no gradient.
     """
     if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
         rendered = torch.where(finite, rendered, rendered.detach())
         image = known(image, rendered)
-    return l1_and_ssim(rendered, image, w, ease) if w else huber(rendered, image, ease)
+    return l1_and_ssim(rendered, image, w, delta) if w else huber(rendered, image, delta)

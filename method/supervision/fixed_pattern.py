@@ -96,7 +96,7 @@ class FixedPattern(Supervision):
         if sample.step >= s.first and sample.step % s.every == 0:
             self.gain, self.dark = solve(self.sums, s, self.white)
         response = rendered * (1 + self.gain[chosen]) + self.dark[chosen]
-        return difference(response, sample.images, s.ssim_weight, s.ease)
+        return difference(response, sample.images, s.ssim_weight, s.huber_delta)
 
     def estimates(self) -> dict[str, Tensor]:
         """Return the maps [C, H, W]: `gain` with mean 1 over each camera, `dark` in spikes per tick."""

@@ -16,13 +16,13 @@ class PixelSettings(Settings):
     """Numbers of the supervision `pixel` (prefix `supervision`)."""
 
     ssim_weight: float = 0.2  # 3DGS's lambda; 4DGS publishes 0, which blurs
-    ease: float = 0.0  # white, below which differences count squared: their mean counts, not their median
+    huber_delta: float = 0.0  # white, below which differences count squared: their mean counts, not their median
 
 
 class Pixel(Supervision):
     """(1 - w) mean |I - P| + w (1 - SSIM(I, P)), the loss of 3DGS.
 
-    w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14). An `ease` makes |d| Huber's loss.
+    w = `ssim_weight`; with 0 it is the pixel loss of 4DGS and of Spike4DGS (eq. 14). A `huber_delta` makes |d| Huber's.
     """
 
     label = ""
@@ -34,4 +34,4 @@ class Pixel(Supervision):
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
         """Return the loss of one rendered sample."""
-        return difference(render(sample.t), sample.images, self.settings.ssim_weight, self.settings.ease)
+        return difference(render(sample.t), sample.images, self.settings.ssim_weight, self.settings.huber_delta)

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.changes import MASKS, changing, without_specks
-from spike4dgs.method.training_views.lookup import variation_at
-from spike4dgs.method.training_views.projection import project
+from spike4dgs.method.training_views.points import project, variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 SMALLEST_PX = 20  # pixels of a part; noise makes smaller ones

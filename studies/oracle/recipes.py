@@ -210,8 +210,8 @@ def paths_that_know(velocities: Callable[[NDArray[Any]], Float32], duration_s: f
     """Return the motion `paths` whose first Gaussians move as `velocities` says, which is of the middle of the clip."""
 
     class KnowingPaths(Paths):
-        def attach(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
-            first = super().attach(gaussians, images)
+        def initialize(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+            first = super().initialize(gaussians, images)
             found = torch.from_numpy(velocities(first.means.detach().cpu().numpy()))
             first.extra["coefficients"][:, :3] = found.to(first.means) * (duration_s / self.pieces)
             return first

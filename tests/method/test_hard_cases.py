@@ -118,9 +118,9 @@ def test_losses_gradients_and_parameters_are_numbers(name, images, motion, super
     kind, comparison = MOTIONS[motion], SUPERVISIONS[supervision]
     sizes = replace(kind.defaults, **SMALL.get(motion, {}))
     model = kind(measure(start, scene), sizes, seeded(0, -1))
-    gaussians = model.attach(from_points(start.points[::8], start.values[::8], opacity=0.5), training_images)
+    gaussians = model.initialize(from_points(start.points[::8], start.values[::8], opacity=0.5), training_images)
     compare = comparison(replace(comparison.defaults, **loss), scene)
-    density = DensitySettings(every=3)
+    density = DensitySettings(refine_every=3)
     fit = Trainer(training_images, gaussians, model, compare, s, density, scale=1.0, seed=0)
     while fit.step < fit.total:
         assert fit.train_step().isfinite()

@@ -81,7 +81,7 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     """Position, orientation, opacity and velocity at the border are the same on both sides."""
     g, motion, h = cloud(seed=4, dtype=torch.float64), paths(1200), 1e-6
     before, after = (1.0, 0.0) if forward else (0.0, 1.0)
-    follower = motion.continued(g, forward)
+    follower = motion.next_piece(g, forward)
     old, new = motion.splats(g, before), motion.splats(follower, after)
     torch.testing.assert_close(new.means, old.means, rtol=0, atol=1e-12)
     torch.testing.assert_close(rotation_matrices(new.quats), rotation_matrices(old.quats), rtol=0, atol=1e-12)
@@ -98,7 +98,7 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     torch.testing.assert_close(speed(follower, 0.5), speed(follower, after), rtol=0, atol=1e-6)
 
 
-OFTEN = DensitySettings(every=2)
+OFTEN = DensitySettings(refine_every=2)
 
 
 def trainer(density: DensitySettings = OFTEN, **settings: int) -> Trainer:
@@ -108,7 +108,7 @@ def trainer(density: DensitySettings = OFTEN, **settings: int) -> Trainer:
     extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
     motion = Paths(extent, PathSettings(), seeded(0, -1))
     training_images = make_training_images(scene, start.cameras, images, spaced, "cpu")
-    first = motion.attach(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
+    first = motion.initialize(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
     loss = Pixel(Pixel.defaults, scene)
     return Trainer(training_images, first, motion, loss, s, density, scale=extent.scale, seed=3)
 
@@ -141,7 +141,7 @@ def test_a_piece_that_has_ended_stays_as_it_is() -> None:
 
 
 def test_a_cap_holds_whatever_the_images_size() -> None:
-    density = DensitySettings(every=2, max_gaussians=1500, grow_gradient=0.0)
+    density = DensitySettings(refine_every=2, max_gaussians=1500, grow_grad2d=0.0)
     fit = trainer(density, fine_steps=30, coarse_steps=20)
     start = len(fit.gaussians)
     fit.run(quiet)

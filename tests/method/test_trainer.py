@@ -24,7 +24,7 @@ from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.instants import Corrections, correction, node
-from spike4dgs.method.training_views.lookup import variation_at
+from spike4dgs.method.training_views.points import variation_at
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages
 
 MOTIONS = BASELINE_PARTS.motion
@@ -72,7 +72,7 @@ def trainer(
         training_images = replace(training_images, spans=spans(training_images))
     kind = SUPERVISIONS[supervision]
     compare = kind(replace(kind.defaults, **(loss or {})), scene)
-    gaussians, density = model.attach(first, training_images), DensitySettings(every=2)
+    gaussians, density = model.initialize(first, training_images), DensitySettings(refine_every=2)
     return Trainer(training_images, gaussians, model, compare, s, density, scale=extent.scale, seed=3)
 
 
@@ -104,7 +104,7 @@ def test_paths_lay_nothing_down_where_the_background_is_not_rendered() -> None:
     fit = trainer(24, motion="paths", freeze_background=True)
     while fit.step < 12:
         fit.train_step()
-    assert fit.motion.guide(fit.gaussians, fit.training_images, seeded(0, 0)) is fit.gaussians
+    assert fit.motion.guided_samples(fit.gaussians, fit.training_images, seeded(0, 0)) is fit.gaussians
     assert (fit.gaussians.extra["times"].detach() - 0.5).abs().max() < 0.1
 
 
@@ -204,7 +204,7 @@ def test_a_stage_ends_with_the_mean_of_its_last_steps() -> None:
 
 
 def test_nothing_is_averaged_before_the_number_of_gaussians_is_settled() -> None:
-    with pytest.raises(UserError, match=r"trainer.average of at most 0.4, as density.until is 0.6"):
+    with pytest.raises(UserError, match=r"trainer.average of at most 0.4, as density.refine_stop is 0.6"):
         trainer(average=0.5)
 
 
@@ -326,7 +326,10 @@ def test_unknown_setting_or_wrong_type_is_refused(name, value):
     ("name", "message"),
     [
         ("motion.lr_gird", "expected settings among motion.cell_px, .*motion.tv_weight, found 'motion.lr_gird'"),
-        ("density.refine", "expected settings among density.every, density.grow_gradient, .* found 'density.refine'"),
+        (
+            "density.refine",
+            "expected settings among density.grow_grad2d, density.grow_scale3d, .* found 'density.refine'",
+        ),
         ("lr_grid", "PART.NAME, PART among density, images, initialization, motion, supervision, trainer, found 'lr_g"),
         ("optimizer.lr", "PART among density, .*, found 'optimizer.lr'; correct the name"),
         ("initialization.seed", "expected no settings of initialization, found 'initialization.seed'"),

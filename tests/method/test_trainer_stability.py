@@ -50,7 +50,7 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     first = from_points(start.points[::9], start.values[::9], opacity=0.5)
     model = MOTIONS[motion](extent, MOTIONS[motion].defaults, seeded(0, -1))
     training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
-    gaussians = model.attach(first, training_images)
+    gaussians = model.initialize(first, training_images)
     twin = dtype == torch.float64
     if twin:
         gaussians = Gaussians.from_tensors({k: v.double() for k, v in gaussians.tensors().items()})

@@ -19,7 +19,7 @@ from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from spike4dgs.method.models import modules
+from spike4dgs.method.models import model_file
 from spike4dgs.method.splat.cuda import render
 
 DEVICE = "meta"  # a name that PyTorch has for a device without kernels of its own
@@ -124,5 +124,5 @@ def pretend_device() -> Iterator[str]:
         patch.setattr(render, "_kernels", lambda channels: ("forward", "backward"))
         patch.setattr(render, "_sum_kernel", lambda: "sum")
         patch.setattr(render, "simulated", lambda: True)
-        patch.setattr(modules, "WITHOUT_MEMORY", torch.device("cpu"))  # that device's name stands for ours here
+        patch.setattr(model_file, "WITHOUT_MEMORY", torch.device("cpu"))  # that device's name stands for ours here
         yield DEVICE

@@ -72,7 +72,7 @@ def gaussian_model(motion: str, background: int = 0) -> FittedModel:
     spec = MotionSpec(motion, Extent(LOW, HIGH, 2.0, WORLD.n_ticks, WORLD.width), settings)
     made = shaken(MOTIONS[motion](spec.extent, spec.settings, seeded(3, 0)), 0.2)
     images = TrainingImages(Views.from_cameras(WORLD.cameras), (25, 75), torch.rand(2, 4, 24, 40), WORLD.n_ticks)
-    gaussians = made.attach(points(), images)
+    gaussians = made.initialize(points(), images)
     rng = seeded(4, 0)
     extra = {k: v + 0.1 * torch.randn(v.shape, generator=rng) for k, v in gaussians.extra.items()}
     moved = Gaussians.from_tensors({**gaussians.tensors(), **extra})

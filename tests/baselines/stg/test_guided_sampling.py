@@ -90,7 +90,7 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     assert [t for _, t in new] == [0.9, 0.1]
     uv, _ = cameras[1].project(new[0][0].means.double().numpy())
     assert (uv > 32).all() and (uv < 64).all()
-    more = motion.guide(g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    more = motion.guided_samples(g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert len(more) == len(g) + sum(len(x) for x, _ in new)
     assert torch.equal(more.means[: len(g)], g.means) and set(more.extra["times"][len(g) :].tolist()) == {
         torch.tensor(t).item() for t in (0.9, 0.1)

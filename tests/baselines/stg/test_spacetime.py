@@ -24,8 +24,7 @@ from spike4dgs.method.motion.polynomial import move_to
 from spike4dgs.method.splat import Views, render
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.torch_state import seeded
-from spike4dgs.method.training_views.lookup import look_up, variation_at
-from spike4dgs.method.training_views.projection import project
+from spike4dgs.method.training_views.points import look_up, project, variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 MOTIONS = PARTS.motion
@@ -148,7 +147,7 @@ def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> No
     g.logits[:] = 0.0
     statistics = GradientStatistics(torch.tensor([1.0, 0.0] * 6), torch.ones(12))
     (edit,) = adapt_density(g, statistics, DensitySettings(), 100.0, 50, torch.Generator().manual_seed(0))
-    born = motion().born(edit, torch.Generator().manual_seed(1))
+    born = motion().after_densification(edit, torch.Generator().manual_seed(1))
     old, new = born.gaussians.rows(torch.arange(12)), born.gaussians.rows(torch.arange(12, 18))
     assert edit.added == born.added == 6 and all(torch.equal(v, g.tensors()[k]) for k, v in old.tensors().items())
     assert new.extra["times"].min() >= 0 and new.extra["times"].max() <= 1 and new.extra["times"].std() > 0.1
@@ -159,7 +158,9 @@ def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> No
 def test_relocated_gaussians_keep_their_hosts_times() -> None:
     g = cloud(12)
     edit = relocate(g, torch.arange(12) < 3, torch.Generator().manual_seed(0))
-    assert torch.equal(motion().born(edit, torch.Generator()).gaussians.extra["times"], edit.gaussians.extra["times"])
+    assert torch.equal(
+        motion().after_densification(edit, torch.Generator()).gaussians.extra["times"], edit.gaussians.extra["times"]
+    )
 
 
 def test_rays_project_to_their_pixels() -> None:
@@ -230,7 +231,7 @@ def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times
     assert shift[board].mean() > 0.5 > 3 * shift[~board].mean()  # the board uncovers some of what is behind it
     n = len(points)
     g = Gaussians(points, torch.zeros(n, 3), torch.ones(n, 4), torch.zeros(n), torch.zeros(n, 1))
-    timed = motion().attach(g, f)
+    timed = motion().initialize(g, f)
     short = timed.extra["log_temporal_scales"].exp() < 1
     assert len(timed) == n + (SETTINGS.moving_copies - 1) * shift.sum() and int(short.sum()) == 3 * shift.sum()
     thirds = (timed.extra["times"][short].view(3, -1) * 3).long()

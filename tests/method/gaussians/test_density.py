@@ -13,7 +13,7 @@ from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prun
 from spike4dgs.method.splat import Views, render
 
 SETTINGS = DensitySettings()
-HIGH = 2 * SETTINGS.grow_gradient
+HIGH = 2 * SETTINGS.grow_grad2d
 
 
 def cloud(n: int, seed: int = 0) -> Gaussians:
@@ -166,7 +166,7 @@ def test_relocation_changes_the_image_far_less_than_plain_copies_would() -> None
 def test_densification_grows_where_the_gradient_is_high_and_removes_the_faint() -> None:
     g = cloud(6)
     g.logits[3] = -9.0
-    g.log_scales[1, 2] = math.log(2 * SETTINGS.split_scale * 3.0)  # large for a scene of this size
+    g.log_scales[1, 2] = math.log(2 * SETTINGS.grow_scale3d * 3.0)  # large for a scene of this size
     (edit,) = adapt_density(g, statistics([HIGH, HIGH, 0, HIGH, 0, 0]), SETTINGS, 3.0, 100, torch.Generator())
     assert edit.source.tolist() == [0, 2, 4, 5, -1, -1, -1]
     assert torch.equal(edit.gaussians.means[4], g.means[0])
@@ -186,7 +186,7 @@ def test_densification_at_the_limit_moves_the_dead() -> None:
     g.logits[2] = -9.0
     (edit,) = adapt_density(g, statistics([1.0] * 8), SETTINGS, 1.0, 7, torch.Generator())
     assert len(edit.gaussians) == 8 and edit.source[2] == -1
-    assert edit.gaussians.logits.sigmoid().min() > SETTINGS.min_opacity
+    assert edit.gaussians.logits.sigmoid().min() > SETTINGS.prune_opacity
 
 
 def test_gradient_statistics_are_those_of_each_view_alone_in_half_images() -> None:

@@ -27,7 +27,7 @@ from spike4dgs.method.training_views.training_images import TrainingImages
 WORLD = ToyWorld(width=32, height=20, side=2)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 3.0, 100, 32)
 SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=8, views_per_step=2)
-DENSITY = DensitySettings(every=2, until=0.5)
+DENSITY = DensitySettings(refine_every=2, refine_stop=0.5)
 PLANES = HexPlaneSettings(mlp_width=8, features=4)
 
 
@@ -89,7 +89,7 @@ def test_learning_rates_fall_over_each_stage_and_follow_the_size_of_the_scene() 
 
 
 def test_nothing_is_densified_after_its_share_of_a_stage() -> None:
-    t, counts = trainer(replace(DENSITY, grow_gradient=1e-9, max_per_pixel=50)), []
+    t, counts = trainer(replace(DENSITY, grow_grad2d=1e-9, max_per_pixel=50)), []
     for _ in range(t.total):
         t.train_step()
         counts.append(len(t.gaussians))

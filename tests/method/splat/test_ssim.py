@@ -46,14 +46,14 @@ def test_the_loss_equals_its_two_terms(shape: tuple[int, int, int], w: float) ->
     assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm() + 1e-6
 
 
-@pytest.mark.parametrize("ease", [1e-3, 0.02, 0.1, 10.0])
+@pytest.mark.parametrize("delta", [1e-3, 0.02, 0.1, 10.0])
 @pytest.mark.parametrize("w", [0.0, 0.2])
-def test_with_an_ease_it_is_hubers_loss(w: float, ease: float) -> None:
+def test_with_a_delta_it_is_hubers_loss(w: float, delta: float) -> None:
     a, b = images(2, 30, 40)
     fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
-    value = difference(fast, b, w, ease)
+    value = difference(fast, b, w, delta)
     d = (slow - b.double()).abs()
-    huber = torch.where(d < ease, d * d / (2 * ease), d - ease / 2).mean()
+    huber = torch.where(d < delta, d * d / (2 * delta), d - delta / 2).mean()
     expected = (1 - w) * huber + w * (1 - ssim_reference(slow, b.double()))
     value.backward()
     expected.backward()

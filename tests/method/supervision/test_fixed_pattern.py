@@ -151,15 +151,15 @@ def _seeded(step: int) -> torch.Generator:
     return torch.Generator().manual_seed(step)
 
 
-@pytest.mark.parametrize("ease", [0.0, 0.05])
-def test_the_loss_compares_through_the_maps_and_leaves_other_views_alone(ease: float) -> None:
-    loss = loss_of(replace(SETTINGS, first=1000, ssim_weight=0.3, ease=ease))
+@pytest.mark.parametrize("delta", [0.0, 0.05])
+def test_the_loss_compares_through_the_maps_and_leaves_other_views_alone(delta: float) -> None:
+    loss = loss_of(replace(SETTINGS, first=1000, ssim_weight=0.3, huber_delta=delta))
     loss.gain[1], loss.dark[1] = 0.25, 0.02
     image = torch.rand(1, *SIZE, generator=_seeded(0)).requires_grad_()
     measured = torch.rand(1, *SIZE, generator=_seeded(1))
     measured[0, 2, 3] = torch.nan
     value = loss(lambda t: image, Sample(0.5, 60, (1,), measured, 0))
-    expected = difference(image * 1.25 + 0.02, measured, 0.3, ease)
+    expected = difference(image * 1.25 + 0.02, measured, 0.3, delta)
     assert value.item() == pytest.approx(expected.item(), rel=1e-6)
     np.testing.assert_array_equal(
         *(torch.autograd.grad(v, image, retain_graph=True)[0].numpy() for v in (value, expected))

@@ -18,7 +18,7 @@ from spike4dgs.method.training_views.foreground import (
     moving_window,
     stray_points,
 )
-from spike4dgs.method.training_views.lookup import variation_at
+from spike4dgs.method.training_views.points import variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=64, height=40, travel=0.3)

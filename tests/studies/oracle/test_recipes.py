@@ -109,7 +109,7 @@ def test_first_gaussians_move_as_the_surfaces_that_they_lie_on(truth: Truth) -> 
     still = np.array([[0.2, 1.0, 1.4], [-0.9, 0.3, 0.0], [0.1, 0.99, 1.3]], np.float32)
     points = np.concatenate([board, still])
     plain = from_points(points, np.full(5, 0.5, np.float32), opacity=0.5, scale=1.0)
-    first = motion.attach(plain, None)  # type: ignore[arg-type]
+    first = motion.initialize(plain, None)  # type: ignore[arg-type]
     at_the_ends = [motion.splats(first, t).means.detach().numpy() for t in (0.0, 0.5, 1.0)]
     moved = [[WORLD.travel * (t - 0.5), 0, 0] for t in (0.0, 0.5, 1.0)]
     for found, by in zip(at_the_ends, moved, strict=True):
@@ -122,7 +122,7 @@ def test_velocities_are_shared_out_over_the_pieces_of_a_long_clip(truth: Truth) 
     motion = known(extent, PARTS.motion["paths"].defaults, torch.Generator())
     assert motion.pieces == 3
     point = from_points(np.array([[0.1, 0, 0.6]] * 4, np.float32), np.ones(4, np.float32), opacity=0.5, scale=1.0)
-    first = motion.attach(point, None)  # type: ignore[arg-type]
+    first = motion.initialize(point, None)  # type: ignore[arg-type]
     ends = [motion.splats(first, t).means[0, 0].item() for t in (0.0, 1.0)]
     assert ends[1] - ends[0] == pytest.approx(WORLD.travel / 3, rel=1e-4)
 

@@ -15,7 +15,7 @@ _RATE_HZ, _GAIN = 20_000.0, 0.6
 _DISTANCE_M = 4.0  # from the cameras to the wall
 
 
-def made_scene() -> tuple[TrainingScene, NDArray[np.float32], NDArray[np.float32]]:
+def warm_up_scene() -> tuple[TrainingScene, NDArray[np.float32], NDArray[np.float32]]:
     """Return four views of a textured wall and a bar that moves; and points [N, 3] on the wall with values [N]."""
     aim = np.array([0.0, 0.0, _DISTANCE_M])
     cameras = tuple(

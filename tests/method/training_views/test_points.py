@@ -7,7 +7,7 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.method.splat import Views
-from spike4dgs.method.training_views.projection import project
+from spike4dgs.method.training_views.points import project
 
 WORLD = ToyWorld(width=64, height=40)
 
