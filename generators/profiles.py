@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.lens import Distortion
-from spike4dgs.generators.worlds import WorldScene
 
 RATE_HZ = 20_000
 TARGET_EVERY = RATE_HZ // 1000  # ticks between ground-truth frames: 1 ms
@@ -115,33 +109,3 @@ class Job:
 
 
 HELD_OUT_VIEW = 4
-
-
-def cameras(scene: WorldScene, width: int, height: int, views: Sequence[int] = tuple(range(9))) -> tuple[Camera, ...]:
-    """Return cameras `cam_00` .. `cam_08` of the array, or only `views` of it, in the given order.
-
-    The focal length scales with `width`, so the field of view is the same at every resolution.
-    Raises UserError for a view outside 0..8 or an empty image.
-    """
-    if width < 1 or height < 1:
-        raise problem(
-            "camera resolution", "at least 1x1 pixels", f"{width}x{height}", "give a positive width and height"
-        )
-    wrong = [v for v in views if not 0 <= v < 9]
-    if wrong:
-        raise problem("views", "numbers 0 to 8 of the 3x3 array", str(wrong), "leave them out")
-    return tuple(_camera(scene, v, width, height) for v in views)
-
-
-def _camera(scene: WorldScene, view: int, width: int, height: int) -> Camera:
-    rig = scene.rig
-    center, target = np.array(rig.center), np.array(rig.target)
-    up = np.array([0.0, 0.0, 1.0])
-    forward = (target - center) / np.linalg.norm(target - center)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    row, column = divmod(view, 3)
-    shift = (column - 1) * rig.spacing_m[0] * right + (1 - row) * rig.spacing_m[1] * np.cross(right, forward)
-    focal = 0.5 * width / np.tan(np.radians(rig.fov_x_deg) / 2)
-    aim = target + (1 - rig.toe_in) * shift
-    return look_at(f"cam_{view:02d}", center + shift, aim, up, focal=focal, width=width, height=height)

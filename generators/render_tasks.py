@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.lens import Distortion
-from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, cameras
+from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 _POINTS_PER_VIEW = 250  # of the sparse model

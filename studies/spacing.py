@@ -162,9 +162,10 @@ def render_every_tick(
     """Return the frames [n + 1, H, W] at every tick, speed of the fastest point in px/s, seconds per frame."""
     from rich.progress import Progress
 
-    from spike4dgs.generators.profiles import HELD_OUT_VIEW, cameras
+    from spike4dgs.generators.profiles import HELD_OUT_VIEW
     from spike4dgs.generators.rendering.image_motion import max_image_speed
     from spike4dgs.generators.rendering.render import MultiViewRenderer
+    from spike4dgs.generators.rig import cameras
 
     views = cameras(world, *size, [HELD_OUT_VIEW])
     renderer = MultiViewRenderer(world, views, seed=seed, spp=spp, background_spp=4 * spp)

@@ -25,7 +25,7 @@ MAY_IMPORT = {
 ORDER = {
     "benchmark": "errors lazy plugins variants files compilation locks schemas inputs gpu environment weights array "
     "spikes scene identity release imports metrics method results hard_cases reports runs cli speed",
-    "generators": "profiles sensor worlds other_sensors recorder rendering msdi_data streams render_tasks "
+    "generators": "profiles sensor worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews hard_cases scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state settings splat gaussians training_views motion supervision pose_refinement trainer_settings "
     "schedule models checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings "

@@ -3,9 +3,9 @@
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
-from spike4dgs.generators.worlds.parts.meshes import box, quad, rotation, translation
-from spike4dgs.generators.worlds.parts.surfaces import Lamp, Material
-from spike4dgs.generators.worlds.parts.textures import cloth, paving, wood
+from spike4dgs.generators.worlds.meshes import box, quad, rotation, translation
+from spike4dgs.generators.worlds.surfaces import Lamp, Material
+from spike4dgs.generators.worlds.textures import cloth, paving, wood
 
 BLADE_M, AXLE_Z_M = 0.30, 0.45
 COLOURS = ((0.75, 0.22, 0.14), (0.20, 0.50, 0.24), (0.78, 0.58, 0.12), (0.16, 0.32, 0.66))

@@ -23,13 +23,14 @@ from scipy.ndimage import maximum_filter
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, Float32
-from spike4dgs.generators.profiles import RATE_HZ, cameras
+from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
 from spike4dgs.generators.rendering.render import make_tracer
 from spike4dgs.generators.rendering.visibility import GROW_PX, Visibility
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.worlds import RigSpec, WorldScene
-from spike4dgs.generators.worlds.parts.meshes import rotation
+from spike4dgs.generators.worlds.meshes import rotation
 
 _AZIMUTH_DEG, _ELEVATION_DEG = 25.0, 10.0  # to either side
 _LOWEST_DEG, _HIGHEST_DEG = 8.0, 70.0  # elevation seen from the target

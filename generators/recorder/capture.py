@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.generators.recorder.clips.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
-from spike4dgs.generators.recorder.clips.cutting import Cutter, First, agree, first_frame, joined
-from spike4dgs.generators.recorder.clips.delivery import Delivery
-from spike4dgs.generators.recorder.clips.gaps import INTERRUPTED
-from spike4dgs.generators.recorder.clips.layouts import COUNTER, Layout, make_layout
-from spike4dgs.generators.recorder.clips.ring import Ring
-from spike4dgs.generators.recorder.clips.ticks import Run
-from spike4dgs.generators.recorder.memory import buffer_seconds
-from spike4dgs.generators.recorder.rates import Rate, Rates
+from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
+from spike4dgs.generators.recorder.frames.cutting import Cutter, First, agree, first_frame, joined
+from spike4dgs.generators.recorder.frames.delivery import Delivery
+from spike4dgs.generators.recorder.frames.gaps import INTERRUPTED
+from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout, make_layout
+from spike4dgs.generators.recorder.frames.ring import Ring
+from spike4dgs.generators.recorder.frames.ticks import Run
+from spike4dgs.generators.recorder.resources import buffer_seconds
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, CameraProfile, RigProfile
+from spike4dgs.generators.recorder.sync import Rate, Rates
 from spike4dgs.generators.recorder.usb.reader import Reader
 from spike4dgs.generators.recorder.usb.reads import OK, TIME_OUT
 from spike4dgs.generators.recorder.usb.transport import Link

@@ -11,8 +11,8 @@ from typing import Any
 import usb.core
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.generators.recorder.clips.layouts import make_layout
-from spike4dgs.generators.recorder.memory import buffer_seconds, free_bytes, least_seconds
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.resources import buffer_seconds, free_bytes, least_seconds
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.transport import udev_fix
 

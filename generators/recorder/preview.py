@@ -17,8 +17,8 @@ from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.generators.recorder.rates import Rate
 from spike4dgs.generators.recorder.rig_profile import RigProfile
+from spike4dgs.generators.recorder.sync import Rate
 
 WINDOW_TICKS = 32  # of an image on the sheet
 _BAR = 20  # characters for one spike per tick

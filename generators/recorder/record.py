@@ -22,15 +22,14 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.untrusted.numbers import MAX_TICKS
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
-from spike4dgs.generators.recorder.clips.clip import Clip, Sink
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles
-from spike4dgs.generators.recorder.clips.clip_record import ClipRecord
-from spike4dgs.generators.recorder.clips.disk import BUFFER_BYTES
-from spike4dgs.generators.recorder.clips.layouts import UInt8
+from spike4dgs.generators.recorder.clip_files import StreamFiles
+from spike4dgs.generators.recorder.clip_record import ClipRecord
+from spike4dgs.generators.recorder.disk import BUFFER_BYTES
 from spike4dgs.generators.recorder.emulation.imperfections import PERFECT, Imperfections
-from spike4dgs.generators.recorder.memory import buffer_seconds, bytes_per_s
+from spike4dgs.generators.recorder.frames.clip import Clip, Sink
+from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
-from spike4dgs.generators.recorder.priority import real_time
+from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, real_time
 from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sources import (

@@ -13,8 +13,6 @@ from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.counted import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN
-from spike4dgs.generators.recorder.clips.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
-from spike4dgs.generators.recorder.clips.orientation import orient
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.imperfections import (
@@ -26,6 +24,8 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
     with_wrong_calibrations,
 )
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
 
 CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")

@@ -12,8 +12,8 @@ import numpy as np
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.worlds import WorldScene
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import Mesh, merge, vertex_normals
-from spike4dgs.generators.worlds.parts.surfaces import Material, mesh_to_mitsuba
+from spike4dgs.generators.worlds.meshes import Mesh, merge, vertex_normals
+from spike4dgs.generators.worlds.surfaces import Material, mesh_to_mitsuba
 
 _Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)  # Mitsuba's skies are y up
 _PLAIN = Material((0.5, 0.5, 0.5))

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spike4dgs.generators.worlds.parts.meshes import Mesh
-from spike4dgs.generators.worlds.parts.surfaces import Material
+from spike4dgs.generators.worlds.meshes import Mesh
+from spike4dgs.generators.worlds.surfaces import Material
 
 
 class Part(NamedTuple):

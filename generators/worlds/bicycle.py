@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import box, ellipsoid, merge, revolve, rotation, translation, tube
 from spike4dgs.generators.worlds.parts import cycles, figure, street
-from spike4dgs.generators.worlds.parts.meshes import box, ellipsoid, merge, revolve, rotation, translation, tube
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
+from spike4dgs.generators.worlds.surfaces import Colour, Material
 
 LENGTH_M, WHEEL_M = 1.68, 0.345
 AXLES_X_M = {"rear": -0.495, "front": 0.495}

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Deforming, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import rotation, translation
 from spike4dgs.generators.worlds.parts import bird_body, garden, street
-from spike4dgs.generators.worlds.parts.meshes import rotation, translation
 
 _PLUMAGES = (
     bird_body.Plumage((0.05, 0.22, 0.60), (0.80, 0.36, 0.06), (0.08, 0.38, 0.62), (0.82, 0.81, 0.76)),

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import rotation, translation
 from spike4dgs.generators.worlds.parts import street, vehicle
-from spike4dgs.generators.worlds.parts.meshes import rotation, translation
 
 _LIVERIES = (
     vehicle.Livery((0.82, 0.56, 0.04), (0.03, 0.03, 0.035), "7"),

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import Mesh, box, merge, quad, revolve
 from spike4dgs.generators.worlds.parts import desk
-from spike4dgs.generators.worlds.parts.meshes import Mesh, box, merge, quad, revolve
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, Block, Body, owners, simulate
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Lamp, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, fractal, mix, plain
+from spike4dgs.generators.worlds.surfaces import Colour, Lamp, Material
+from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
 RADIUS_M, THICK_M = 0.024, 0.0045
 _SEGMENTS = 28

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
-from spike4dgs.generators.worlds.parts import cycles, figure, street
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     Atlas,
     Mesh,
     box,
@@ -21,8 +20,9 @@ from spike4dgs.generators.worlds.parts.meshes import (
     translation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, plain
+from spike4dgs.generators.worlds.parts import cycles, figure, street
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, plain
 
 LENGTH_M, WHEEL_M = 2.05, 0.315
 AXLES_X_M = {"rear": -0.70, "front": 0.71}

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     Mesh,
     box,
     disc,
@@ -20,8 +19,9 @@ from spike4dgs.generators.worlds.parts.meshes import (
     rotation,
     translation,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Lamp, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, cloth, fractal, mix, plain
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
+from spike4dgs.generators.worlds.surfaces import Colour, Lamp, Material
+from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, plain
 
 DISC_RADIUS_M, DISC_TOP_M = 0.32, 0.05
 

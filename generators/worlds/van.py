@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.meshes import rotation, translation
 from spike4dgs.generators.worlds.parts import street, van_body
-from spike4dgs.generators.worlds.parts.meshes import rotation, translation
 
 _LIVERIES = (
     van_body.Livery((0.82, 0.81, 0.77), (0.05, 0.25, 0.45), (0.72, 0.12, 0.05), "FOTON", "5 ms EXPRESS"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.generators.recorder.priority import real_time
+from spike4dgs.generators.recorder.resources import real_time
 from spike4dgs.studies.speed.record_runs import Load, Outcome, disk_rate, run
 from spike4dgs.studies.speed.timing import show_table
 

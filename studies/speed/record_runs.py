@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.generators.recorder.capture import DRAIN, TRIGGERED, capture
 from spike4dgs.generators.recorder.checks import find_cameras
-from spike4dgs.generators.recorder.clips.clip import Clip
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles
-from spike4dgs.generators.recorder.clips.disk import BUFFER_BYTES, Buffers, DiskFile
-from spike4dgs.generators.recorder.clips.layouts import PLAIN, UInt8
+from spike4dgs.generators.recorder.clip_files import StreamFiles
+from spike4dgs.generators.recorder.disk import BUFFER_BYTES, Buffers, DiskFile
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_profile
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera
-from spike4dgs.generators.recorder.memory import buffer_seconds
-from spike4dgs.generators.recorder.priority import real_time
-from spike4dgs.generators.recorder.rates import Rate
+from spike4dgs.generators.recorder.frames.clip import Clip
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8
+from spike4dgs.generators.recorder.resources import buffer_seconds, real_time
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, RigProfile
+from spike4dgs.generators.recorder.sync import Rate
 from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
 from spike4dgs.generators.recorder.usb.transport import UsbLink, open_link
 

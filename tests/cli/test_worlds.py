@@ -9,7 +9,7 @@ import pytest
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.cli.worlds import COLUMNS, worlds
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 
 

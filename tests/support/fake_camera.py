@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.layouts import Layout, make_layout
+from spike4dgs.generators.recorder.frames.layouts import Layout, make_layout
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion
 

@@ -16,10 +16,10 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.stream import SpikeWriter, pack
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import find_cameras
-from spike4dgs.generators.recorder.clips.clip import CameraClip, Clip
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles
-from spike4dgs.generators.recorder.clips.clip_record import ClipRecord
-from spike4dgs.generators.recorder.clips.gaps import Gap
+from spike4dgs.generators.recorder.clip_files import StreamFiles
+from spike4dgs.generators.recorder.clip_record import ClipRecord
+from spike4dgs.generators.recorder.frames.clip import CameraClip, Clip
+from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.usb.transport import open_link
 

@@ -17,9 +17,9 @@ from usb_mock import UsbMock
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.generators.recorder.clips.clip import CameraClip
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import Fault
+from spike4dgs.generators.recorder.frames.clip import CameraClip
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 
 BLOCK, QUEUED = 1024, 4

@@ -32,10 +32,10 @@ from usb_testbed import (
     library,
 )
 
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, STALL, UNPLUGGED
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.backend import interfaces, string_descriptor
 from spike4dgs.generators.recorder.emulation.camera import DUPLICATE, HIGH_SPEED, MISSING, EmulatedCamera
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, UNPLUGGED
 
 # Zero packets, bulk continuation, no packet size limit, scatter-gather, reaping after a disconnect.
 _CAPABILITIES = 0x01 | 0x02 | 0x04 | 0x08 | 0x10

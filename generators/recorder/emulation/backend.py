@@ -27,9 +27,9 @@ import usb.core
 import usb.util
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, STALL, UNPLUGGED
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import DUPLICATE, HIGH_SPEED, MISSING, EmulatedCamera
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, UNPLUGGED
 from spike4dgs.generators.recorder.rig_profile import CameraProfile
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, Completion
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
-from spike4dgs.generators.recorder.clips.layouts import make_layout
-from spike4dgs.generators.recorder.clips.orientation import orient
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
+from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import TOP_DOWN, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, OK
 

@@ -17,8 +17,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.scene.cameras import Camera, Float64
 from spike4dgs.benchmark.scene.lens import make_distortion
-from spike4dgs.generators.recorder.clips.layouts import make_layout
 from spike4dgs.generators.recorder.emulation.camera import LOST, Fault
+from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, RigProfile
 
 Pixels = NDArray[np.int64]  # [n], row * width + column, row 0 at the top

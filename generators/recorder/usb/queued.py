@@ -18,7 +18,7 @@ import usb.core
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, OK, SHORT, Completion
 
 UInt8 = NDArray[np.uint8]

@@ -6,8 +6,8 @@ import threading
 import time
 from collections import deque
 
-from spike4dgs.generators.recorder.clips.layouts import Layout
-from spike4dgs.generators.recorder.clips.ring import Block, Ring
+from spike4dgs.generators.recorder.frames.layouts import Layout
+from spike4dgs.generators.recorder.frames.ring import Block, Ring
 from spike4dgs.generators.recorder.usb.reads import FATAL, OK, SHORT, TIME_OUT, Completion, Transfers
 from spike4dgs.generators.recorder.usb.transport import Link
 

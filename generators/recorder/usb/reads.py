@@ -12,7 +12,7 @@ import numpy as np
 import usb.core
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
 
 UInt8 = NDArray[np.uint8]
 

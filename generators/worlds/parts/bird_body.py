@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import Mesh, ellipsoid, loft, merge, surface, tube
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, fractal, mix, plain
+from spike4dgs.generators.worlds.meshes import Mesh, ellipsoid, loft, merge, surface, tube
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
 LENGTH_M = 0.30
 SPAN_M = 0.27  # of one wing, along its bent line

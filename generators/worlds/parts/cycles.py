@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.meshes import Mesh, box, merge, revolve, rotation, translation, tube
 from spike4dgs.generators.worlds.parts import figure
-from spike4dgs.generators.worlds.parts.meshes import Mesh, box, merge, revolve, rotation, translation, tube
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
+from spike4dgs.generators.worlds.surfaces import Colour, Material
 
 RUBBER = Material((0.028, 0.028, 0.03))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     box,
     ellipsoid,
     merge,
@@ -15,8 +15,8 @@ from spike4dgs.generators.worlds.parts.meshes import (
     translation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, cloth, fractal, mix, paving, plain, wood
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, paving, plain, wood
 
 INK: tuple[Colour, ...] = ((0.55, 0.04, 0.03), (0.03, 0.07, 0.35), (0.03, 0.20, 0.07), (0.03, 0.03, 0.03))
 BLOCKS: tuple[Colour, ...] = ((0.75, 0.22, 0.14), (0.20, 0.50, 0.24), (0.78, 0.58, 0.12), (0.16, 0.32, 0.66))

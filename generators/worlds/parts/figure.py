@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import Mesh, box, ellipsoid, loft, merge, revolve, rotation
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, cloth, fractal, mix, plain
+from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, loft, merge, revolve, rotation
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, plain
 
 TORSO_M, UPPER_ARM_M, FOREARM_M, THIGH_M, SHIN_M = 0.50, 0.29, 0.27, 0.45, 0.45
 SHOULDER_M, HIP_M = 0.19, 0.09  # of each side, from the middle

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import Mesh, box, ellipsoid, merge, quad, revolve, tube
-from spike4dgs.generators.worlds.parts.surfaces import Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, fractal, mix, paving, plain, wood
+from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, merge, quad, revolve, tube
+from spike4dgs.generators.worlds.surfaces import Material
+from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, paving, plain, wood
 
 WALL_Y = 1.15
 _POTS = ((-0.78, 0.62, 0.15), (-0.38, 0.86, 0.11), (0.46, 0.78, 0.13), (0.88, 0.56, 0.16), (-1.2, 0.80, 0.13))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.parts.meshes import Mesh
+from spike4dgs.generators.worlds.meshes import Mesh
 
 STEP_S = 5e-5
 GRAVITY_M_S2 = 9.81

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import merge, quad
+from spike4dgs.generators.worlds.meshes import merge, quad
 from spike4dgs.generators.worlds.parts.street_furniture import (
     FRONT_Y,
     PAVEMENT_Z,
@@ -22,8 +22,8 @@ from spike4dgs.generators.worlds.parts.street_furniture import (
     shops,
     trees,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, asphalt, fractal, mix, paving, plain
+from spike4dgs.generators.worlds.surfaces import Material
+from spike4dgs.generators.worlds.textures import Canvas, asphalt, fractal, mix, paving, plain
 
 _TEXELS = 56  # per metre on the ground
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     Mesh,
     box,
     ellipsoid,
@@ -19,8 +19,8 @@ from spike4dgs.generators.worlds.parts.meshes import (
     translation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, cloth, fractal, mix, paving, plain
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, paving, plain
 
 WHITE: Colour = (0.80, 0.79, 0.76)
 DARK: Colour = (0.03, 0.03, 0.035)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     Atlas,
     Mesh,
     box,
@@ -22,8 +22,8 @@ from spike4dgs.generators.worlds.parts.meshes import (
     rotation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, fractal, plain
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, fractal, plain
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.9, 1.95, 2.30
 WHEEL_M, RIM_M, ARCH_M = 0.34, 0.225, 0.42

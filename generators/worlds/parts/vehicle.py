@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.parts.meshes import (
+from spike4dgs.generators.worlds.meshes import (
     Atlas,
     Mesh,
     box,
@@ -23,8 +23,8 @@ from spike4dgs.generators.worlds.parts.meshes import (
     translation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.surfaces import Colour, Material
-from spike4dgs.generators.worlds.parts.textures import Canvas, fractal, mix, plain
+from spike4dgs.generators.worlds.surfaces import Colour, Material
+from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.2, 1.76, 1.46
 WHEEL_RADIUS_M, RIM_RADIUS_M, ARCH_RADIUS_M = 0.33, 0.22, 0.405

@@ -16,7 +16,7 @@ from spike4dgs.benchmark.scene.training_bursts import (
     write_bursts,
 )
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 
 

@@ -19,7 +19,7 @@ from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
 from spike4dgs.generators.msdi_data import make_msdi_data as msdi_data
 from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_msdi_data
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 from spike4dgs.method.msdi.training.data import points_of
 

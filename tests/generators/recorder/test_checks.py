@@ -17,7 +17,7 @@ from fake_camera import rig
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder import checks
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
 from spike4dgs.generators.recorder.usb import queued, transport
 from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion, SingleReads
 

@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.recorder.clips.layouts import LAYOUTS, Layout, make_layout
-from spike4dgs.generators.recorder.clips.ticks import Run, TickCounter
+from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_layout
+from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 from spike4dgs.generators.recorder.rig_profile import RigProfile, load_profile
 
 TAG_CASES, STREAM_CASES, PROFILE_CASES = 2000, 2000, 2000  # streams: for each of three layouts

@@ -10,7 +10,7 @@ import pytest
 from fake_camera import rig
 
 from spike4dgs.cli import main
-from spike4dgs.generators.recorder.memory import buffer_seconds, bytes_per_s, free_bytes, least_seconds
+from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, free_bytes, least_seconds
 
 FAST = replace(rig(3), width=400, height=250, transfer_bytes=1 << 20, transfers=16)  # 250 MB/s a camera
 

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.generators.recorder.emulation.array import scene_profile
 from spike4dgs.generators.recorder.preview import WINDOW_TICKS, Watch, middle_image, write_sheet
-from spike4dgs.generators.recorder.rates import Rate
+from spike4dgs.generators.recorder.sync import Rate
 
 
 def stream(n_ticks=400, gaps=(), seed=0):

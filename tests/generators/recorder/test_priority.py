@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from spike4dgs.generators.recorder.priority import real_time
+from spike4dgs.generators.recorder.resources import real_time
 
 
 def policy_of(thread: threading.Thread) -> int:
@@ -34,7 +34,7 @@ def test_all_threads_have_it_while_it_lasts() -> None:
 
 REFUSED = """
 import os, resource
-from spike4dgs.generators.recorder.priority import real_time
+from spike4dgs.generators.recorder.resources import real_time
 if os.getuid() == 0:
     os.setuid(65534)
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))

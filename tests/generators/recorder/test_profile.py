@@ -13,7 +13,7 @@ import pytest
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.recorder.clips.layouts import make_layout
+from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.rig_profile import RigProfile, calibration_toml, load_profile, read_calibration
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fake_camera import HEIGHT, WIDTH, layout_of, rig
 
-from spike4dgs.generators.recorder.clips.ring import Block
-from spike4dgs.generators.recorder.rates import spikes_per_tick
+from spike4dgs.generators.recorder.frames.ring import Block
+from spike4dgs.generators.recorder.sync import spikes_per_tick
 
 
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows"])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.clip import ARRIVAL_TIMES, CameraClip, CameraStats, Clip
+from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, CameraClip, CameraStats, Clip
 from spike4dgs.generators.recorder.sync import fit_arrival
 
 FPS = 20000

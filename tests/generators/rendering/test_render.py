@@ -16,12 +16,12 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray as gray_of
-from spike4dgs.generators.profiles import cameras
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.render import MultiViewRenderer, make_tracer
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, Deforming, Part, WorldScene
-from spike4dgs.generators.worlds.parts.meshes import merge, quad, rotation
-from spike4dgs.generators.worlds.parts.surfaces import Material
+from spike4dgs.generators.worlds.meshes import merge, quad, rotation
+from spike4dgs.generators.worlds.surfaces import Material
 
 WIDTH, HEIGHT, SPP = 64, 40, 32
 NAMES = ["car", "turntable"]  # rigid; surfaces that deform are in the second half

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from spike4dgs.generators.profiles import cameras
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 
 WIDTH, HEIGHT, SPP = 64, 40, 32

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, turntable
 from spike4dgs.generators.worlds.parts import bird_body
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, bicycle, bricks, chips, jaywalk, motor
 from spike4dgs.generators.worlds.parts import bird_body, cycles, figure, van_body
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, STEP_S, Body, owners, simulate

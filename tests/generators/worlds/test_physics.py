@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from spike4dgs.generators.worlds import WorldScene, bricks, chips
-from spike4dgs.generators.worlds.parts.meshes import box
+from spike4dgs.generators.worlds.meshes import box
 from spike4dgs.generators.worlds.parts.rigid_bodies import (
     GRAVITY_M_S2,
     SOFT_M,
@@ -20,7 +20,7 @@ from spike4dgs.generators.worlds.parts.rigid_bodies import (
     Trajectory,
     simulate,
 )
-from spike4dgs.generators.worlds.parts.textures import _font
+from spike4dgs.generators.worlds.textures import _font
 
 MODULES = {"bricks": bricks, "chips": chips}
 CASES = [("bricks", 0), ("bricks", 1), ("bricks", 2), ("chips", 0), ("chips", 1), ("chips", 5)]

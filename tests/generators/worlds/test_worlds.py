@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.profiles import cameras
 from spike4dgs.generators.rendering.image_motion import KeyPlan, carried, key_plan, max_image_speed, spacings
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import make_tracer
 from spike4dgs.generators.rendering.scalar_tiles import load_sensor
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, Part, WorldScene
 
 WIDTH, HEIGHT = 64, 40

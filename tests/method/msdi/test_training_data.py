@@ -17,7 +17,7 @@ from spike4dgs.benchmark.scene.training_bursts import (
 from spike4dgs.benchmark.spikes.bits import unpack
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.worlds import WORLDS
 from spike4dgs.method.msdi.training.data import Bursts, check_ticks, chosen, mirrored, points_of, varied

@@ -16,12 +16,12 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import find_cameras
-from spike4dgs.generators.recorder.clips.clip import CameraClip
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles
-from spike4dgs.generators.recorder.clips.layouts import make_layout
+from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.emulation import backend as emulator
 from spike4dgs.generators.recorder.emulation.backend import EmulatedReads
 from spike4dgs.generators.recorder.emulation.camera import Fault, UInt8
+from spike4dgs.generators.recorder.frames.clip import CameraClip
+from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.usb.reads import Completion
 from spike4dgs.generators.recorder.usb.transport import open_link
 

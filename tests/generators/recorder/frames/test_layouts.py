@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.recorder.clips.gaps import Gap
-from spike4dgs.generators.recorder.clips.layouts import LAYOUTS, Layout, make_layout
-from spike4dgs.generators.recorder.clips.orientation import orient
-from spike4dgs.generators.recorder.clips.ticks import Run, TickCounter
+from spike4dgs.generators.recorder.frames.gaps import Gap
+from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
+from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
 SIZES = {"plain": (400, 250), "tagged-rows": (400, 250), "line-tagged": (1000, 1000)}
 SMALL = {"plain": (21, 5), "tagged-rows": (24, 6), "line-tagged": (24, 6)}

@@ -1,5 +1,7 @@
 """Delivery of frames to the sink of continuous mode, by a thread of its own.
 
+Delivery of frames to the sink of continuous mode, by a thread of its own.
+
 A sink may wait for long, for a disk that stalls. Only this thread waits then: reads continue into the rings, and the
 capturing thread still reacts to Ctrl-C and reports rates.
 """
@@ -9,9 +11,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 
-from spike4dgs.generators.recorder.clips.clip import Sink
-from spike4dgs.generators.recorder.clips.cutting import Cutter
-from spike4dgs.generators.recorder.clips.ring import Ring
+from spike4dgs.generators.recorder.frames.clip import Sink
+from spike4dgs.generators.recorder.frames.cutting import Cutter
+from spike4dgs.generators.recorder.frames.ring import Ring
 
 _POLL_S = 0.005  # interval at which empty rings are looked at again
 # Passed on at once. Nine cameras with reads of 62 kB, beside busy programs: one read at a time fell behind by 380 MB/s.

@@ -16,8 +16,8 @@ from recorder_rig import FRAME, source_scene
 
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
-from spike4dgs.generators.recorder.clips import disk
-from spike4dgs.generators.recorder.clips.disk import Buffers, DiskFile
+from spike4dgs.generators.recorder import disk as disk
+from spike4dgs.generators.recorder.disk import Buffers, DiskFile
 
 BLOCK = 4096
 

@@ -1,5 +1,7 @@
 """The streams of a recording: files that grow as `.part` files at their true ticks during the capture.
 
+The streams of a recording: files that grow as `.part` files at their true ticks during the capture.
+
 Ticks that were never written are zeros, and listed as gaps.
 """
 
@@ -18,11 +20,11 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import check_new, writing
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.scene.writer import stream_name
-from spike4dgs.generators.recorder.clips.clip_record import ClipRecord, gaps_of, write_description
-from spike4dgs.generators.recorder.clips.disk import Buffers, DiskFile
-from spike4dgs.generators.recorder.clips.gaps import DISK, Gap, merged
-from spike4dgs.generators.recorder.clips.layouts import Int64, UInt8, make_layout
-from spike4dgs.generators.recorder.clips.orientation import orient
+from spike4dgs.generators.recorder.clip_record import ClipRecord, gaps_of, write_description
+from spike4dgs.generators.recorder.disk import Buffers, DiskFile
+from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
+from spike4dgs.generators.recorder.frames.layouts import Int64, UInt8, make_layout
+from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import NAME, TOP_DOWN, CameraProfile, RigProfile
 
 _FRAMES = 256  # unpacked at a time: 3.2 MB of 400x250, which stays in the cache

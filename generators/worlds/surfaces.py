@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from spike4dgs.generators.worlds.parts.meshes import Mesh
+    from spike4dgs.generators.worlds.meshes import Mesh
 
 Colour = tuple[float, float, float]
 
@@ -52,7 +52,7 @@ def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
     """Return a `mitsuba.Mesh` that can be a value in a scene dictionary, also inside a shape group."""
     import mitsuba as mi
 
-    from spike4dgs.generators.worlds.parts.meshes import vertex_normals
+    from spike4dgs.generators.worlds.meshes import vertex_normals
 
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material.to_mitsuba())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.gaps import DISK, Gap, merged
+from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
 
 UInt8 = NDArray[np.uint8]
 

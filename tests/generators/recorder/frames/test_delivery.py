@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
-from spike4dgs.generators.recorder.clips.cutting import Cutter
-from spike4dgs.generators.recorder.clips.delivery import Delivery
-from spike4dgs.generators.recorder.clips.layouts import UInt8, make_layout
-from spike4dgs.generators.recorder.clips.ring import Ring
+from spike4dgs.generators.recorder.frames.cutting import Cutter
+from spike4dgs.generators.recorder.frames.delivery import Delivery
+from spike4dgs.generators.recorder.frames.layouts import UInt8, make_layout
+from spike4dgs.generators.recorder.frames.ring import Ring
 
 LAYOUT = make_layout("plain", 16, 8)  # 16 bytes a frame
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.clips.gaps import OVERFLOW, Gap
-from spike4dgs.generators.recorder.clips.layouts import COUNTER, Layout
-from spike4dgs.generators.recorder.clips.ring import Block, Ring
-from spike4dgs.generators.recorder.clips.ticks import Run, TickCounter
+from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, Gap
+from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout
+from spike4dgs.generators.recorder.frames.ring import Block, Ring
+from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
 UInt8 = NDArray[np.uint8]
 

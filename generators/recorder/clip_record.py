@@ -1,5 +1,7 @@
 """The description of a recording: scene.json or stream.json, and the manifest.
 
+The description of a recording: scene.json or stream.json, and the manifest.
+
 With a calibrated rig the folder is a scene, `spike4dgs-scene/1`; without poses it is a folder of streams with its
 `stream.json`, which `inspect` and `calibrate-rig` read. The description and the manifest are written last, so a folder
 without them is an unfinished recording.
@@ -22,7 +24,7 @@ from spike4dgs.benchmark.scene.splits import Split, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import open_stream
-from spike4dgs.generators.recorder.clips.gaps import Gap, merged
+from spike4dgs.generators.recorder.frames.gaps import Gap, merged
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 
 

@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.generators.recorder.clips.ring import Ring
+from spike4dgs.generators.recorder.frames.ring import Ring
 
 
 @settings(max_examples=60, deadline=None)

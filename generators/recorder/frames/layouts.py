@@ -1,5 +1,7 @@
 """Frame layouts: the format of a camera's frames on the wire, and their conversion to packed ticks.
 
+Frame layouts: the format of a camera's frames on the wire, and their conversion to packed ticks.
+
 | name | frame | torn frames are detected by | frames are counted by |
 |---|---|---|---|
 | `plain` | the packed tick, ceil(W H / 8) bytes (400x250: 12,500) | nothing | nothing |
@@ -35,7 +37,7 @@ import numpy as np
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import rows
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
-from spike4dgs.generators.recorder.clips.layout_kernels import (
+from spike4dgs.generators.recorder.frames.layout_kernels import (
     LINE_BITS,
     MIX,
     STEP,

@@ -22,10 +22,10 @@ from spike4dgs.benchmark.spikes.gaps import present, read_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.cli.inspect import _plot_gaps, examine, inspect
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles, write_clip
-from spike4dgs.generators.recorder.clips.clip_record import ClipRecord
-from spike4dgs.generators.recorder.clips.gaps import REASONS, Gap, merged, missing
-from spike4dgs.generators.recorder.clips.layouts import LAYOUTS, make_layout
+from spike4dgs.generators.recorder.clip_files import StreamFiles, write_clip
+from spike4dgs.generators.recorder.clip_record import ClipRecord
+from spike4dgs.generators.recorder.frames.gaps import REASONS, Gap, merged, missing
+from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 
 WIDTH, HEIGHT, TICKS = 24, 6, 30
@@ -58,8 +58,8 @@ import sys
 from pathlib import Path
 import numpy as np
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.recorder.clips.clip_files import StreamFiles
-from spike4dgs.generators.recorder.clips.clip_record import ClipRecord
+from spike4dgs.generators.recorder.clip_files import StreamFiles
+from spike4dgs.generators.recorder.clip_record import ClipRecord
 from spike4dgs.generators.recorder.rig_profile import load_profile
 
 out, rig, value = Path(sys.argv[1]), load_profile(Path(sys.argv[2])), int(sys.argv[3])
