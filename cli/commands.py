@@ -155,42 +155,30 @@ COMMANDS: dict[str, Command] = {
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "doctor": Command(
-        "spike4dgs.cli.doctor:make_doctor",
-        "say what this machine has, what it lacks, and what mends it",
-        "doctor",
-        needs=(
-            "spike4dgs.method.splat.kernels.vector_ir:host_lanes",
-            "spike4dgs.method.splat.kernels.threads:get_threads",
-            "spike4dgs.generators.rendering.mitsuba_variant:diagnose",
-            "spike4dgs.method.msdi.weights:check_weights",
-            "spike4dgs.baselines.images.spk2img.weights:check_weights",
-            "spike4dgs.baselines.starts.dust3r:weights_path",
-        ),
+        "spike4dgs.cli.doctor:doctor", "say what this machine has, what it lacks, and what mends it", "doctor"
     ),
     "download": Command(
-        "spike4dgs.benchmark.release.download_command:make_download",
+        "spike4dgs.cli.download:download",
         "fetch the scenes of a track or a release, or parts of them",
         "download outdoor-small --from https://example.org/spike4dgs/1 --out data",
-        needs=("spike4dgs.leaderboard.tracks:track_scenes",),
     ),
     "download weights": Command(
-        "spike4dgs.benchmark.release.weights_command:make_download_weights",
+        "spike4dgs.cli.download_weights:download_weights",
         "fetch weight files of metrics and methods, their licences shown first",
         "download weights lpips",
-        needs=("spike4dgs.baselines.starts.dust3r:weight_file",),
     ),
     "release pack": Command(
-        "spike4dgs.benchmark.release.release_commands:release_pack",
+        "spike4dgs.cli.release:pack",
         "pack scenes into a release that people can download",
         "release pack data/car-0-small data/turntable-0-small --out releases/1",
     ),
     "release check": Command(
-        "spike4dgs.benchmark.release.release_commands:release_check",
+        "spike4dgs.cli.release:check",
         "check a release: a host's limits, its index, every byte",
         "release check releases/1",
     ),
     "verify": Command(
-        "spike4dgs.benchmark.scene.verify:verify",
+        "spike4dgs.cli.verify:verify",
         "check every file of a scene against its manifest",
         "verify data/car-0-small",
     ),

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Any
 
 import psutil
 from rich.console import Console
@@ -56,50 +55,26 @@ class Finding:
 Check = Callable[[], Iterator[Finding]]
 
 
-@dataclass(frozen=True)
-class OtherRooms:
-    """The functions of other rooms that tell about their parts."""
+def doctor() -> int:
+    """Say what this machine has, what it lacks, and what mends it. Nothing is installed or changed.
 
-    vector_lanes: Callable[[], int]  # floats in a vector of the CPU kernels
-    kernel_threads: Callable[[], int]
-    mitsuba: Callable[[], Any]  # the variant's `name`, `why_not_fast` and `llvm`, the libraries found
-    networks: tuple[tuple[str, Callable[[], Path]], ...]  # by name, what finds their weights or raises UserError
+    The exit code is 1 where something that every run needs is broken, and 0 otherwise.
+    """
+    return report(examine())
 
 
-def make_doctor(
-    vector_lanes: Callable[[], int],
-    kernel_threads: Callable[[], int],
-    mitsuba: Callable[[], Any],
-    msdi: Callable[[], Path],
-    spk2img: Callable[[], Path],
-    dust3r: Callable[[], Path],
-) -> Callable[[], int]:
-    """Return the command `doctor`, which calls these functions of other rooms."""
-    networks = (("MSDI", msdi), ("Spk2ImgNet", spk2img), ("DUSt3R", dust3r))
-    rooms = OtherRooms(vector_lanes, kernel_threads, mitsuba, networks)
-
-    def doctor() -> int:
-        """Say what this machine has, what it lacks, and what mends it. Nothing is installed or changed.
-
-        The exit code is 1 where something that every run needs is broken, and 0 otherwise.
-        """
-        return report(examine(rooms))
-
-    return doctor
-
-
-def examine(rooms: OtherRooms) -> list[Finding]:
+def examine() -> list[Finding]:
     """Return the findings of all checks."""
     checks: dict[str, Check] = {
         "processor": _processor,
-        "CPU kernels": partial(_kernels, rooms),
+        "CPU kernels": _kernels,
         "packages": _packages,
         "torch": _torch,
-        "mitsuba": partial(_mitsuba, rooms),
+        "mitsuba": _mitsuba,
         "GPU": _gpu,
         "optional": _optional,
         "metrics": _metrics,
-        "networks": partial(_networks, rooms),
+        **{name: partial(_network, name, find) for name, find in NETWORKS.items()},
     }
     return [finding for part, check in checks.items() for finding in _try(part, check)]
 
@@ -140,13 +115,16 @@ def _processor() -> Iterator[Finding]:
     yield Finding("disk", OK, f"{disk.free / 2**30:.1f} of {disk.total / 2**30:.1f} GiB free in {Path.cwd()}")
 
 
-def _kernels(rooms: OtherRooms) -> Iterator[Finding]:
+def _kernels() -> Iterator[Finding]:
     import llvmlite.binding
+
+    from spike4dgs.method.splat.kernels.threads import get_threads
+    from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 
     features = llvmlite.binding.get_host_cpu_features()
     names = {"avx512f": "AVX-512", "avx2": "AVX2", "avx": "AVX", "neon": "NEON"}
     widest = next((name for key, name in names.items() if features.get(key)), "no wide vectors")
-    found = f"{widest}, {rooms.vector_lanes()} floats a vector, threads: {rooms.kernel_threads()}"
+    found = f"{widest}, {host_lanes()} floats a vector, threads: {get_threads()}"
     yield Finding("CPU kernels", OK, found)
 
 
@@ -166,8 +144,10 @@ def _torch() -> Iterator[Finding]:
     yield Finding("torch", OK, f"{torch.__version__}, threads: {torch.get_num_threads()}")
 
 
-def _mitsuba(rooms: OtherRooms) -> Iterator[Finding]:
-    variant, installed = rooms.mitsuba(), version("mitsuba")
+def _mitsuba() -> Iterator[Finding]:
+    from spike4dgs.generators.rendering.mitsuba_variant import diagnose
+
+    variant, installed = diagnose(), version("mitsuba")
     numbers = [re.search(r"\d+", Path(path).name) for path in variant.llvm]
     llvm = ", ".join(sorted({n[0] for n in numbers if n}, key=int)) or "not found"
     if not variant.why_not_fast:
@@ -228,14 +208,34 @@ def _short(path: Path) -> str:
     return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else str(path)
 
 
-def _networks(rooms: OtherRooms) -> Iterator[Finding]:
-    for name, find in rooms.networks:
-        try:
-            yield Finding(name, OK, find().name)
-        except WeightsError as e:
-            yield Finding(name, MISSING, "no weights", str(e).rpartition("; ")[2])
-        except UserError as e:
-            yield Finding(name, BROKEN, str(e))
+def _network(name: str, find: Callable[[], Path]) -> Iterator[Finding]:
+    try:
+        yield Finding(name, OK, find().name)
+    except WeightsError as e:
+        yield Finding(name, MISSING, "no weights", str(e).rpartition("; ")[2])
+
+
+def _msdi() -> Path:
+    from spike4dgs.method.msdi.weights import check_weights
+
+    return check_weights()
+
+
+def _spk2img() -> Path:
+    from spike4dgs.baselines.images.spk2img.weights import check_weights
+
+    return check_weights()
+
+
+def _dust3r() -> Path:
+    from spike4dgs.baselines.starts.dust3r import weights_path
+
+    return weights_path()
+
+
+# What finds the weights of a network, or raises UserError. They are imported when they are asked for: a room that
+# cannot be imported is a finding.
+NETWORKS: dict[str, Callable[[], Path]] = {"MSDI": _msdi, "Spk2ImgNet": _spk2img, "DUSt3R": _dust3r}
 
 
 def _version(package: str) -> str | None:

@@ -16,7 +16,12 @@ from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 class Selection:
     """What is asked for; empty means all. The files at the top of a scene always come along.
 
-    `window_ms`: streams alone, and of them the ticks of these milliseconds [start, stop).
+    Args:
+        scenes: Only these.
+        cameras: Only files of these cameras, beside the scene's own.
+        parts: Only these parts, such as spikes, calibration or images, beside the scene's description.
+        window_ms: Only the streams, from the first to the second millisecond, as OUT/SCENE-START-STOPms: a folder
+            of streams to look at, which is no scene of the track.
     """
 
     scenes: tuple[str, ...] = ()
@@ -82,6 +87,9 @@ class Selection:
             expected = f"milliseconds from 0 to {scene.n_ticks * 1000 / scene.rate_hz:g} ({scene.id})"
             raise problem("--window-ms", expected, "{:g} {:g}".format(*self.window_ms), "shorten the window")
         return ticks
+
+
+EVERYTHING = Selection()
 
 
 def _check(option: str, asked: Sequence[str], known: Iterable[str], release: str) -> None:

@@ -1,16 +1,12 @@
-"""`verify`: check every file of a scene folder against its manifest, and the contents that make its revision."""
+"""Check that the files of a scene hold the contents that make its revision."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
-
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
-from spike4dgs.benchmark.scene.scene import Scene, open_scenes
+from spike4dgs.benchmark.scene.scene import Scene
 
 
 def verify_content(scene: Scene) -> Iterator[str]:
@@ -29,20 +25,3 @@ def verify_content(scene: Scene) -> Iterator[str]:
                     raise problem(path, f"content {recorded[:16]}...", f"{found[:16]}...", fix)
         except UserError as e:
             yield str(e)
-
-
-def verify(scenes: Positional[tuple[Path, ...]]) -> int:
-    """Check size and SHA-256 of every file of scene folders, and that the scenes can be read.
-
-    Data that is fitted or scored is decoded too: the revision is that of what the files hold.
-
-    Args:
-        scenes: Scene folders.
-    """
-    problems = 0
-    for scene in open_scenes(scenes, allow_gaps=True):
-        for line in dict.fromkeys([*scene.manifest.problems(), *verify_content(scene)]):
-            print(f"error: {line}", file=sys.stderr)
-            problems += 1
-        print(f"{scene.root}: {len(scene.manifest.files)} files, revision {scene.revision}")
-    return 2 if problems else 0

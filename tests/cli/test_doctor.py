@@ -24,22 +24,24 @@ from spike4dgs.cli.doctor import (
     NOTE,
     OK,
     Finding,
-    OtherRooms,
     examine,
-    make_doctor,
     report,
 )
 
 LLVM = SimpleNamespace(name="llvm_ad_rgb", why_not_fast="", llvm=("/usr/lib/libLLVM.so.19.1", "/usr/lib/libLLVM-15.so"))
 
 
-def rooms(**changes: Any) -> OtherRooms:
-    facts = {"vector_lanes": lambda: 16, "kernel_threads": lambda: 3, "mitsuba": lambda: LLVM, "networks": ()}
-    return OtherRooms(**(facts | changes))
+@pytest.fixture(autouse=True)
+def machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with 16 lanes, 3 threads and LLVM, where no network is looked for."""
+    monkeypatch.setattr("spike4dgs.method.splat.kernels.vector_ir.host_lanes", lambda: 16)
+    monkeypatch.setattr("spike4dgs.method.splat.kernels.threads.get_threads", lambda: 3)
+    monkeypatch.setattr("spike4dgs.generators.rendering.mitsuba_variant.diagnose", lambda: LLVM)
+    monkeypatch.setattr(doctor, "NETWORKS", {})
 
 
-def found(part: str, **changes: Any) -> Finding:
-    (finding,) = [f for f in examine(rooms(**changes)) if f.part == part]
+def found(part: str) -> Finding:
+    (finding,) = [f for f in examine() if f.part == part]
     return finding
 
 
@@ -69,8 +71,9 @@ def test_on_a_machine_without_llvm_it_names_the_scalar_variant_and_what_mends_it
     assert all(len(line) <= 80 for line in lines if not line.startswith("    > "))
 
 
-def test_what_is_found_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    names = {f.part: f for f in examine(rooms(networks=(("MSDI", lambda: Path("a/msdi.safetensors")),)))}
+def test_what_is_found_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(doctor, "NETWORKS", {"MSDI": lambda: Path("a/msdi.safetensors")})
+    names = {f.part: f for f in examine()}
     assert names["CPU kernels"].found.endswith("16 floats a vector, threads: 3")
     assert names["mitsuba"].found.endswith("llvm_ad_rgb; LLVM 15, 19")
     assert names["MSDI"] == Finding("MSDI", OK, "msdi.safetensors")
@@ -83,27 +86,26 @@ def test_what_is_found_is_said(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_weights_that_users_bring_may_be_missing_and_a_damaged_file_is_broken(
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = problem("here", "weights", "SPIKE4DGS_X not set", "get the file; then set SPIKE4DGS_X")
-    absent = found(
-        "X",
-        networks=(
-            (
-                "X",
-                partial(fail, WeightsError(str(error), "")),
-            ),
-        ),
-    )
+    monkeypatch.setattr(doctor, "NETWORKS", {"X": partial(fail, WeightsError(str(error), ""))})
+    absent = found("X")
     assert absent == Finding("X", MISSING, "no weights", "then set SPIKE4DGS_X")
-    damaged = found("X", networks=(("X", partial(fail, problem("x.pt", "weights", "damaged data", "mend it"))),))
+    error = problem("x.pt", "weights", "damaged data", "mend it")
+    monkeypatch.setattr(doctor, "NETWORKS", {"X": partial(fail, error)})
+    damaged = found("X")
     assert damaged.state == BROKEN and "x.pt: expected weights, found damaged data" in damaged.found
     assert report([absent, damaged]) == 1
     assert "Broken: X. Optional parts missing: 1." in capsys.readouterr().out
 
 
-def test_a_check_that_fails_is_a_finding_and_the_others_run(capsys: pytest.CaptureFixture[str]) -> None:
-    findings = examine(rooms(vector_lanes=partial(fail, ImportError("no module numba\nmore"))))
+def test_a_check_that_fails_is_a_finding_and_the_others_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lanes = partial(fail, ImportError("no module numba\nmore"))
+    monkeypatch.setattr("spike4dgs.method.splat.kernels.vector_ir.host_lanes", lanes)
+    findings = examine()
     broken = [f for f in findings if f.state == BROKEN]
     assert [(f.part, f.found) for f in broken] == [("CPU kernels", "ImportError: no module numba")]
     assert {"mitsuba", "torch", "GPU"} <= {f.part for f in findings}
@@ -139,11 +141,3 @@ def test_a_gpu_without_kernels_is_optional_and_named(monkeypatch: pytest.MonkeyP
     assert found("CUDA kernels") == wanted
     monkeypatch.setattr(doctor, "missing_rasterizer", lambda: None)
     assert found("CUDA kernels").state == OK
-
-
-def test_the_command_takes_no_arguments() -> None:
-    facts = rooms()
-    command = make_doctor(
-        facts.vector_lanes, facts.kernel_threads, facts.mitsuba, *([partial(Path, "w.safetensors")] * 3)
-    )
-    assert command() == 0

@@ -10,7 +10,8 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.release.counted_copy import counted_copy
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.scene.verify import verify, verify_content
+from spike4dgs.benchmark.scene.verify import verify_content
+from spike4dgs.cli.verify import verify
 from spike4dgs.generators.recorder.sources import DARK, emulated_source
 
 

@@ -10,9 +10,10 @@ from range_server import serve
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.release import source as source_module
-from spike4dgs.benchmark.release.download_command import make_download
 from spike4dgs.benchmark.release.index import Release
+from spike4dgs.benchmark.release.selection import Selection
 from spike4dgs.benchmark.release.track import track_folders
+from spike4dgs.cli import download as command
 
 
 @pytest.fixture
@@ -56,11 +57,15 @@ def test_without_a_server_the_scenes_are_named(
         track_folders(revisions, tmp_path, None)
 
 
-def test_the_command_takes_a_tracks_scenes(revisions: dict[str, str], release_folder: Path, tmp_path: Path) -> None:
-    command = make_download(lambda name: {"pattern-1": revisions["pattern-1"]})
-    assert command("outdoor", source=str(release_folder), out=tmp_path, parts=("images",)) == 0
+def test_the_command_takes_a_tracks_scenes(
+    revisions: dict[str, str], release_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "track_scenes", lambda name: {"pattern-1": revisions["pattern-1"]})
+    source = str(release_folder)
+    assert command.download("outdoor", source=source, out=tmp_path, selection=Selection(parts=("images",))) == 0
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["pattern-1"]
     with pytest.raises(UserError, match="--scenes: expected scenes of outdoor: pattern-1, found pattern-0"):
-        command("outdoor", source=str(release_folder), out=tmp_path, scenes=("pattern-0",))
+        command.download("outdoor", source=source, out=tmp_path, selection=Selection(scenes=("pattern-0",)))
+    monkeypatch.setattr(command, "track_scenes", lambda name: {"pattern-1": "22"})
     with pytest.raises(UserError, match="expected pattern-1 in revision 22"):
-        make_download(lambda name: {"pattern-1": "22"})("outdoor", source=str(release_folder), out=tmp_path / "new")
+        command.download("outdoor", source=source, out=tmp_path / "new")

@@ -14,7 +14,8 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file, write_json
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.scene.verify import verify, verify_content
+from spike4dgs.benchmark.scene.verify import verify_content
+from spike4dgs.cli.verify import verify
 
 TRUTH = "images/cam_03/000020.exr"
 

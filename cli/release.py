@@ -13,12 +13,12 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.release.check import find_problems
 from spike4dgs.benchmark.release.index import Release, read_release
-from spike4dgs.benchmark.release.pack import pack
+from spike4dgs.benchmark.release.pack import pack as pack_scenes
 from spike4dgs.benchmark.release.progress import size_text
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 
-def release_pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000) -> int:
+def pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000) -> int:
     """Pack scene folders into uncompressed tars with an index, a dataset card, Croissant and sums.
 
     The same scenes give the same bytes. A killed run resumes.
@@ -34,7 +34,7 @@ def release_pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str =
     if shard_mb < 1:
         raise problem("--shard-mb", "at least 1", str(shard_mb), "correct the number")
     opened = open_scenes(scenes, allow_gaps=True)
-    release = pack(opened, out, name, shard_mb * 1_000_000)
+    release = pack_scenes(opened, out, name, shard_mb * 1_000_000)
     _console().print(_costs(release))
     size = sum(shard.bytes for shard in release.shards)
     print(f"{out}: {len(release.scenes)} scenes, {size} bytes in {len(release.shards)} shards")
@@ -42,7 +42,7 @@ def release_pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str =
     return 0
 
 
-def release_check(folder: Positional[Path]) -> int:
+def check(folder: Positional[Path]) -> int:
     """Check a release as Hugging Face would limit it, and every byte of it.
 
     Counts and sizes of files, names, the dataset card, Croissant, all SHA-256, and that the index lists what the tars

@@ -9,11 +9,12 @@ import pytest
 from range_server import Behaviour, serve
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.release import weights_command
 from spike4dgs.benchmark.release.source import Patience, Source
 from spike4dgs.benchmark.release.transfer import PIECE
-from spike4dgs.benchmark.release.weights_command import FILES, fetch_weights, make_download_weights
+from spike4dgs.benchmark.release.weights import fetch_weights
 from spike4dgs.benchmark.weights import ALEXNET, VARIABLE, NamedWeights, WeightFile, find_weights
+from spike4dgs.cli import download_weights as command_module
+from spike4dgs.cli.download_weights import FILES, download_weights
 
 CONTENT = bytes(range(256)) * 4096 * 24  # 24 MiB: two pieces
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -26,6 +27,7 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setitem(FILES, "lpips", FILE)
+    monkeypatch.setitem(FILES, "dust3r", weight("dust3r.safetensors"))
     return tmp_path / "torch/hub/checkpoints"
 
 
@@ -38,7 +40,7 @@ def server(tmp_path: Path) -> Path:
 
 
 def command(*names: str, **options: object) -> int:
-    return make_download_weights(lambda: weight("dust3r.safetensors"))(names, **options)
+    return download_weights(names, **options)
 
 
 def weight(name: str) -> WeightFile:
@@ -63,7 +65,7 @@ def test_licences_are_asked_for_first(
     with serve(server) as (address, seen):
         with pytest.raises(UserError, match="licences: expected your consent .*; add --yes to accept them"):
             command("lpips", source=address)
-        monkeypatch.setattr(weights_command.sys.stdin, "isatty", lambda: True, raising=False)
+        monkeypatch.setattr(command_module.sys.stdin, "isatty", lambda: True, raising=False)
         monkeypatch.setattr("builtins.input", lambda prompt: "no")
         with pytest.raises(UserError, match="your consent"):
             command("lpips", source=address)

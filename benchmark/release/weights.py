@@ -1,0 +1,54 @@
+"""Fetch a weight file into the folder where metrics and methods look for it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import sha256_file, writing
+from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.release.progress import ByteProgress, size_text
+from spike4dgs.benchmark.release.source import Source
+from spike4dgs.benchmark.release.transfer import PIECE
+from spike4dgs.benchmark.weights import WeightFile
+
+
+def fetch_weights(source: Source, name: str, file: WeightFile) -> Path:
+    """Fetch a file to where it is looked for and return its path. A killed run goes on where it was.
+
+    Raises UserError where the source keeps failing or has another file than the known one, and where the disk is full.
+    """
+    path = file.candidates[0]
+    part = path.with_name(f".{path.name}.part")
+    with locked(path.with_name(f".{path.name}.lock"), path, "a file that no other program fetches"):
+        size = file.bytes or source.size(name)
+        if size is None:
+            raise problem(source.where(name), "a server that states sizes", "one that does not", "use another source")
+        for attempt in (1, 2):  # the part of an earlier run may be damaged
+            _append(source, name, part, size)
+            if file.sha256 in (None, found := sha256_file(part)):
+                break
+            part.unlink()
+            if attempt == 2:
+                raise problem(source.where(name), f"sha256 {file.sha256}", found, "use another source")
+        with writing(path):
+            os.replace(part, path)
+    return path
+
+
+def _append(source: Source, name: str, part: Path, size: int) -> None:
+    """Fetch the bytes that a part lacks."""
+    with ByteProgress(f"downloading {name} ({size_text(size)})", size) as progress, writing(part):
+        with open(part, "ab") as file:
+            have = min(file.tell(), size)
+            file.truncate(have)
+            progress.skip(have)
+            while have < size:
+                stop = min(have + PIECE, size)
+                data = source.read_again(name, have, stop, size)
+                file.write(data)
+                file.flush()
+                have = stop
+                progress.advance(len(data))
+            os.fsync(file.fileno())
