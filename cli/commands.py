@@ -92,50 +92,48 @@ COMMANDS: dict[str, Command] = {
         "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
     ),
     "submit": Command(
-        "spike4dgs.leaderboard.submit_command:make_submit",
+        "spike4dgs.cli.submit:submit",
         "verify a result record and enter it into the leaderboard",
         "submit r.json --predictions runs/small/predictions/tfp+4dgs --scenes data/car-0-small data/turntable-0-small",
-        needs=("spike4dgs.generators.second_renderings:second_renderings",),
     ),
     "verify-leaderboard": Command(
-        "spike4dgs.leaderboard.verify_command:verify_leaderboard",
+        "spike4dgs.cli.verify_leaderboard:verify_leaderboard",
         "check a leaderboard's release, entries and boards",
         "verify-leaderboard leaderboard",
     ),
     "leaderboard": Command(
-        "spike4dgs.leaderboard.page.show_command:show", "print the ranking, with intervals of the ranks", "leaderboard"
+        "spike4dgs.cli.leaderboard:show", "print the ranking, with intervals of the ranks", "leaderboard"
     ),
     "leaderboard build": Command(
-        "spike4dgs.leaderboard.page.build_command:build", "write the leaderboard as a page", "leaderboard build"
+        "spike4dgs.cli.leaderboard:build", "write the leaderboard as a page", "leaderboard build"
     ),
     "season make": Command(
-        "spike4dgs.leaderboard.season.make_command:make_season_make",
+        "spike4dgs.cli.season:make",
         "draw secret seeds, make hidden scenes, write the commitments to them",
         "season make 1 --worlds car turntable --secret ~/season-1",
-        needs=("spike4dgs.generators.make_dataset:make_dataset",),
     ),
     "season publish": Command(
-        "spike4dgs.leaderboard.season.publish_command:publish",
+        "spike4dgs.cli.season:publish",
         "write what may be public by now as tars: training parts, in the end whole scenes",
         "season publish 1 --secret ~/season-1 --out public",
     ),
     "season predict": Command(
-        "spike4dgs.leaderboard.season.predict_command:predict",
+        "spike4dgs.cli.season:predict",
         "fit methods on published training parts and render the targets, to submit them",
         "season predict car-9001-small turntable-9001-small --methods tfp+4dgs --out runs/season-1",
     ),
     "season score": Command(
-        "spike4dgs.leaderboard.season.score_command:score",
+        "spike4dgs.cli.season:score",
         "score submitted predictions, or methods that are run first",
         "season score 1 --secret ~/season-1 --predictions received/theirs --methods tfp+4dgs",
     ),
     "season reveal": Command(
-        "spike4dgs.leaderboard.season.reveal_command:reveal",
+        "spike4dgs.cli.season:reveal",
         "publish the secret seeds of a season that is over",
         "season reveal 1 --secret ~/season-1",
     ),
     "season check": Command(
-        "spike4dgs.leaderboard.season.check_command:check",
+        "spike4dgs.cli.season:check",
         "check the seeds, scenes and scores of a season against its commitments",
         "season check 0",
     ),

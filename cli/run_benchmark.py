@@ -27,7 +27,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From
-from spike4dgs.leaderboard.submit_command import submit_all
+from spike4dgs.cli.submit import submit_all
 from spike4dgs.leaderboard.tracks import track_scenes
 
 

@@ -7,23 +7,29 @@
 
 REVISION begins the hash of the scenes' revisions and the split (`tracks.dataset_revision`). Paths follow from the
 record's scenes, revisions, split, method and seed alone. Hidden files are no entries: a killed process may leave some.
+
+LEADERBOARD/LEDGER has a line for every entry that `submit` wrote, so that one that was edited by hand is noticed:
+
+    <sha256 of the entry's canonical JSON>  entries/1-outdoor-small@0123456789ab/tfp+4dgs.json
+
+Lines are sorted and never removed. Who edits an entry and the ledger alike is noticed only when the entry is verified
+again from its predictions.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.ledger import NAME as LEDGER
-from spike4dgs.leaderboard.ledger import Ledger, add_line, read_ledger
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, place_of
 
 SCHEMA = "spike4dgs-entry/2"
@@ -31,7 +37,10 @@ CLAIMED, RE_SCORED, RE_FITTED = LABELS = ("claimed", "re-scored", "re-fitted")  
 FOLDERS = (PUBLIC, LOCAL, ARCHIVE)
 BOARD = "leaderboard.json"
 WAIT_S = 600.0  # for other submissions; one takes a second under the lock
+LEDGER = "LEDGER"
 Entry = dict[str, Any]
+Ledger = frozenset[tuple[str, str]]  # (sha256, path below the leaderboard)
+_LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
 _LARGEST = 1e15  # of any number: sums and squares of such numbers stay finite
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt") for i in range(10))}  # on Windows
 
@@ -128,6 +137,26 @@ def check_numbers(value: Any, where: Path) -> None:
         elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:  # NaN compares false
             found = f"an integer of {len(str(abs(item)))} digits" if isinstance(item, int) else str(item)
             raise problem(where, f"numbers within +-{_LARGEST:g}", found, "score the predictions again")
+
+
+def read_ledger(leaderboard: Path) -> Ledger:
+    """Return the lines of the ledger; none where there is no such file. Raises UserError for a damaged line."""
+    path = leaderboard / LEDGER
+    if not path.is_file():
+        return frozenset()
+    found = set()
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        if not (match := _LINE.fullmatch(line)):
+            expected = "lines of a sha256, two blanks and an entry's path"
+            raise problem(path, expected, f"line {number}: {line[:80]!r}", "restore the file from version control")
+        found.add((match[1], match[2]))
+    return frozenset(found)
+
+
+def add_line(leaderboard: Path, sha256: str, path: str) -> None:
+    """Add a line to the ledger. The caller holds the leaderboard's lock."""
+    lines = sorted({*read_ledger(leaderboard), (sha256, path)}, key=lambda line: (line[1], line[0]))
+    write_text(leaderboard / LEDGER, "".join(f"{digest}  {name}\n" for digest, name in lines))
 
 
 def entry_paths(leaderboard: Path, *folders: str) -> Iterator[str]:

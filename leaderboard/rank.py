@@ -5,14 +5,16 @@
     archive.json       entries from before release 1, without ranks
 
 A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration. Those
-are re-scored or re-fitted, complete, and without flags. Every other entry is a row of its own after them, without rank.
+are re-scored or re-fitted, complete, and without flags, which follow from the entry and the release. Every other entry
+is a row of its own after them, without rank.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +24,19 @@ from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry, read_entries
-from spike4dgs.leaderboard.flags import flags_of
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of
 
 SCHEMA = "spike4dgs-leaderboard/2"
 FILES = {PUBLIC: BOARD, LOCAL: "local.json", ARCHIVE: "archive.json"}
+MAX_EQUAL_PIXELS = 0.25  # half floats of good renderings equal the truth's in a few percent of the pixels
+MAX_NOISE_SHARE = 0.1  # 0 for honest predictions; a tenth of the truth mixed in gives as much
+STANDARD_ERRORS = 5.0  # beyond chance: the noise has heavy tails, and honest fits of van reach three
+COPY, NOISE, CEILING, TRAINED = (
+    "equals truth",
+    "carries the truth's noise",
+    "above the noise ceiling",
+    "trained on test scenes",
+)
 _BEFORE = "before release 1: these scenes' bytes are not those of the release"
 
 
@@ -124,6 +134,37 @@ def may_be_ranked(entry: Entry) -> bool:
     record = entry["record"]
     complete = is_complete(record) and record["mean"][PRIMARY] is not None
     return complete and entry["verification"]["label"] != CLAIMED and not flags_of(entry)
+
+
+def flags_of(entry: Mapping[str, Any]) -> list[str]:
+    """Return the flags of an entry, each with the scenes that it comes from; none for what may be ranked."""
+    record, truth = entry["record"], entry["verification"]["truth"]
+    release, found = current_release(), dict[str, list[str]]()
+    for scene, cell in sorted(record["scenes"].items()):
+        for flag in _of_truth(truth.get(scene)):
+            found.setdefault(flag, []).append(scene)
+        revision, psnr = record["dataset"]["scenes"][scene], cell["metrics"]["psnr"]
+        ceiling = release.ceiling_db(scene, revision) or truth.get(scene, {}).get("ceiling_db")
+        if psnr is not None and ceiling is not None and psnr > ceiling:
+            found.setdefault(CEILING, []).append(f"{scene} has {psnr:.1f} of {ceiling:.1f} dB")
+        if any(_names(text, name) for text in record["method"]["trained_on"] for name in (scene, revision)):
+            found.setdefault(TRAINED, []).append(scene)
+    return [f"{flag} ({', '.join(scenes)})" for flag, scenes in found.items()]
+
+
+def _of_truth(check: Mapping[str, Any] | None) -> Iterator[str]:
+    if check is None:
+        return
+    if check["equal_images"] or check["equal_pixels"] > MAX_EQUAL_PIXELS:
+        yield COPY
+    share, error = check["noise_share"], check["noise_share_error"]
+    if share is not None and share - STANDARD_ERRORS * error > MAX_NOISE_SHARE:
+        yield NOISE
+
+
+def _names(text: str, name: str) -> bool:
+    """Return whether a text has a name as a word of its own: car-1-small does not name car-1-small-lens."""
+    return re.search(rf"(?<![\w.-]){re.escape(name)}(?![\w.-]*\w)", text, re.IGNORECASE) is not None
 
 
 def _configuration(entry: Entry) -> str:

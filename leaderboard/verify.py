@@ -1,4 +1,6 @@
-"""Verify a record: hash and score the predictions again, and compare every value with the record's.
+"""Verify a record, or a whole leaderboard.
+
+The predictions of a record are hashed and scored again, and every value is compared with the record's.
 
 Fit time, speed and memory cannot be computed again: they must equal those in prediction.json. Metrics whose weights
 this machine lacks are not compared. The predictions are compared with the truth and its noise (`truth_check`).
@@ -6,18 +8,22 @@ this machine lacks are not compared. The predictions are compared with the truth
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.runs.predictions import SUMS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value
 from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
 from spike4dgs.benchmark.runs.sensors import sensor_of
 from spike4dgs.benchmark.runs.targets import has_truth
-from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.scene.scene import Scene, open_scenes
+from spike4dgs.leaderboard.entry import FOLDERS, Entry, check_folder, read_entries
+from spike4dgs.leaderboard.rank import FILES, make_boards
 from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings
 
 GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ
@@ -97,3 +103,65 @@ def _check_same(claimed: Cell, computed: Cell, metrics: Collection[str], where: 
     for key in (*COSTS, "budget", "device", "fitted_with"):
         if claimed[key] != computed[key]:
             raise problem(where, f"{key} {computed[key]} as in prediction.json", str(claimed[key]), fix)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What came of checking a leaderboard: how many entries it has, how many were scored again, and the problems."""
+
+    entries: int
+    scored: int
+    problems: tuple[str, ...]
+
+
+def verify_leaderboard(
+    leaderboard: Path, predictions: Path | None = None, scenes: Sequence[Path] = (), allow_gaps: bool = False
+) -> Findings:
+    """Check that entries are as submitted and that boards follow from them.
+
+    `predictions` METHOD/SCENE of a run are scored again, with those of `scenes` that are there. Raises UserError where
+    the folder is no leaderboard.
+    """
+    check_folder(leaderboard)
+    entries, refused = read_entries(leaderboard, *FOLDERS)
+    problems = [f"{leaderboard / path}: {reason}" for path, reason in refused.items()]
+    problems += _stale_boards(leaderboard)
+    scored = 0
+    if predictions is not None:
+        by_id = {open_scenes([scene], allow_gaps)[0].id: scene for scene in scenes}
+        for path, entry in entries.items():
+            try:
+                scored += _score_again(leaderboard / path, entry, predictions, by_id, allow_gaps)
+            except UserError as e:
+                problems.append(str(e))
+    return Findings(len(entries), scored, tuple(problems))
+
+
+def _stale_boards(leaderboard: Path) -> Iterator[str]:
+    """Yield a line for each board file that does not follow from the entries."""
+    boards = make_boards(leaderboard)
+    for folder, name in FILES.items():
+        path = leaderboard / name
+        if folder not in boards:
+            if path.exists():
+                yield f"{path}: expected no such file, as there are no entries in {folder}/; remove it"
+            continue
+        try:
+            found: Mapping[str, object] | None = read_json(path, "a board")
+        except UserError as e:
+            yield str(e)
+            continue
+        if found != boards[folder]:
+            yield f"{path}: expected what the entries give, found other content; submit any record again"
+
+
+def _score_again(where: Path, entry: Entry, predictions: Path, scenes: Mapping[str, Path], allow_gaps: bool) -> bool:
+    """Score an entry's predictions again if its files are there; return whether they are."""
+    record = entry["record"]
+    folder = predictions / record["method"]["name"]
+    ok = [scene for scene, cell in record["scenes"].items() if cell["status"] == "ok"]
+    if not ok or any(not (folder / scene / SUMS).is_file() or scene not in scenes for scene in ok):
+        return False
+    opened: list[Scene] = open_scenes([scenes[scene] for scene in ok], allow_gaps, record["dataset"]["split"])
+    verify_record(record, where, folder, opened)
+    return True

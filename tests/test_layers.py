@@ -31,7 +31,7 @@ ORDER = {
     "schedule models checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings "
     "viewing",
     "baselines": "nearest_view images radiance_field spike_render starts stg tracking recipes hard_cases",
-    "leaderboard": "tracks ledger entry truth_check flags rank verify refit submit_command verify_command page season",
+    "leaderboard": "tracks entry truth_check rank verify refit submit page season",
 }
 MOST_MODULES = 13  # in a folder; `__init__` does not count
 MANY_MODULES = {"cli"}  # one module a command: the listing is the table of commands

@@ -1,4 +1,4 @@
-"""The results of a season: one file for each submission, and the table that is made from them."""
+"""Score submissions to a season; its results are one file for each, and the table that is made from them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
+from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import check_no_oracle
-from spike4dgs.leaderboard.season.season_file import Season, season_folder
+from spike4dgs.leaderboard.season.fits import find_chosen, predict_all
+from spike4dgs.leaderboard.season.season_file import Season, is_revealed, read_season, season_folder
+from spike4dgs.leaderboard.season.secret_folder import open_committed, runs_folder
 
 SCHEMA = "spike4dgs-season-result/1"
 TABLE = "table.md"
@@ -121,3 +127,47 @@ def write_table(seasons: Path, season: Season) -> Path:
     path = season_folder(seasons, season.season) / TABLE
     write_text(path, table_text(season, read_results(seasons, season)))
     return path
+
+
+def score_season(
+    number: int,
+    secret: Path,
+    seasons: Path,
+    *,
+    predictions: Sequence[Path] = (),
+    methods: Sequence[str] = (),
+    metrics: Sequence[str] = (AUTO,),
+    device: str = "auto",
+) -> tuple[Path, list[str]]:
+    """Score predictions folders of participants, and installed methods, which are run first on the training parts.
+
+    Return the season's table and why some were not scored: a participant's mistake does not stop the others. Raises
+    UserError for a season that is revealed, for nothing to score, and for predictions where streams are hidden.
+    """
+    season = read_season(seasons, number)
+    if is_revealed(seasons, number):
+        fix = "submit to the next season: whoever knows the seeds can make the truth"
+        raise problem(f"season {number}", "a season whose seeds are secret", "revealed ones", fix)
+    if not (predictions or methods):
+        raise problem("season score", "--predictions or --methods", "neither", "name what to score")
+    if predictions and season.streams == "hidden":
+        fix = "take the method itself: --methods"
+        raise problem("--predictions", "a season with published streams", "hidden ones", fix)
+    selection, refused = select_metrics(tuple(metrics)), list[str]()
+    with locked(secret / ".lock", secret, "a folder in which nobody else scores"):
+        scenes = open_committed(secret, season)
+        submitted = [(PREDICTIONS, folder) for folder in predictions]
+        if methods:
+            chosen, on = find_chosen(methods, device)
+            settings = Settings(runs_folder(secret), season.fit_seed, on, season.fit_budget)
+            failed = predict_all(open_committed(secret, season, training=True), chosen, settings)
+            refused += [f"{name}: not fitted, see its log in {settings.out / 'logs'}" for name in sorted(failed)]
+            ran = [settings.out / "predictions" / name for name in methods if name not in failed]
+            submitted += [(METHOD, folder) for folder in ran]
+        for way, folder in submitted:
+            try:
+                record = score_predictions(folder, scenes, selection, season.training_revisions)
+                write_result(seasons, number, Result(way, record))
+            except UserError as e:
+                refused.append(str(e))
+        return write_table(seasons, season), refused

@@ -20,7 +20,7 @@ from spike4dgs.leaderboard.season import opening
 
 SEASONS = Path("leaderboard/seasons")
 SCHEMA = "spike4dgs-season/1"
-_NAME = "season.json"
+NAME = "season.json"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def season_folder(seasons: Path, number: int) -> Path:
 
 def is_announced(seasons: Path, number: int) -> bool:
     """Return whether the season's commitments are written."""
-    return (season_folder(seasons, number) / _NAME).exists()
+    return (season_folder(seasons, number) / NAME).exists()
 
 
 def is_revealed(seasons: Path, number: int) -> bool:
@@ -83,7 +83,7 @@ def is_revealed(seasons: Path, number: int) -> bool:
 
 def read_season(seasons: Path, number: int) -> Season:
     """Read season.json. Raises UserError where it is missing, damaged or another season's."""
-    path = season_folder(seasons, number) / _NAME
+    path = season_folder(seasons, number) / NAME
     data = read_json(path, "a season")
     schema = load_schema("spike4dgs.leaderboard.season", "season.schema.json")
     check_schema(data, schema, path, "restore the file from git")
@@ -95,7 +95,7 @@ def read_season(seasons: Path, number: int) -> Season:
 
 def write_season(seasons: Path, season: Season) -> Path:
     """Write season.json and return its path. Raises UserError where there is one: commitments never change."""
-    path = season_folder(seasons, season.season) / _NAME
+    path = season_folder(seasons, season.season) / NAME
     if path.exists():
         raise problem(path, "no such file yet", "the commitments of a season", "choose another number")
     data = {"schema": SCHEMA, **asdict(season), "scenes": [asdict(scene) for scene in season.scenes]}

@@ -9,9 +9,14 @@ runs/                   the fits of methods that the maintainers run, with predi
 
 from __future__ import annotations
 
+import io
+import tarfile
 from pathlib import Path
+from typing import IO
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import atomic_path, sha256_file
+from spike4dgs.benchmark.scene.manifest import NAME
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season.season_file import Season
 
@@ -46,3 +51,23 @@ def open_committed(secret: Path, season: Season, training: bool = False) -> list
             found, fix = f"{scene.revision[:16]}...", "restore the scene that `season make` made"
             raise problem(scene.root, f"revision {expected[scene.id][:16]}..., as committed", found, fix)
     return scenes
+
+
+def pack_scene(scene: Scene, path: Path) -> str:
+    """Write the files of a scene's manifest, and the manifest, as a tar that unpacks to SCENE/; return its SHA-256.
+
+    Members are sorted by name and have no owner and no time. Raises UserError where a file is not as recorded.
+    """
+    with atomic_path(path) as part, tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for name in sorted([*scene.manifest.files, NAME]):
+            source = scene.root / name if name == NAME else scene.manifest.path(name)
+            with open(source, "rb") as file:
+                tar.addfile(_member(f"{scene.id}/{name}", file), file)
+    return sha256_file(path)
+
+
+def _member(name: str, file: IO[bytes]) -> tarfile.TarInfo:
+    info = tarfile.TarInfo(name)  # no owner, and the time 0
+    info.size, info.mode = file.seek(0, io.SEEK_END), 0o644
+    file.seek(0)
+    return info

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from spike4dgs.leaderboard.flags import flags_of
+from spike4dgs.leaderboard.rank import flags_of
 
 CHECK = {"images": 3, "equal_images": 0, "equal_pixels": 0.04, "ceiling_db": None}
 

@@ -10,7 +10,7 @@ from dummy_methods import CountMethod, run
 from submissions import board, edit, enter, everything, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.submit_command import submit_all
+from spike4dgs.cli.submit import submit_all
 
 
 def test_with_files_an_entry_is_re_scored(

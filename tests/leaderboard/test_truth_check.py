@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from dummy_methods import CountMethod, run
 from scipy.ndimage import gaussian_filter
-from submissions import board, read, release_of
+from submissions import board, enter, read, release_of
 
 from spike4dgs.benchmark.files import sha256_file, write_text
 from spike4dgs.benchmark.runs.record import write_record
 from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.scene.images import read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.leaderboard.submit_command import make_submit
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
 NOISE = 0.004  # 48 dB
@@ -101,10 +100,9 @@ def with_noise(done: Path) -> None:
 
 
 def enter_checked(done: Path, name: str) -> dict[str, Any]:
-    submit = make_submit(second)
-    scenes = (done / "s0", done / "s1")
-    predictions = done / "out/predictions" / name
-    submit(done / f"out/results/{name}.json", predictions=predictions, scenes=scenes, leaderboard=done / "board")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spike4dgs.generators.second_renderings.second_renderings", second)
+        enter(done, name)
     rows = {r["method"]: r for r in board(done, "leaderboard")["boards"][0]["rows"]}
     return dict(rows[name])
 

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from submissions import edit, edit_with_ledger, enter, release_of
 
+from spike4dgs.cli.verify_leaderboard import verify_leaderboard
 from spike4dgs.leaderboard import tracks
-from spike4dgs.leaderboard.verify_command import verify_leaderboard
 
 
 def problems(done: Path, capsys: pytest.CaptureFixture[str], **options: Any) -> list[str]:

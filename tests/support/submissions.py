@@ -12,14 +12,11 @@ import pytest
 
 from spike4dgs.benchmark.files import sha256_json, write_json
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli.submit import submit
 from spike4dgs.leaderboard import tracks
-from spike4dgs.leaderboard.entry import read_entry
-from spike4dgs.leaderboard.ledger import add_line, read_ledger
-from spike4dgs.leaderboard.submit_command import make_submit
-from spike4dgs.leaderboard.truth_check import no_renderings
+from spike4dgs.leaderboard.entry import add_line, read_entry, read_ledger
 
 Record = dict[str, Any]
-submit = make_submit(no_renderings)
 
 
 def enter(done: Path, name: str = "tfp+4dgs", verified: bool = True, **options: Any) -> Path:

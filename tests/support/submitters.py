@@ -16,9 +16,8 @@ import sys
 import time
 from pathlib import Path
 
+from spike4dgs.cli.submit import submit
 from spike4dgs.leaderboard.rank import write_boards
-from spike4dgs.leaderboard.submit_command import make_submit
-from spike4dgs.leaderboard.truth_check import no_renderings
 
 
 def make_results(record: Path, folder: Path, count: int) -> list[Path]:
@@ -35,7 +34,7 @@ def make_results(record: Path, folder: Path, count: int) -> list[Path]:
 def _submit(result: Path, leaderboard: Path, started: str) -> None:
     sys.stdout = sys.stderr = open(os.devnull, "w")
     Path(started).touch()
-    make_submit(no_renderings)(result, leaderboard=leaderboard)
+    submit(result, leaderboard=leaderboard)
 
 
 def submit_under_fire(leaderboard: Path, results: list[Path], kills: int, seed: int = 0) -> tuple[int, list[int]]:

@@ -26,7 +26,7 @@ from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription
 from spike4dgs.cli import main
-from spike4dgs.leaderboard.submit_command import submit_all
+from spike4dgs.cli.submit import submit_all
 
 
 def at(*positions: tuple[float, float]) -> tuple[Camera, ...]:

@@ -10,8 +10,7 @@ from dummy_methods import CountMethod
 from fake_renderer import render_fakes
 from made_season import NUMBER, WORLDS, Made
 
-from spike4dgs.generators.make_dataset import make_dataset
-from spike4dgs.leaderboard.season.make_command import make_season_make
+from spike4dgs.cli.season import make
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +18,6 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Made:
     made = Made(tmp_path_factory.mktemp("season"))
     with pytest.MonkeyPatch.context() as patch:
         render_fakes(patch)
-        make = make_season_make(make_dataset)
         given = {"worlds": WORLDS, "profile": "tiny", "budget": "0.02"}
         assert make(NUMBER, secret=made.secret, seasons=made.seasons, **given) == 0
     made.predict(CountMethod("counts"), CountMethod("rough", steps=1))

@@ -13,11 +13,10 @@ from made_season import NUMBER, Made
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.cli.season import check, reveal
 from spike4dgs.generators.make_dataset import make_dataset
-from spike4dgs.leaderboard.season.check_command import check
 from spike4dgs.leaderboard.season.opening import NAME, draw_opening, read_opening
 from spike4dgs.leaderboard.season.results import write_table
-from spike4dgs.leaderboard.season.reveal_command import reveal
 
 SCENE = "car-9003-tiny"
 

@@ -11,15 +11,15 @@ from made_season import NUMBER, WORLDS, Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli.season import make
 from spike4dgs.generators.make_dataset import make_dataset
-from spike4dgs.leaderboard.season.make_command import make_season_make
 from spike4dgs.leaderboard.season.opening import NAME, read_opening
 from spike4dgs.leaderboard.season.secret_folder import pack_file, scene_folder, training_folder
 
 
 def command(made: Made, worlds: tuple[str, ...] = WORLDS, number: int = NUMBER, **options: Any) -> int:
     given = {"profile": "tiny", "secret": made.secret, "seasons": made.seasons, **options}
-    return make_season_make(make_dataset)(number, worlds=worlds, **given)
+    return make(number, worlds=worlds, **given)
 
 
 def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
@@ -58,7 +58,7 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
         rendered.append(worlds[0])
         return make_dataset(worlds, **options)
 
-    make = make_season_make(dying)
+    monkeypatch.setattr("spike4dgs.generators.make_dataset.make_dataset", dying)
     given: dict[str, Any] = {"worlds": WORLDS, "profile": "tiny", "secret": made.secret, "seasons": made.seasons}
     with pytest.raises(KeyboardInterrupt):
         make(NUMBER, **given)

@@ -11,7 +11,7 @@ from fake_renderer import files
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.leaderboard.season.packing import pack_scene
+from spike4dgs.leaderboard.season.secret_folder import pack_scene
 
 
 def test_a_pack_unpacks_to_the_scene(small_scene: Path, tmp_path: Path) -> None:

@@ -9,9 +9,8 @@ from made_season import NUMBER, Made
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file, write_json
+from spike4dgs.cli.season import publish, reveal
 from spike4dgs.leaderboard.season.opening import NAME, draw_opening, write_secret
-from spike4dgs.leaderboard.season.publish_command import publish
-from spike4dgs.leaderboard.season.reveal_command import reveal
 
 
 def closing(made: Made, days: int) -> None:

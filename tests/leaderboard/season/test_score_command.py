@@ -16,10 +16,9 @@ from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.leaderboard.season.predict_command import predict_all
+from spike4dgs.cli.season import reveal, score
+from spike4dgs.leaderboard.season.fits import predict_all
 from spike4dgs.leaderboard.season.results import read_results
-from spike4dgs.leaderboard.season.reveal_command import reveal
-from spike4dgs.leaderboard.season.score_command import score
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
 

@@ -1,14 +1,11 @@
-"""`season check`: check what a season's maintainers committed to and published. Public files are all that it needs."""
+"""Check what a season's maintainers committed to and published. Public files are all that it needs."""
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
@@ -17,52 +14,20 @@ from spike4dgs.benchmark.scene.verify import verify_content
 from spike4dgs.leaderboard.season import opening
 from spike4dgs.leaderboard.season.opening import Seed, read_opening
 from spike4dgs.leaderboard.season.results import TABLE, read_result, read_results, result_path, table_text
-from spike4dgs.leaderboard.season.season_file import (
-    SEASONS,
-    HiddenScene,
-    Season,
-    is_revealed,
-    read_season,
-    season_folder,
-)
+from spike4dgs.leaderboard.season.season_file import HiddenScene, Season, is_revealed, season_folder
 from spike4dgs.leaderboard.season.training_part import write_training_part
 from spike4dgs.leaderboard.verify import verify_record
 
 _FORGED = "the published file was changed after the commitment, or is another season's"
 
 
-def check(
-    number: Positional[int],
-    *,
-    scenes: Path | None = None,
-    predictions: Path | None = None,
-    seasons: Path = SEASONS,
-) -> int:
-    """Check a season: the revealed seeds against the commitment, the scenes, and the scores.
-
-    Scenes come from the season's tars, or from `make-dataset` with the revealed seeds, whose command lines are printed.
-    Each line says what is right or what could not be checked; errors say what is wrong, and the exit code is then 2.
-
-    Args:
-        number: Number of the season.
-        scenes: Folder of the hidden scenes: ID/ as `make-dataset` makes or tar unpacks it, ID.tar, or both.
-        predictions: Folder of the scored predictions, METHOD/ID/, to score them again.
-        seasons: Folder of the public files.
-    """
-    wrong = 0
-    for one in _checks(read_season(seasons, number), seasons, scenes, predictions):
-        try:
-            print(one())
-        except UserError as e:
-            print(f"error: {e}", file=sys.stderr)
-            wrong += 1
-    return 2 if wrong else 0
-
-
-def _checks(
-    season: Season, seasons: Path, scenes: Path | None, predictions: Path | None
+def checks(
+    season: Season, seasons: Path, scenes: Path | None = None, predictions: Path | None = None
 ) -> Iterator[Callable[[], str]]:
-    """Yield the checks: each returns a line, or raises UserError for what is wrong."""
+    """Yield the checks of a season's public files, of its `scenes` and of the scored `predictions`.
+
+    Each returns a line on what is right or could not be checked, or raises UserError for what is wrong.
+    """
     yield partial(_check_seeds, season, seasons)
     yield partial(_check_results, season, seasons)
     for scene in season.scenes:

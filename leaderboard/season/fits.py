@@ -1,49 +1,19 @@
-"""`season predict`: fit methods on the training parts of hidden scenes, and render their targets. Nothing is scored."""
+"""Fit methods on the training parts of hidden scenes, and render their targets. Nothing is scored."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
-
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.locks import locked
-from spike4dgs.benchmark.method import Method, get_method, make_budget
+from spike4dgs.benchmark.method import Method, get_method
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.cell import Job, is_done, run_job
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.run import Settings, predictions_folder
-from spike4dgs.benchmark.scene.scene import Scene, open_scenes
-
-
-def predict(
-    scenes: Positional[tuple[Path, ...]],
-    *,
-    methods: tuple[str, ...],
-    out: Path = Path("runs/season"),
-    budget: str = "quick",
-    seed: int = 0,
-    device: str = "auto",
-) -> int:
-    """Fit methods on the training parts of hidden scenes, and render the targets for submission.
-
-    OUT/predictions/METHOD is what to submit. A killed run resumes where it was.
-
-    Args:
-        scenes: Training parts of the season's scenes, unpacked.
-        methods: Methods by name.
-        out: Folder for predictions, models and logs.
-        budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
-        seed: Seed of everything random.
-        device: auto, cpu or cuda.
-    """
-    chosen, on = find_chosen(methods, device)
-    failed = predict_all(open_scenes(scenes), chosen, Settings(out, seed, on, make_budget(budget)))
-    print(f"predictions: {out / 'predictions'}, a folder for each method")
-    return 1 if failed else 0
+from spike4dgs.benchmark.scene.scene import Scene
 
 
 def find_chosen(names: Sequence[str], device: str) -> tuple[list[Method], str]:

@@ -1,14 +1,11 @@
-"""`submit`: check a result record, verify it as far as its files allow, and enter it into the leaderboard."""
+"""Enter result records into the leaderboard, each verified as far as its files allow."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.environment import environment, harness, utc_now
 from spike4dgs.benchmark.errors import UserError, problem
@@ -43,9 +40,9 @@ class Files:
 
     predictions: Path | None
     scenes: tuple[Path, ...]
-    allow_gaps: bool
+    allow_gaps: bool = False
     second_renderings: SecondRenderings = no_renderings
-    refit_in: Path | None = None  # the folder of the second fit; None: it is not fitted again
+    refit: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,41 +54,19 @@ class Verified:
     missing: str
 
 
-def make_submit(second_renderings: SecondRenderings) -> Callable[..., int]:
-    """Return the command `submit`, which calls this function of another room."""
+@dataclass(frozen=True)
+class Submitted:
+    """What came of records, in lines: where they stand, what the boards do not list, and why some were refused."""
 
-    def submit(
-        result: Positional[Path],
-        *,
-        predictions: Path | None = None,
-        scenes: tuple[Path, ...] = (),
-        leaderboard: Path = Path("leaderboard"),
-        refit: bool = False,
-        replace: bool = False,
-        allow_gaps: bool = False,
-    ) -> int:
-        """Check a result record and enter it into the leaderboard.
+    standings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
 
-        With predictions and scenes, every hash and every score is computed again and the entry is labelled re-scored;
-        with --refit the method is fitted again too, and the entry is labelled re-fitted. Anything else is claimed and
-        gets no rank. A record of a track's scenes and revisions is on that track's board, any other on a local one.
-        Submitting a record twice changes nothing.
 
-        Args:
-            result: Result record, as written by score or run-benchmark.
-            predictions: The method's predictions folder, or the folder of one per scene id.
-            scenes: Scene folders of the record's dataset.
-            leaderboard: Leaderboard folder.
-            refit: Fit the method again, with the record's seed, budget and device, and compare the scores.
-            replace: Replace another record of the same method and seed.
-            allow_gaps: Accept recordings with gaps.
-        """
-        check_folder(leaderboard)
-        files = Files(predictions, scenes, allow_gaps, second_renderings, leaderboard / WORK if refit else None)
-        _enter([_verify(result, files)], leaderboard, replace)
-        return 0
-
-    return submit
+def submit(result: Path, files: Files, leaderboard: Path, replace: bool = False) -> Submitted:
+    """Verify a record as far as its files are given, and enter it. Raises UserError where it is refused."""
+    check_folder(leaderboard)
+    return _enter([_verify(result, files, leaderboard)], leaderboard, replace, None)
 
 
 def submit_all(
@@ -101,23 +76,22 @@ def submit_all(
     leaderboard: Path,
     replace: bool = False,
     allow_gaps: bool = False,
-) -> int:
-    """Submit several records, each with its predictions if there are some; print the ranks once all are entered.
+) -> Submitted:
+    """Enter several records, each with its predictions if there are some, and make the boards once.
 
-    A record that the leaderboard refuses is an error on stderr and does not stop the others. Return how many were.
+    A record that is refused does not stop the others.
     """
     check_folder(leaderboard)
-    verified, refused = [], 0
+    verified, refused = [], list[str]()
     for result, predictions in results.items():
         try:
-            verified.append(_verify(result, Files(predictions, scenes, allow_gaps)))
+            verified.append(_verify(result, Files(predictions, scenes, allow_gaps), leaderboard))
         except UserError as e:
-            print(f"error: {e}", file=sys.stderr)
-            refused += 1
-    return refused + _enter(verified, leaderboard, replace, go_on=True)
+            refused.append(str(e))
+    return _enter(verified, leaderboard, replace, refused)
 
 
-def _verify(result: Path, files: Files) -> Verified:
+def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
     """Read a record and verify it as far as its files are given."""
     record = read_record(result)
     check_no_oracle(record, result)
@@ -125,7 +99,7 @@ def _verify(result: Path, files: Files) -> Verified:
     entry_path(record)  # names that cannot be file names are refused before the work
     opened = open_scenes(files.scenes, files.allow_gaps, record["dataset"]["split"]) if files.scenes else []
     missing = _reason_not_to_verify(record, files.predictions, opened)
-    if files.refit_in and missing:
+    if files.refit and missing:
         raise problem("--refit", "predictions and scenes of a scored record", missing, "give them")
     computed = {metric for cell in record["scenes"].values() for metric in cell["computed"]}
     if files.predictions is None or missing:
@@ -133,7 +107,7 @@ def _verify(result: Path, files: Files) -> Verified:
         unverified = [m for m in METRICS if m in computed]
         return Verified(record, {"label": CLAIMED, "unverified": unverified, **nothing}, missing)
     rescored = verify_record(record, result, files.predictions, opened, files.second_renderings)
-    refit = fit_again(record, opened, files.refit_in, make_console()) if files.refit_in else None
+    refit = fit_again(record, opened, leaderboard / WORK, make_console()) if files.refit else None
     verification = {
         "label": RE_FITTED if refit else RE_SCORED,
         "unverified": [m for m in METRICS if m in rescored.unverified],
@@ -144,37 +118,33 @@ def _verify(result: Path, files: Files) -> Verified:
     return Verified(record, verification, "")
 
 
-def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, go_on: bool = False) -> int:
-    """Write entries and boards under the leaderboard's lock, and print where the records stand.
-
-    Return how many were refused; without `go_on` the first raises its UserError.
-    """
-    entered, refused = [], 0
+def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refused: list[str] | None) -> Submitted:
+    """Write entries and boards under the leaderboard's lock. Without `refused` the first refusal raises UserError."""
+    entered = []
     with lock(leaderboard):
         remove_parts(leaderboard)
         for one in verified:
             try:
                 entered.append((one, write_entry(leaderboard, one.record, one.verification, replace)))
             except UserError as e:
-                if not go_on:
+                if refused is None:
                     raise
-                print(f"error: {e}", file=sys.stderr)
-                refused += 1
+                refused.append(str(e))
         boards = write_boards(leaderboard)
+    found = Submitted(refused=refused or [])
     for one, entry in entered:
         v = entry["verification"]
         why = f" ({one.missing})" if one.missing and v["label"] == CLAIMED else ""
         if v["label"] != CLAIMED and v["unverified"]:
             why = f" (as claimed, for lack of weights: {', '.join(v['unverified'])})"
         at = standing(boards, entry_path(one.record))
-        print(f"{one.record['method']['name']}: {v['label']}{why}, {at}")
+        found.standings.append(f"{one.record['method']['name']}: {v['label']}{why}, {at}")
     places = [place_of(one.record) for one, _ in entered]
     for folder, reason in dict.fromkeys((p.folder, p.why) for p in places if not p.is_public):
-        print(f"local board, in {leaderboard / FILES[LOCAL]}, not on a track: {folder}: {reason}")
+        found.standings.append(f"local board, in {leaderboard / FILES[LOCAL]}, not on a track: {folder}: {reason}")
     for board in boards.values():
-        for item in board["refused"]:
-            print(f"warning: not listed: {leaderboard / item['entry']}: {item['reason']}", file=sys.stderr)
-    return refused
+        found.warnings.extend(f"not listed: {leaderboard / i['entry']}: {i['reason']}" for i in board["refused"])
+    return found
 
 
 def _reason_not_to_verify(record: Record, predictions: Path | None, scenes: Sequence[Scene]) -> str:

@@ -1,0 +1,197 @@
+"""`season make`, `publish`, `predict`, `score`, `reveal`, `check`: benchmarks whose scenes are hidden until the end."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import make_budget
+from spike4dgs.benchmark.metrics.selection import AUTO
+from spike4dgs.benchmark.reports.console import make_console, results_table
+from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.scene.scene import open_scenes
+from spike4dgs.leaderboard.season import publish as public
+from spike4dgs.leaderboard.season import season_file
+from spike4dgs.leaderboard.season.check import checks
+from spike4dgs.leaderboard.season.fits import find_chosen, predict_all
+from spike4dgs.leaderboard.season.make import make_season
+from spike4dgs.leaderboard.season.opening import NAME, Seed
+from spike4dgs.leaderboard.season.results import read_results, score_season
+from spike4dgs.leaderboard.season.season_file import SEASONS, read_season, season_folder
+
+
+def make(
+    number: Positional[int],
+    *,
+    worlds: tuple[str, ...],
+    secret: Path,
+    profile: str = "small",
+    closes: str | None = None,
+    hide_streams: bool = False,
+    budget: str = "quick",
+    fit_seed: int = 0,
+    workers: int = 1,
+    seasons: Path = SEASONS,
+) -> int:
+    """Draw secret seeds, make the hidden scenes of a season, and write the commitments to them.
+
+    SEASONS/NUMBER/season.json is public: commit and push it now, before anybody submits. SECRET is not. A killed
+    run continues with the same command. Nothing that is committed to is ever changed.
+
+    Args:
+        number: Number of the season, from 0 up.
+        worlds: Worlds, one hidden scene of each.
+        secret: Folder for the seeds and the scenes, which only its owner can read.
+        profile: Profile of the scenes: tiny, small or paper.
+        closes: Last day of submissions, such as 2027-01-31; they end with the reveal if left out.
+        hide_streams: Publish no training streams: methods alone can be submitted.
+        budget: Budget of methods that the maintainers run: quick, standard, paper, or a multiple of quick.
+        fit_seed: Seed of those fits.
+        workers: Processes that render.
+        seasons: Folder of the public files.
+    """
+    from spike4dgs.generators.make_dataset import make_dataset
+
+    def make_scene(seed: Seed, out: Path) -> int:
+        options = {"profile": seed.profile, "seed": int(seed.seed), "variant": seed.variant}
+        return make_dataset((seed.world,), out=out, workers=workers, **options)
+
+    folder = season_folder(seasons, number)
+    if make_season(
+        number,
+        worlds,
+        secret,
+        seasons,
+        make_scene,
+        profile=profile,
+        closes=closes,
+        hide_streams=hide_streams,
+        budget=budget,
+        fit_seed=fit_seed,
+    ):
+        path = folder / season_file.NAME
+        print(f"season {number}: commitments in {path}: commit and push them; keep {secret} secret")
+    else:
+        print(f"season {number}: complete, kept: {folder}")
+    return 0
+
+
+def publish(number: Positional[int], *, secret: Path, out: Path, seasons: Path = SEASONS) -> int:
+    """Write what may be public by now as tars: the scenes' training parts, and after the reveal the whole scenes.
+
+    Training parts have no truth: participants fit them and submit predictions. Each tar has the committed SHA-256.
+
+    Args:
+        number: Number of the season.
+        secret: Folder of `season make`.
+        out: Folder for the tars.
+        seasons: Folder of the public files.
+    """
+    for path, sha256 in public.publish(number, secret, out, seasons):
+        print(f"{sha256}  {path}")
+    return 0
+
+
+def predict(
+    scenes: Positional[tuple[Path, ...]],
+    *,
+    methods: tuple[str, ...],
+    out: Path = Path("runs/season"),
+    budget: str = "quick",
+    seed: int = 0,
+    device: str = "auto",
+) -> int:
+    """Fit methods on the training parts of hidden scenes, and render the targets for submission.
+
+    OUT/predictions/METHOD is what to submit. A killed run resumes where it was.
+
+    Args:
+        scenes: Training parts of the season's scenes, unpacked.
+        methods: Methods by name.
+        out: Folder for predictions, models and logs.
+        budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
+        seed: Seed of everything random.
+        device: auto, cpu or cuda.
+    """
+    chosen, on = find_chosen(methods, device)
+    failed = predict_all(open_scenes(scenes), chosen, Settings(out, seed, on, make_budget(budget)))
+    print(f"predictions: {out / 'predictions'}, a folder for each method")
+    return 1 if failed else 0
+
+
+def score(
+    number: Positional[int],
+    *,
+    secret: Path,
+    predictions: tuple[Path, ...] = (),
+    methods: tuple[str, ...] = (),
+    metrics: tuple[str, ...] = (AUTO,),
+    device: str = "auto",
+    seasons: Path = SEASONS,
+) -> int:
+    """Score submissions to a season: predictions of participants, and installed methods, which are run first.
+
+    Methods get the training parts alone, with the season's budget and seed. A name is scored once. Each result is in
+    SEASONS/NUMBER/results, the table in table.md: commit and push both before the reveal.
+
+    Args:
+        number: Number of the season.
+        secret: Folder of `season make`.
+        predictions: Predictions folders, each with one folder per scene id.
+        methods: Installed methods by name.
+        metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
+            are always computed.
+        device: Of the methods: auto, cpu or cuda.
+        seasons: Folder of the public files.
+    """
+    given = {"predictions": predictions, "methods": methods, "metrics": metrics}
+    table, refused = score_season(number, secret, seasons, device=device, **given)
+    for line in refused:
+        print(f"error: {line}", file=sys.stderr)
+    results = read_results(seasons, read_season(seasons, number))
+    make_console().print(results_table([result.record for result in results]))
+    print(f"table: {table}; results: {table.parent / 'results'}")
+    return 1 if refused else 0
+
+
+def reveal(number: Positional[int], *, secret: Path, seasons: Path = SEASONS) -> int:
+    """Publish the seeds of a season: SEASONS/NUMBER/opening.json, whose SHA-256 is the commitment.
+
+    It is refused before the closing day is over, and where nothing was scored. Nothing can be scored afterwards.
+
+    Args:
+        number: Number of the season.
+        secret: Folder of `season make`.
+        seasons: Folder of the public files.
+    """
+    season, path = public.reveal(number, secret, seasons), season_folder(seasons, number) / NAME
+    print(f"season {number}: seeds in {path}; `sha256sum {path}` gives the commitment {season.opening_sha256}")
+    print(f"check it with `spike4dgs season check {number}`; `season publish` now writes the whole scenes")
+    return 0
+
+
+def check(
+    number: Positional[int], *, scenes: Path | None = None, predictions: Path | None = None, seasons: Path = SEASONS
+) -> int:
+    """Check a season: the revealed seeds against the commitment, the scenes, and the scores.
+
+    Scenes come from the season's tars, or from `make-dataset` with the revealed seeds, whose command lines are printed.
+    Each line says what is right or what could not be checked; errors say what is wrong, and the exit code is then 2.
+
+    Args:
+        number: Number of the season.
+        scenes: Folder of the hidden scenes: ID/ as `make-dataset` makes or tar unpacks it, ID.tar, or both.
+        predictions: Folder of the scored predictions, METHOD/ID/, to score them again.
+        seasons: Folder of the public files.
+    """
+    wrong = 0
+    for one in checks(read_season(seasons, number), seasons, scenes, predictions):
+        try:
+            print(one())
+        except UserError as e:
+            print(f"error: {e}", file=sys.stderr)
+            wrong += 1
+    return 2 if wrong else 0

@@ -1,0 +1,69 @@
+"""`submit`: check a result record and enter it into the leaderboard."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.leaderboard import submit as work
+from spike4dgs.leaderboard.submit import Files, Submitted
+from spike4dgs.leaderboard.truth_check import Renderings
+
+
+def submit(
+    result: Positional[Path],
+    *,
+    predictions: Path | None = None,
+    scenes: tuple[Path, ...] = (),
+    leaderboard: Path = Path("leaderboard"),
+    refit: bool = False,
+    replace: bool = False,
+    allow_gaps: bool = False,
+) -> int:
+    """Check a result record and enter it into the leaderboard.
+
+    With predictions and scenes, every hash and every score is computed again and the entry is labelled re-scored;
+    with --refit the method is fitted again too, and the entry is labelled re-fitted. Anything else is claimed and
+    gets no rank. A record of a track's scenes and revisions is on that track's board, any other on a local one.
+    Submitting a record twice changes nothing.
+
+    Args:
+        result: Result record, as written by score or run-benchmark.
+        predictions: The method's predictions folder, or the folder of one per scene id.
+        scenes: Scene folders of the record's dataset.
+        leaderboard: Leaderboard folder.
+        refit: Fit the method again, with the record's seed, budget and device, and compare the scores.
+        replace: Replace another record of the same method and seed.
+        allow_gaps: Accept recordings with gaps.
+    """
+    files = Files(predictions, scenes, allow_gaps, _second_renderings, refit)
+    return _tell(work.submit(result, files, leaderboard, replace))
+
+
+def submit_all(results: Mapping[Path, Path | None], **options: Any) -> int:
+    """Submit several records, as `leaderboard.submit.submit_all` does, and print what came of it.
+
+    Return how many were refused.
+    """
+    return _tell(work.submit_all(results, **options))
+
+
+def _second_renderings(scene: Scene) -> Renderings | None:
+    from spike4dgs.generators.second_renderings import second_renderings  # Mitsuba, only where it renders
+
+    return second_renderings(scene)
+
+
+def _tell(found: Submitted) -> int:
+    for line in found.refused:
+        print(f"error: {line}", file=sys.stderr)
+    for line in found.standings:
+        print(line)
+    for line in found.warnings:
+        print(f"warning: {line}", file=sys.stderr)
+    return len(found.refused)
