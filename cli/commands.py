@@ -181,17 +181,17 @@ COMMANDS: dict[str, Command] = {
         "verify data/car-0-small",
     ),
     "import-dat": Command(
-        "spike4dgs.benchmark.exchange.dat:import_dat",
+        "spike4dgs.cli.import_dat:import_dat",
         "make a folder of streams or a scene from bare .dat files, with cameras of COLMAP, OpenCV or Kalibr",
         "import-dat recordings --width 400 --height 250 --rate-hz 20000 --cameras camchain.yaml --out data/first",
     ),
     "import-spikecv": Command(
-        "spike4dgs.benchmark.exchange.spikecv:import_spikecv",
+        "spike4dgs.cli.spikecv:import_spikecv",
         "make a scene folder from a SpikeCV folder",
         "import-spikecv motVidarReal2020/rotation1 --out data/rotation1 --rate-hz 20000",
     ),
     "export-spikecv": Command(
-        "spike4dgs.benchmark.exchange.spikecv:export_spikecv",
+        "spike4dgs.cli.spikecv:export_spikecv",
         "write a scene's streams as a SpikeCV folder",
         "export-spikecv data/car-0-small --out car-spikecv",
     ),

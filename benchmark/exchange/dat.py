@@ -1,85 +1,44 @@
-"""`import-dat`: bare `.dat` streams, one for each camera, as a folder of streams or a scene."""
+"""Bare `.dat` streams, one for each camera, become a folder of streams or a scene.
+
+No header, 1 bit per pixel, row-major, least significant bit first; a tick takes ceil(width * height / 8) bytes.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.camera_files import read_camera_files
-from spike4dgs.benchmark.exchange.spikecv import write_recorded_scene
+from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write_recording
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.writer import stream_name
-from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
 from spike4dgs.benchmark.untrusted.names import check_ids
-from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN, MAX_HZ, MAX_SIDE
+from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
 
 _TICKS = 4096  # copied at a time
 
 
 def import_dat(
-    path: Positional[Path],
-    *,
-    width: int,
-    height: int,
-    rate_hz: float,
-    out: Path,
-    cameras: Path | None = None,
-    radiance_gain: float = 1.0,
-    rows_top_down: bool = False,
-    licence: str = "unknown",
-) -> int:
-    """Import a bare .dat file, or a folder of them (one per camera), as a folder of streams or a scene folder.
+    path: Path, out: Path, *, width: int, height: int, recording: Recording, cameras: Path | None = None
+) -> dict[str, SpikeStream]:
+    """Import a bare .dat file, or a folder of them (one per camera), to a new folder; return its streams.
 
-    The layout is that of `inspect` and of SpikeCV: no header, 1 bit per pixel, row-major, least significant bit first;
-    a tick takes ceil(width * height / 8) bytes. Without cameras the result is the streams and a stream.json, which
-    `inspect` and `calibrate-rig` read. With cameras it is a scene whose cameras are all for training.
-
-    Cameras come from a COLMAP model (its folder, text or binary), from OpenCV (a YAML or XML file with a map for each
-    camera, or a folder of files, one for each), or from Kalibr (camchain.yaml). They are named like the .dat files.
-    Lens distortion by OpenCV's k1, k2, p1, p2, k3 is kept (COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV, Kalibr's radtan).
-    Another lens, such as a fisheye, is refused where it distorts by 0.05 px or more.
-
-    Args:
-        path: A .dat file, or a folder of them; a camera is called like its file.
-        width: Pixels per row.
-        height: Rows.
-        rate_hz: Ticks per second.
-        out: New folder to write.
-        cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file. COLMAP's unit of length is any; a scene's
-            is the metre.
-        radiance_gain: Spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per tick.
-        rows_top_down: The files store the top row first. The usual order of this camera is bottom row first.
-        licence: Licence of the recording.
+    With `cameras` (COLMAP, OpenCV, Kalibr) it is a scene, else a folder of streams. Raises UserError before anything is
+    written where files or cameras do not fit.
     """
-    if not (0 < rate_hz <= MAX_HZ and 0 < radiance_gain <= MAX_GAIN):
-        found = f"{rate_hz:g}, {radiance_gain:g}"
-        raise problem("--rate-hz and --radiance-gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
+    recording.check()
     if max(width, height) > MAX_SIDE:
         raise problem("--width and --height", f"at most {MAX_SIDE}", f"{width}, {height}", "correct it")
     files = {file.stem: file for file in _dat_files(path)}
     check_ids(files, "camera", path, "rename the .dat file, after which the camera is called")
-    sources = {
-        name: open_stream(file, width, height, rate_hz, rows_bottom_up=not rows_top_down)
-        for name, file in files.items()
-    }
-    found_cameras = None if cameras is None else _cameras(cameras, sources, (width, height))
+    rate_hz, bottom_up = recording.rate_hz, not recording.rows_top_down
+    sources = {n: open_stream(file, width, height, rate_hz, rows_bottom_up=bottom_up) for n, file in files.items()}
+    found = None if cameras is None else _cameras(cameras, sources, (width, height))
     check_new(out)
-    streams = {}
-    for name, source in sources.items():
-        target = out / (f"{name}.dat" if found_cameras is None else stream_name(name))
-        streams[name] = _copied(source, target)
-        print(f"{target}: {source.n_ticks} ticks of {width}x{height}")
-    if found_cameras is None:
-        write_stream_folder(out, streams, {"source": {"kind": "dat"}})
-        print(f"{out}: a folder of streams without poses")
-    else:
-        write_recorded_scene(out, found_cameras, streams, radiance_gain, licence, "dat")
-        print(f"{out}: a scene of {len(streams)} training cameras")
-    return 0
+    streams = {name: _copied(source, stream_path(out, name, found)) for name, source in sources.items()}
+    write_recording(out, streams, found, recording, "dat")
+    return streams
 
 
 def _dat_files(path: Path) -> list[Path]:

@@ -16,17 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write_recording
 from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
-from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
-from spike4dgs.benchmark.spikes.folder import write_stream_folder
+from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, UInt8, open_stream
 from spike4dgs.benchmark.untrusted.names import check_ids, inside
-from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN, MAX_HZ, MAX_SIDE, shown
+from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE, shown
 from spike4dgs.benchmark.untrusted.yaml_file import read_yaml
 
 CONFIG = "config.yaml"
@@ -44,79 +42,39 @@ class _Source:
 
 
 def import_spikecv(
-    folder: Positional[Path],
-    out: Path,
-    rate_hz: float,
-    transforms: Path | None = None,
-    radiance_gain: float = 1.0,
-    rows_top_down: bool = False,
-    licence: str = "unknown",
-) -> int:
-    """Import a SpikeCV folder, or a folder of them (one per camera), as a scene folder or a folder of streams.
+    folder: Path, out: Path, recording: Recording, transforms: Path | None = None
+) -> dict[str, SpikeStream]:
+    """Import a SpikeCV folder, or a folder of them (one per camera), to a new folder; return its streams.
 
-    With poses the result is a scene whose cameras are all for training and that has no scored images; without, it is
-    the streams and a stream.json, which `inspect` reads. Labels are not imported. Streams whose H*W is no multiple of
-    8 are packed anew, because ours begin every tick on a whole byte.
-
-    spike4dgs import-spikecv motVidarReal2020/rotation1 --out data/rotation1 --rate-hz 20000
-
-    Args:
-        folder: Folder with config.yaml, or with one such folder per camera; the camera is called like its folder.
-        out: New folder to write.
-        rate_hz: Ticks per second, which SpikeCV does not record.
-        transforms: nerfstudio file (JSON) with intrinsics and a pose for each camera, named by the key "camera".
-        radiance_gain: Spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per tick.
-        rows_top_down: The file stores the top row first. The usual order of this camera is bottom row first.
-        licence: Licence of the recording.
+    With a nerfstudio file of poses it is a scene, else a folder of streams. Raises UserError before anything is written
+    where a folder is damaged, or the poses do not fit.
     """
-    if not (0 < rate_hz <= MAX_HZ and 0 < radiance_gain <= MAX_GAIN):
-        found = f"{rate_hz:g}, {radiance_gain:g}"
-        raise problem("rate_hz and radiance_gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
+    recording.check()
     sources = {path.name: _read_config(path) for path in _spikecv_folders(folder)}
     check_ids(sources, "camera", folder, "rename the camera's folder")
     cameras = None if transforms is None else _read_poses(transforms, sources)
     check_new(out)
     streams = {}
     for camera, source in sources.items():
-        target = out / (f"{camera}.dat" if cameras is None else stream_name(camera))
-        with SpikeWriter(target, source.width, source.height) as writer:
+        target, size = stream_path(out, camera, cameras), (source.width, source.height)
+        with SpikeWriter(target, *size) as writer:
             for packed in _read_ticks(source):
                 writer.write(packed)
-        size = (source.width, source.height)
-        streams[camera] = open_stream(target, *size, rate_hz, rows_bottom_up=not rows_top_down)
-        print(f"{target}: {source.n_ticks} ticks of {source.width}x{source.height}")
-    if cameras is None:
-        write_stream_folder(out, streams)
-    else:
-        write_recorded_scene(out, cameras, streams, radiance_gain, licence, "spikecv")
-    return 0
+        streams[camera] = open_stream(target, *size, recording.rate_hz, rows_bottom_up=not recording.rows_top_down)
+    write_recording(out, streams, cameras, recording, "spikecv")
+    return streams
 
 
-def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False) -> int:
-    """Write the streams of a scene as SpikeCV folders, one per camera, rows bottom-up (SpikeCV's default).
-
-    SpikeCV does not store the rate, the poses, the clock, the radiance gain, gaps and the scored images: they are left
-    out. Streams whose H*W is no multiple of 8 are packed anew without padding, as SpikeCV counts bytes.
-
-    spike4dgs export-spikecv data/car-0-small --out car-spikecv
-
-    Args:
-        scene: Scene folder.
-        out: New folder; each camera becomes a folder in it.
-        allow_gaps: Export a recording with gaps all the same.
-    """
-    opened = open_scene(scene, allow_gaps)
+def export_spikecv(scene: Scene, out: Path) -> None:
+    """Write the streams of a scene as SpikeCV folders OUT/CAMERA, rows bottom-up (SpikeCV's default)."""
     check_new(out)
-    for camera in opened.meta["streams"]:
-        stream = opened.stream(camera)
+    for camera in scene.meta["streams"]:
+        stream = scene.stream(camera)
         with atomic_path(out / camera / f"{camera}.dat") as part, open(part, "wb") as file:
             for start in range(0, stream.n_ticks, _TICKS):
                 spikes = stream.window(start, min(start + _TICKS, stream.n_ticks))
                 file.write(np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").data)
         write_text(out / camera / CONFIG, _config(camera, stream))
-        print(f"{out / camera}: {stream.n_ticks} ticks of {stream.width}x{stream.height}")
-    print(f"not in SpikeCV's format: {opened.rate_hz:g} ticks per second, poses, clock, gain, scored images")
-    return 0
 
 
 def _config(camera: str, stream: SpikeStream) -> str:
@@ -203,38 +161,3 @@ def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
         found = " and ".join(f"{w}x{h}x{n}" for w, h, n in shapes)
         raise problem(path, "streams of one size and length for one scene", found, "cut them to one length")
     return tuple(cameras[name] for name in sorted(sources))
-
-
-def write_recorded_scene(
-    out: Path,
-    cameras: tuple[Camera, ...],
-    streams: dict[str, SpikeStream],
-    radiance_gain: float,
-    licence: str,
-    kind: str,
-) -> None:
-    """Describe streams of one length, which are already in `out`, as a scene without truth; all cameras train.
-
-    `kind` is the source in scene.json.
-    """
-    first = streams[cameras[0].id]
-    name = out.resolve().name
-    finish_scene(
-        out,
-        SceneDescription(
-            id=name,
-            title=f"Recording {name}",
-            licence=licence,
-            cameras=cameras,
-            train=tuple(c.id for c in cameras),
-            test=(),
-            rate_hz=first.rate_hz,
-            n_ticks=first.n_ticks,
-            radiance_gain=radiance_gain,
-            targets=(),
-            sensor={"model": "unknown", "rows_bottom_up": first.rows_bottom_up},
-            source={"kind": kind},
-            clock={"t0_ns": 0, "source": "unknown"},
-            sync={"method": "unknown", "max_error_us": None},
-        ),
-    )

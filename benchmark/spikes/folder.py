@@ -20,7 +20,7 @@ NAME = "stream.json"
 _SCHEMA = "spike4dgs-streams/1"
 
 
-def write_stream_folder(root: Path, streams: dict[str, SpikeStream], facts: Mapping[str, Any] | None = None) -> None:
+def write_stream_folder(root: Path, streams: Mapping[str, SpikeStream], facts: Mapping[str, Any] | None = None) -> None:
     """Describe streams, which are already in `root` as `CAMERA.dat`, in stream.json.
 
     `facts` are what else is known of the recording: clock, sync, source.

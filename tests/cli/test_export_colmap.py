@@ -13,6 +13,7 @@ from small_scenes import HEIGHT, WIDTH
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.dat import import_dat
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -51,7 +52,7 @@ def test_the_way_there_and_back(small_scene: Path, tmp_path: Path, capsys: pytes
     (tmp_path / "in").mkdir()
     for camera in ("cam_00", "cam_01", "cam_02"):
         (tmp_path / f"in/{camera}.dat").write_bytes((small_scene / f"spikes/{camera}.dat").read_bytes())
-    size = {"width": WIDTH, "height": HEIGHT, "rate_hz": 20000.0}
+    size = {"width": WIDTH, "height": HEIGHT, "recording": Recording(20000.0)}
     import_dat(tmp_path / "in", **size, cameras=tmp_path / "out/sparse/0", out=tmp_path / "back")
     scene, back = open_scene(small_scene), open_scene(tmp_path / "back")
     for camera in back.cameras.values():

@@ -14,6 +14,7 @@ from small_scenes import TICKS, array_cameras
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
@@ -136,8 +137,8 @@ def test_a_recording_without_ground_truth_has_no_test_images(
 ) -> None:
     poses = {"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}
     (tmp_path / "poses.json").write_text(json.dumps(poses))
-    export_spikecv(small_scene, tmp_path / "spikecv")
-    import_spikecv(tmp_path / "spikecv", tmp_path / "back", rate_hz=20000.0, transforms=tmp_path / "poses.json")
+    export_spikecv(open_scene(small_scene), tmp_path / "spikecv")
+    import_spikecv(tmp_path / "spikecv", tmp_path / "back", Recording(20000.0), tmp_path / "poses.json")
     export_nerfstudio(tmp_path / "back", tmp_path / "export")
     assert len(load(tmp_path / "export", "train")) == 16 and not (tmp_path / "export/transforms_test.json").exists()
     assert "no transforms_test.json: the scene has no such images" in capsys.readouterr().out

@@ -376,15 +376,16 @@ def read_imports(folder: Path, out: Path) -> None:
 
     from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.exchange.dat import import_dat
+    from spike4dgs.benchmark.exchange.recording import Recording
     from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 
     refused = None
     for name in ("colmap", "colmap-text", "opencv.yml", "opencv.xml", "kalibr.yaml", "spikecv"):
         try:
             if name == "spikecv":
-                import_spikecv(folder / name, out / name, 20000.0)
+                import_spikecv(folder / name, out / name, Recording(20000.0))
             else:
-                size = {"width": WIDTH, "height": HEIGHT, "rate_hz": 20000.0}
+                size = {"width": WIDTH, "height": HEIGHT, "recording": Recording(20000.0)}
                 import_dat(folder / "in", **size, out=out / name, cameras=folder / name)
         except UserError as e:
             refused = e

@@ -16,6 +16,7 @@ from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras, shared_file
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.dat import import_dat
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
@@ -24,7 +25,8 @@ from spike4dgs.cli import main
 
 CAMERAS = array_cameras(3)
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
-SIZE: Any = {"width": WIDTH, "height": HEIGHT, "rate_hz": 20000.0}
+SIZE: Any = {"width": WIDTH, "height": HEIGHT}
+STATED: Any = SIZE | {"recording": Recording(20000.0)}
 BENT = np.array([0.2, 0, 0, 0, 0])  # moves the corners by pixels
 SLIGHT = BENT * 1e-3
 
@@ -92,11 +94,11 @@ def write_kalibr(path: Path, lens: str = "radtan", coefficients: Sequence[float]
 
 def test_a_file_without_cameras_becomes_a_folder_of_streams(tmp_path: Path) -> None:
     spikes = write_streams(tmp_path / "in", ["left"])["left"]
-    assert import_dat(tmp_path / "in" / "left.dat", **SIZE, out=tmp_path / "out") == 0
+    assert set(import_dat(tmp_path / "in" / "left.dat", **STATED, out=tmp_path / "out")) == {"left"}
     (stream,) = open_stream_folder(tmp_path / "out").values()
     assert (stream.rate_hz, stream.n_ticks) == (20000.0, TICKS)
     np.testing.assert_array_equal(stream.window(0, TICKS), spikes)
-    import_dat(tmp_path / "in", **SIZE, out=tmp_path / "top", rows_top_down=True)
+    import_dat(tmp_path / "in", **SIZE, recording=Recording(20000.0, rows_top_down=True), out=tmp_path / "top")
     np.testing.assert_array_equal(open_stream_folder(tmp_path / "top")["left"].window(0, TICKS), spikes[:, ::-1])
 
 
@@ -104,7 +106,9 @@ def test_colmap_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     spikes = write_streams(tmp_path / "in", ["cam_00", "cam_02"])
     for kind in ("text", "binary"):
         model = write_colmap(tmp_path / kind)
-        import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / f"{kind}-out", radiance_gain=0.5)
+        import_dat(
+            tmp_path / "in", **SIZE, recording=Recording(20000.0, 0.5), cameras=model, out=tmp_path / f"{kind}-out"
+        )
         assert "no stream of cam_01: left out" in capsys.readouterr().out
         scene = open_scene(tmp_path / f"{kind}-out")
         assert scene.train == ("cam_00", "cam_02") and scene.test == () and scene.radiance_gain == 0.5
@@ -120,14 +124,14 @@ def test_images_of_a_colmap_camera_agree(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", ["cam_00"])
     model = write_colmap(tmp_path / "binary", names=["cam_00/000001.png", "cam_00/000002.png", "cam_01/000001.png"])
     with pytest.raises(UserError, match="one camera and pose for all images of cam_00, found another in cam_00/000002"):
-        import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=model, out=tmp_path / "out")
 
 
 @pytest.mark.parametrize("suffix", ["yml", "yaml", "xml"])
 def test_opencv_cameras(tmp_path: Path, suffix: str) -> None:
     write_streams(tmp_path / "in", [c.id for c in CAMERAS])
     path = write_opencv(tmp_path / f"cameras.{suffix}", SLIGHT * 0, vector=suffix == "xml")
-    import_dat(tmp_path / "in", **SIZE, cameras=path, out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=path, out=tmp_path / "out")
     cameras = open_scene(tmp_path / "out").cameras
     for c in CAMERAS:
         uv = cv2.projectPoints(POINTS, cv2.Rodrigues(c.R)[0], c.t, opencv_matrix(c), np.zeros(5))[0].reshape(-1, 2)
@@ -142,7 +146,7 @@ def test_a_folder_of_opencv_files_has_one_camera_each(tmp_path: Path) -> None:
     for key, value in {"K": opencv_matrix(c), "D": np.zeros((1, 5)), "rvec": cv2.Rodrigues(c.R)[0], "t": c.t}.items():
         file.write(key, value)
     file.release()
-    import_dat(tmp_path / "in", **SIZE, cameras=tmp_path / "calibration", out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "calibration", out=tmp_path / "out")
     found = open_scene(tmp_path / "out").cameras[c.id]
     np.testing.assert_allclose(found.w2c, c.w2c, atol=1e-12)
     np.testing.assert_allclose(found.K, c.K, atol=1e-9)
@@ -150,7 +154,7 @@ def test_a_folder_of_opencv_files_has_one_camera_each(tmp_path: Path) -> None:
 
 def test_kalibr_cameras_are_seen_from_the_first(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", [c.id for c in CAMERAS])
-    import_dat(tmp_path / "in", **SIZE, cameras=write_kalibr(tmp_path / "camchain.yaml"), out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=write_kalibr(tmp_path / "camchain.yaml"), out=tmp_path / "out")
     cameras = open_scene(tmp_path / "out").cameras
     np.testing.assert_allclose(cameras["cam_00"].w2c, np.eye(4), atol=1e-12)
     first = POINTS @ CAMERAS[0].R.T + CAMERAS[0].t  # the points in the first camera's coordinates
@@ -173,7 +177,7 @@ def test_lens_distortion_is_kept(tmp_path: Path, kind: str, capsys: pytest.Captu
     c = CAMERAS[0]
     radius = np.hypot(c.width / 2, c.height / 2)
     expected = BENT[0] * (radius / c.fx) ** 2 * radius
-    import_dat(tmp_path / "in", **SIZE, cameras=written("bent", BENT), out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=written("bent", BENT), out=tmp_path / "out")
     assert f"cam_00: its lens moves pixels by up to {expected:.2f} px" in capsys.readouterr().out
     scene = open_scene(tmp_path / "out")
     first = CAMERAS[0].w2c if kind == "kalibr" else np.eye(4)  # Kalibr's world is the first camera's
@@ -181,7 +185,7 @@ def test_lens_distortion_is_kept(tmp_path: Path, kind: str, capsys: pytest.Captu
     for c in CAMERAS:
         uv = cv2.projectPoints(POINTS, cv2.Rodrigues(c.R)[0], c.t, opencv_matrix(c), BENT)[0].reshape(-1, 2)
         assert np.abs(scene.cameras[c.id].project(points)[0] - (uv + 0.5)).max() < 1e-5
-    import_dat(tmp_path / "in", **SIZE, cameras=written("slight", SLIGHT), out=tmp_path / "slight-out")
+    import_dat(tmp_path / "in", **STATED, cameras=written("slight", SLIGHT), out=tmp_path / "slight-out")
     assert f"cam_02: lens distortion of at most {expected / 1000:.3f} px is left out" in capsys.readouterr().out
     assert not open_scene(tmp_path / "slight-out").cameras["cam_02"].distortion
 
@@ -198,7 +202,7 @@ def test_radial_colmap_cameras(tmp_path: Path, model: str, lens: list[float]) ->
     made.add_image_with_trivial_frame(pycolmap.Image(image_id=1, camera_id=1, name="cam_00"), pose)
     (tmp_path / "model").mkdir()
     made.write_binary(str(tmp_path / "model"))
-    import_dat(tmp_path / "in", **SIZE, cameras=tmp_path / "model", out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "model", out=tmp_path / "out")
     expected = np.array([made.image(1).project_point(p) for p in POINTS])
     assert np.abs(open_scene(tmp_path / "out").cameras["cam_00"].project(POINTS)[0] - expected).max() < 1e-6
 
@@ -209,13 +213,13 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
     expected = radius - c.fx * np.arctan(radius / c.fx)
     fisheye = write_kalibr(tmp_path / "camchain.yaml", "equidistant")
     with pytest.raises(UserError, match=f"found another one, with {expected:.2f} px, in cam_00"):
-        import_dat(tmp_path / "in", **SIZE, cameras=fisheye, out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=fisheye, out=tmp_path / "out")
     rational = write_opencv(tmp_path / "rational.yml", np.array([0.1, 0, 0, 0, 0, 0.3, 0, 0]))
     with pytest.raises(UserError, match=r"expected OpenCV's lens model \(k1, k2, p1, p2, k3\)"):
-        import_dat(tmp_path / "in", **SIZE, cameras=rational, out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=rational, out=tmp_path / "out")
     folded = write_opencv(tmp_path / "folded.yml", np.array([-3.0, 0, 0, 0]))
     with pytest.raises(UserError, match="a lens of cam_00 whose model holds up to the image's corners"):
-        import_dat(tmp_path / "in", **SIZE, cameras=folded, out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=folded, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -281,15 +285,15 @@ def test_streams_of_other_lengths_are_no_scene(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", ["cam_00"])
     pack(np.zeros((3, HEIGHT, WIDTH), bool)).tofile(tmp_path / "in" / "cam_01.dat")
     with pytest.raises(UserError, match="one length for one scene, found 3 ticks and 80 ticks"):
-        import_dat(tmp_path / "in", **SIZE, cameras=write_colmap(tmp_path / "m"), out=tmp_path / "out")
-    assert import_dat(tmp_path / "in", **SIZE, out=tmp_path / "out") == 0, "without poses each has its length"
+        import_dat(tmp_path / "in", **STATED, cameras=write_colmap(tmp_path / "m"), out=tmp_path / "out")
+    assert import_dat(tmp_path / "in", **STATED, out=tmp_path / "out"), "without poses each has its length"
     with pytest.raises(UserError, match="a folder with .dat files"):
-        import_dat(tmp_path, **SIZE, out=tmp_path / "other")
+        import_dat(tmp_path, **STATED, out=tmp_path / "other")
 
 
 def test_the_real_recording_comes_in_unchanged(tmp_path: Path) -> None:
     path = shared_file("data/real_spikes/car_100kmh_250x400_200f.dat")
-    import_dat(path, width=400, height=250, rate_hz=40000.0, out=tmp_path / "out")
+    import_dat(path, width=400, height=250, recording=Recording(40000.0), out=tmp_path / "out")
     assert (tmp_path / "out" / path.name).read_bytes() == path.read_bytes()
     (stream,) = open_stream_folder(tmp_path / "out").values()
     assert stream.counts(0, 200).mean() / 200 == pytest.approx(0.366, abs=5e-4)
@@ -301,7 +305,7 @@ def test_a_models_points_rigs_and_frames_are_not_read(tmp_path: Path) -> None:
     model = write_colmap(tmp_path / "binary")
     for name in ("points3D.bin", "rigs.bin", "frames.bin"):
         (model / name).write_bytes(b"\xff" * 200)
-    import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / "out")
+    import_dat(tmp_path / "in", **STATED, cameras=model, out=tmp_path / "out")
     for name, camera in open_scene(tmp_path / "out").cameras.items():
         expected = next(c for c in CAMERAS if c.id == name)
         np.testing.assert_allclose(camera.w2c, expected.w2c, atol=1e-12)
@@ -317,7 +321,7 @@ def test_images_with_points_are_read_without_them(tmp_path: Path) -> None:
         folder = tmp_path / kind
         folder.mkdir()
         model.write_text(str(folder)) if kind == "text" else model.write_binary(str(folder))
-        import_dat(tmp_path / "in", **SIZE, cameras=folder, out=tmp_path / f"{kind}-out")
+        import_dat(tmp_path / "in", **STATED, cameras=folder, out=tmp_path / f"{kind}-out")
         found = open_scene(tmp_path / f"{kind}-out").cameras["cam_00"]
         np.testing.assert_allclose(found.w2c, CAMERAS[0].w2c, atol=1e-9)
 
@@ -330,7 +334,7 @@ def test_matrices_that_contradict_themselves(tmp_path: Path, facts: str) -> None
     (tmp_path / "left.yml").write_text(text)
     write_streams(tmp_path / "in", ["left"])
     with pytest.raises(UserError, match="expected a matrix camera_matrix of left"):
-        import_dat(tmp_path / "in", **SIZE, cameras=tmp_path / "left.yml", out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "left.yml", out=tmp_path / "out")
 
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
@@ -340,4 +344,4 @@ def test_an_images_name_that_is_no_text(tmp_path: Path, kind: str) -> None:
     path.write_bytes(path.read_bytes().replace(b"cam_01.png", b"cam_\x9e1.png"))
     write_streams(tmp_path / "in", ["cam_00"])
     with pytest.raises(UserError, match="found a damaged one .*can't decode byte 0x9e"):
-        import_dat(tmp_path / "in", **SIZE, cameras=model, out=tmp_path / "out")
+        import_dat(tmp_path / "in", **STATED, cameras=model, out=tmp_path / "out")

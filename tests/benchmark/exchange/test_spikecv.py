@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,13 @@ from hypothesis import strategies as st
 from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import pack
+from spike4dgs.cli import main
 
 
 def write_spikecv(folder: Path, spikes: np.ndarray) -> Path:
@@ -40,7 +43,7 @@ def test_import_of_any_size_and_length(
 ) -> None:
     root = tmp_path_factory.mktemp("spikecv")
     spikes = random_spikes(n, height, width, seed)
-    assert import_spikecv(write_spikecv(root / "cam", spikes), root / "out", rate_hz=40000.0) == 0
+    import_spikecv(write_spikecv(root / "cam", spikes), root / "out", Recording(40000.0))
     stream = open_stream_folder(root / "out")["cam"]
     assert (stream.rate_hz, stream.n_ticks, stream.rows_bottom_up) == (40000.0, n, True)
     np.testing.assert_array_equal(stream.window(0, n), spikes)
@@ -50,19 +53,20 @@ def test_import_of_any_size_and_length(
 
 def test_rows_stored_top_down(tmp_path: Path) -> None:
     spikes = random_spikes(9, 5, 11)
-    import_spikecv(write_spikecv(tmp_path / "cam", spikes), tmp_path / "out", rate_hz=1.0, rows_top_down=True)
+    import_spikecv(write_spikecv(tmp_path / "cam", spikes), tmp_path / "out", Recording(1.0, rows_top_down=True))
     np.testing.assert_array_equal(open_stream_folder(tmp_path / "out")["cam"].window(0, 9), spikes[:, ::-1])
 
 
 def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert export_spikecv(small_scene, tmp_path / "spikecv") == 0
+    assert main(["export-spikecv", str(small_scene), "--out", str(tmp_path / "spikecv")]) == 0
     assert "not in SpikeCV's format: 20000 ticks per second" in capsys.readouterr().out
     config = yaml.safe_load((tmp_path / "spikecv/cam_01/config.yaml").read_text())
     assert (config["filename"], config["spike_w"], config["spike_h"]) == ("cam_01.dat", WIDTH, HEIGHT)
     transforms = tmp_path / "poses.json"
     transforms.write_text(json.dumps({"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}))
-    arguments = {"rate_hz": 20000.0, "transforms": transforms, "radiance_gain": 0.6}
-    assert import_spikecv(tmp_path / "spikecv", tmp_path / "back", **arguments) == 0
+    arguments = ["--rate-hz", "20000", "--transforms", str(transforms), "--radiance-gain", "0.6"]
+    assert main(["import-spikecv", str(tmp_path / "spikecv"), "--out", str(tmp_path / "back"), *arguments]) == 0
+    assert f"{tmp_path}/back/spikes/cam_00.dat: {TICKS} ticks of {WIDTH}x{HEIGHT}" in capsys.readouterr().out
     scene, back = open_scene(small_scene), open_scene(tmp_path / "back")
     assert (back.n_ticks, back.rate_hz, back.radiance_gain, back.targets) == (TICKS, 20000.0, 0.6, ())
     assert back.train == tuple(scene.cameras) and back.test == ()
@@ -81,10 +85,9 @@ def test_export_has_no_padding_and_rows_bottom_up(tmp_path: Path) -> None:
     pose = {"camera": "cam", "transform_matrix": top.pop("transform_matrix")}
     transforms.write_text(json.dumps({**top, "frames": [pose]}))  # intrinsics once at the top
     source = write_spikecv(tmp_path / "cam", spikes[:, ::-1])
-    arguments = {"rate_hz": 20000.0, "transforms": transforms, "rows_top_down": True}
-    import_spikecv(source, tmp_path / "scene", **arguments)
+    import_spikecv(source, tmp_path / "scene", Recording(20000.0, rows_top_down=True), transforms)
     assert (tmp_path / "scene/spikes/cam.dat").read_bytes() == pack(spikes, rows_bottom_up=False).tobytes()
-    export_spikecv(tmp_path / "scene", tmp_path / "out")
+    export_spikecv(open_scene(tmp_path / "scene"), tmp_path / "out")
     expected = np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tobytes()
     assert (tmp_path / "out/cam/cam.dat").read_bytes() == expected
 
@@ -97,12 +100,12 @@ def test_a_scene_of_any_size_goes_out_and_comes_back(
     root, spikes = tmp_path_factory.mktemp("spikecv"), random_spikes(n, height, width, seed)
     poses = {"frames": [{"camera": "cam", **to_nerfstudio(array_cameras(1, width, height)[0])}]}
     (root / "poses.json").write_text(json.dumps(poses))
-    known = {"rate_hz": 20000.0, "transforms": root / "poses.json"}
+    known = Recording(20000.0), root / "poses.json"
     source = write_spikecv(root / "cam", spikes[:, ::-1] if top_down else spikes)
-    import_spikecv(source, root / "scene", rows_top_down=top_down, **known)
+    import_spikecv(source, root / "scene", replace(known[0], rows_top_down=top_down), known[1])
     np.testing.assert_array_equal(open_scene(root / "scene").stream("cam").window(0, n), spikes)
-    export_spikecv(root / "scene", root / "out")
-    import_spikecv(root / "out", root / "back", **known)
+    export_spikecv(open_scene(root / "scene"), root / "out")
+    import_spikecv(root / "out", root / "back", *known)
     np.testing.assert_array_equal(open_scene(root / "back").stream("cam").window(0, n), spikes)
 
 
@@ -123,7 +126,7 @@ def test_bad_folders_are_refused_before_anything_is_written(tmp_path: Path, conf
     folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
     (folder / "config.yaml").unlink() if config is None else (folder / "config.yaml").write_text(config)
     with pytest.raises(UserError, match=message) as error:
-        import_spikecv(folder, tmp_path / "out", rate_hz=20000.0)
+        import_spikecv(folder, tmp_path / "out", Recording(20000.0))
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
 
 
@@ -134,7 +137,7 @@ def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
 
     def attempt(*frames: dict[str, object]) -> None:
         (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
-        import_spikecv(tmp_path / "in", tmp_path / "out", rate_hz=1.0, transforms=tmp_path / "poses.json")
+        import_spikecv(tmp_path / "in", tmp_path / "out", Recording(1.0), tmp_path / "poses.json")
 
     pose = to_nerfstudio(camera)
     with pytest.raises(UserError, match=r"found none for cam_01 \(it has cam_00\)"):
@@ -149,11 +152,12 @@ def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
 def test_other_refusals(tmp_path: Path, small_scene: Path) -> None:
     folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
     with pytest.raises(UserError, match="expected positive numbers, at most 1e.09, found 0, 1"):
-        import_spikecv(folder, tmp_path / "out", rate_hz=0)
-    for command in (lambda: import_spikecv(folder, folder, rate_hz=1.0), lambda: export_spikecv(small_scene, folder)):
+        import_spikecv(folder, tmp_path / "out", Recording(0))
+    scene = open_scene(small_scene)
+    for command in (lambda: import_spikecv(folder, folder, Recording(1.0)), lambda: export_spikecv(scene, folder)):
         with pytest.raises(UserError, match="expected a new or empty folder"):
             command()
-    import_spikecv(folder, tmp_path / "out", rate_hz=1.0)
+    import_spikecv(folder, tmp_path / "out", Recording(1.0))
     with open(tmp_path / "out/cam.dat", "ab") as file:
         file.truncate(7 * 7)
     with pytest.raises(UserError, match="cam.dat: expected 9 ticks, found 7; the stream is truncated"):

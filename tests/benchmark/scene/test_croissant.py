@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from small_scenes import array_cameras, write_small_scene
 
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
 from spike4dgs.benchmark.scene.manifest import read_manifest
@@ -76,8 +77,8 @@ def test_further_contents_are_listed(small_scene: Path, tmp_path: Path) -> None:
 def test_a_scene_without_images_validates_too(small_scene: Path, tmp_path: Path) -> None:
     poses = {"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}
     (tmp_path / "poses.json").write_text(json.dumps(poses))
-    export_spikecv(small_scene, tmp_path / "spikecv")
-    import_spikecv(tmp_path / "spikecv", tmp_path / "back", rate_hz=20000.0, transforms=tmp_path / "poses.json")
+    export_spikecv(open_scene(small_scene), tmp_path / "spikecv")
+    import_spikecv(tmp_path / "spikecv", tmp_path / "back", Recording(20000.0), tmp_path / "poses.json")
     dataset = load(tmp_path / "back")
     assert not dataset.metadata.ctx.issues.errors and not dataset.metadata.record_sets
     assert dataset.metadata.license == ["unknown"] and not dataset.metadata.creators

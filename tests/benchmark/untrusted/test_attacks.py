@@ -17,6 +17,7 @@ from small_scenes import write_small_scene
 from submissions import submit
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 from spike4dgs.benchmark.files import MOST_BYTES, parse_json, read_json
 from spike4dgs.benchmark.metrics.selection import select_metrics
@@ -248,7 +249,7 @@ def test_folders_of_streams_and_of_spikecv(tmp_path: Path) -> None:
     refused(lambda: open_stream_folder(tmp_path / "in"), "expected a path inside in, found '../secret.dat'")
     (tmp_path / "cv").mkdir()
     (tmp_path / "cv/config.yaml").write_text("filename: ../secret.dat\nspike_w: 40\nspike_h: 24\n")
-    refused(lambda: import_spikecv(tmp_path / "cv", tmp_path / "out", 2e4), "expected a path inside cv")
+    refused(lambda: import_spikecv(tmp_path / "cv", tmp_path / "out", Recording(2e4)), "expected a path inside cv")
     assert not (tmp_path / "out").exists()
 
 

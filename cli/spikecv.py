@@ -1,0 +1,49 @@
+"""`import-spikecv` and `export-spikecv`: SpikeCV folders as scenes, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from spike4dgs.benchmark.exchange import spikecv
+from spike4dgs.benchmark.exchange.recording import Recording
+from spike4dgs.benchmark.scene.scene import open_scene
+
+
+def import_spikecv(
+    folder: Positional[Path], out: Path, recording: OmitArgPrefixes[Recording], transforms: Path | None = None
+) -> int:
+    """Import a SpikeCV folder, or a folder of them (one per camera), as a scene folder or a folder of streams.
+
+    With poses the result is a scene whose cameras are all for training and that has no scored images; without, it is
+    the streams and a stream.json, which `inspect` reads. Labels are not imported. Streams whose H*W is no multiple of
+    8 are packed anew, because ours begin every tick on a whole byte. SpikeCV does not record the rate.
+
+    Args:
+        folder: Folder with config.yaml, or with one such folder per camera; the camera is called like its folder.
+        out: New folder to write.
+        transforms: nerfstudio file (JSON) with intrinsics and a pose for each camera, named by the key "camera".
+    """
+    for stream in spikecv.import_spikecv(folder, out, recording, transforms).values():
+        print(f"{stream.source}: {stream.n_ticks} ticks of {stream.width}x{stream.height}")
+    return 0
+
+
+def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False) -> int:
+    """Write the streams of a scene as SpikeCV folders, one per camera, rows bottom-up (SpikeCV's default).
+
+    SpikeCV does not store the rate, the poses, the clock, the radiance gain, gaps and the scored images: they are left
+    out. Streams whose H*W is no multiple of 8 are packed anew without padding, as SpikeCV counts bytes.
+
+    Args:
+        scene: Scene folder.
+        out: New folder; each camera becomes a folder in it.
+        allow_gaps: Export a recording with gaps all the same.
+    """
+    opened = open_scene(scene, allow_gaps)
+    spikecv.export_spikecv(opened, out)
+    for camera in opened.meta["streams"]:
+        print(f"{out / camera}: {opened.n_ticks} ticks of {opened.meta['width']}x{opened.meta['height']}")
+    print(f"not in SpikeCV's format: {opened.rate_hz:g} ticks per second, poses, clock, gain, scored images")
+    return 0
