@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.method import FitRequest
+from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_ticks
 from spike4dgs.method.images.base import ImageMaker
 
 

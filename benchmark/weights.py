@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
-from spike4dgs.benchmark.untrusted.tensor_header import check_header
+from spike4dgs.benchmark.untrusted import check_header
 
 if TYPE_CHECKING:  # torch takes seconds to import and is needed only where there are weights
     from torch import Tensor, nn

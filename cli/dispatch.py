@@ -14,7 +14,7 @@ from importlib.metadata import version
 from typing import Any
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.untrusted.numbers import shown
+from spike4dgs.benchmark.untrusted import shown
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.commands import COMMANDS, MOVED
 from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY

@@ -17,9 +17,8 @@ import psutil
 from rich.console import Console
 from rich.text import Text
 
-from spike4dgs.benchmark.environment import cpu_name
+from spike4dgs.benchmark.environment import PYTORCH, cpu_name, missing_rasterizer
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.gpu import PYTORCH, missing_rasterizer
 from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightsError, find_weights
 
 OK, MISSING, BROKEN, NOTE = "ok", "missing", "broken", "-"

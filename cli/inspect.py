@@ -15,15 +15,15 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
-from spike4dgs.benchmark.untrusted.numbers import MAX_HZ
+from spike4dgs.benchmark.untrusted import MAX_HZ
 
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
 _TIMELINE_BINS = 400

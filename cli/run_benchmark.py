@@ -15,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, Method, choose_device_for, find_methods, make_budget
-from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.release.track import track_folders
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.runs.record import write_record
 from spike4dgs.benchmark.runs.score import score_predictions

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import make_budget
-from spike4dgs.benchmark.metrics.selection import AUTO
+from spike4dgs.benchmark.metrics.measure import AUTO
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.scene.events import Events
+from spike4dgs.benchmark.scene.other_sensors import Events
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.generators.sensor.model import Float32
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.scene.events import read_events
 from spike4dgs.benchmark.scene.images import encode_srgb, read_geometry
+from spike4dgs.benchmark.scene.other_sensors import read_events
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.model import Float32

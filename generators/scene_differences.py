@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.scene.cameras import camera_facts
 from spike4dgs.benchmark.scene.images import Geometry, read_geometry
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.spikes.counted import counted
+from spike4dgs.benchmark.spikes.counted_recording import counted
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.untrusted.npz import read_npz
+from spike4dgs.benchmark.untrusted import read_npz
 
 _ROUNDING = 1e-9  # relative, of facts in float64
 _MAP_ROUNDING = 1e-5  # relative, of the sensors' maps, which are float32

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.events import write_events
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
+from spike4dgs.benchmark.scene.other_sensors import write_events
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR

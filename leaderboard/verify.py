@@ -14,7 +14,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import SUMS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value

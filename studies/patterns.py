@@ -20,8 +20,8 @@ from spike4dgs.benchmark.files import atomic_path, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.recipes import METHODS, SELF_CALIBRATED
 

@@ -16,8 +16,7 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json, write_text
-from spike4dgs.benchmark.metrics.measure import Values
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import Values, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure

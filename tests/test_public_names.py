@@ -29,7 +29,7 @@ def test_every_public_name_is_there_once_and_hides_no_module(room: str) -> None:
 @pytest.mark.parametrize("room", ROOMS)
 def test_type_checkers_and_the_interpreter_see_the_same_names(room: str) -> None:
     tree = ast.parse((ROOT / room / "__init__.py").read_text(encoding="utf-8"))
-    (branch,) = [node for node in tree.body if isinstance(node, ast.If)]
+    (branch,) = [node for node in tree.body if isinstance(node, ast.If) and node.orelse]
     typed = {(n.module, a.name) for n in branch.body if isinstance(n, ast.ImportFrom) for a in n.names}
     (names,) = [ast.literal_eval(n) for n in ast.walk(branch.orelse[0]) if isinstance(n, ast.Dict)]
     lazy = {(f"spike4dgs.{room}.{module}", name) for module, of_module in names.items() for name in of_module}

@@ -13,8 +13,7 @@ from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
-from spike4dgs.benchmark.untrusted.names import check_ids
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
+from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids
 
 _TICKS = 4096  # copied at a time
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.found_camera import (
+from spike4dgs.benchmark.exchange.foreign_camera import (
     CENTRE,
     Float64,
     FoundCamera,
@@ -26,8 +26,7 @@ from spike4dgs.benchmark.exchange.found_camera import (
     with_brown_lens,
 )
 from spike4dgs.benchmark.files import read_text
-from spike4dgs.benchmark.untrusted.numbers import shown, whole
-from spike4dgs.benchmark.untrusted.yaml_file import parse_yaml
+from spike4dgs.benchmark.untrusted import parse_yaml, shown, whole
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

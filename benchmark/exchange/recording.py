@@ -11,7 +11,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN, MAX_HZ
+from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_HZ
 
 
 @dataclass(frozen=True)

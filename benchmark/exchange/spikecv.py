@@ -23,9 +23,7 @@ from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_t
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, UInt8, open_stream
-from spike4dgs.benchmark.untrusted.names import check_ids, inside
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE, shown
-from spike4dgs.benchmark.untrusted.yaml_file import read_yaml
+from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids, inside, read_yaml, shown
 
 CONFIG = "config.yaml"
 _TICKS = 512  # packed anew at a time: a multiple of 8, so that every part but the last is whole bytes

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, angle_deg, pose_errors, umeyama
-from spike4dgs.benchmark.scene.camera_state import Clock
+from spike4dgs.benchmark.scene.camera_state import Clock, local_ticks, local_window
 from spike4dgs.benchmark.scene.cameras import Camera, check_rotation, look_at
 from spike4dgs.benchmark.scene.images import (
     decode_srgb,
@@ -23,7 +23,6 @@ from spike4dgs.benchmark.scene.images import (
     write_geometry,
 )
 from spike4dgs.benchmark.scene.lens import distort, fold_radius, undistort
-from spike4dgs.benchmark.scene.shared_time import local_ticks, local_window
 
 Float64 = NDArray[np.float64]
 _REFUSAL = "the contract: one clear error each"

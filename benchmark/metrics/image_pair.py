@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.metrics.spikes.view import SpikeView
+from spike4dgs.benchmark.metrics.held_out_spikes import SpikeView
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
 

@@ -10,10 +10,9 @@ from functools import partial
 
 import numpy as np
 
+from spike4dgs.benchmark.metrics.held_out_spikes import SPAN_WINDOW, TOLERANCE, WINDOWS
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
-from spike4dgs.benchmark.metrics.spikes.recorded import SPAN_WINDOW, WINDOWS
-from spike4dgs.benchmark.metrics.spikes.view import TOLERANCE
 
 
 def _spike_psnr(window: int, dynamic: bool, pair: ImagePair) -> float | None:
@@ -44,7 +43,7 @@ def _psnr_row(window: int, dynamic: bool) -> Metric:
         f"that follow from the predictions, in the unit of white{', over the moving region' if dynamic else ''}; "
         "the noise of counting, the same for all methods, is in it",
         higher_is_better=True,
-        implementation="benchmark/metrics/spikes/view.py, count_error",
+        implementation="benchmark/metrics/held_out_spikes.py, count_error",
         measure=partial(_spike_psnr, window, dynamic),
         unit="dB",
         digits=3,
@@ -63,7 +62,7 @@ def _deviance_row(dynamic: bool) -> Metric:
         f"where there is no truth against the recorded one; mean over the "
         f"{'moving region' if dynamic else 'pixels'}",
         higher_is_better=False,
-        implementation="benchmark/metrics/spikes/view.py, span_deviance",
+        implementation="benchmark/metrics/held_out_spikes.py, span_deviance",
         measure=partial(_spike_deviance, dynamic),
         unit="",
         digits=4,

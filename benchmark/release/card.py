@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.benchmark import croissant as croissant
 from spike4dgs.benchmark.files import sha256_file, write_json, write_text
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import SceneEntry, Shard
 from spike4dgs.benchmark.release.progress import size_text
-from spike4dgs.benchmark.scene import croissant
 
 README = "README.md"
 NAMES = (README, croissant.NAME)

@@ -16,13 +16,14 @@ from pathlib import Path
 
 import yaml
 
+from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release import card, index
 from spike4dgs.benchmark.release.index import Release, parse_shard, read_release
 from spike4dgs.benchmark.release.pack import SUMS
 from spike4dgs.benchmark.release.progress import ByteProgress
-from spike4dgs.benchmark.scene import croissant, manifest
+from spike4dgs.benchmark.scene import manifest
 
 MOST_FILES = 100_000  # of a repository
 MOST_ENTRIES = 10_000  # of a folder

@@ -6,12 +6,12 @@ import os
 import shutil
 from pathlib import Path
 
+from spike4dgs.benchmark import croissant as croissant
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, read_json, write_bytes, writing
-from spike4dgs.benchmark.scene import croissant
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.benchmark.spikes.counted import encode_recording
+from spike4dgs.benchmark.spikes.counted_recording import encode_recording
 
 
 def counted_copy(scene: Scene, out: Path) -> Scene:

@@ -7,11 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.held_out_spikes import (
+    WINDOWS,
+    Response,
+    SpikeView,
+    record_around,
+    response_of,
+    view_spikes,
+)
 from spike4dgs.benchmark.metrics.image_pair import Image
+from spike4dgs.benchmark.metrics.measure import Selection
 from spike4dgs.benchmark.metrics.metric import Metric
-from spike4dgs.benchmark.metrics.selection import Selection
-from spike4dgs.benchmark.metrics.spikes.recorded import WINDOWS, Response, record_around, response_of
-from spike4dgs.benchmark.metrics.spikes.view import SpikeView, view_spikes
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.benchmark.spikes.stream import SpikeStream

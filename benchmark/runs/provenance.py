@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio, to_nerfstudio
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.benchmark.untrusted.names import check_ids
+from spike4dgs.benchmark.untrusted import check_ids
 
 
 @dataclass(frozen=True, eq=False)

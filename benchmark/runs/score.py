@@ -11,8 +11,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
-from spike4dgs.benchmark.metrics.measure import fit_gain, measure, scene_means, scene_notes
-from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
+from spike4dgs.benchmark.metrics.measure import Selection, fit_gain, measure, scene_means, scene_notes, select_metrics
 from spike4dgs.benchmark.runs.own_spikes import Cameras, open_cameras, view_of, without_truth
 from spike4dgs.benchmark.runs.predictions import SUMS, MethodInfo, Predictions, open_predictions
 from spike4dgs.benchmark.runs.record import Cell, Record, build_record, missing_cell

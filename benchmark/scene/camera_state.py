@@ -1,7 +1,9 @@
-"""The state of a camera in an array beside its pose: its clock, its gain, its bad pixels."""
+"""The state of a camera in an array beside its pose: clock, gain, bad pixels; its own ticks for those of the array."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,3 +42,34 @@ class CameraState:
 
 
 PERFECT = CameraState()
+
+
+def local_tick(clock: Clock, tick: int) -> int:
+    """Return the camera's tick nearest to a tick of the array; it may lie outside the camera's clip.
+
+    >>> local_tick(Clock(2.6), 100)
+    103
+    """
+    return math.floor(clock.local(tick) + 0.5)
+
+
+def local_ticks(clock: Clock, ticks: Sequence[int], n_ticks: int) -> tuple[list[int], list[bool]]:
+    """Return the camera's ticks, clamped to its clip of `n_ticks`, and which of them are inside it.
+
+    >>> local_ticks(Clock(-3.0), [0, 3, 9], 10)
+    ([0, 0, 6], [False, True, True])
+    """
+    found = [local_tick(clock, tick) for tick in ticks]
+    return [min(max(t, 0), n_ticks - 1) for t in found], [0 <= t < n_ticks for t in found]
+
+
+def local_window(clock: Clock, start: int, stop: int, n_ticks: int) -> tuple[int, int]:
+    """Return the camera's window for a window [start, stop) of the array, as long, and moved into its clip if need be.
+
+    >>> local_window(Clock(4.0), 3, 8, 20), local_window(Clock(4.0), 13, 18, 20)
+    ((7, 12), (15, 20))
+    """
+    middle = (start + stop) // 2
+    first = start + local_tick(clock, middle) - middle
+    first = max(0, min(first, n_ticks - (stop - start)))
+    return first, first + stop - start

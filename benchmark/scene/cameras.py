@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.lens import NAMES, Distortion, distort, make_distortion, undistort
-from spike4dgs.benchmark.untrusted.names import check_ids
-from spike4dgs.benchmark.untrusted.numbers import MAX_LENGTH, MAX_SIDE, number, positive, shown, whole
+from spike4dgs.benchmark.untrusted import MAX_LENGTH, MAX_SIDE, check_ids, number, positive, shown, whole
 
 Float64 = NDArray[np.float64]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes

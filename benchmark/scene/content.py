@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.images import read_channels, read_mask
-from spike4dgs.benchmark.spikes.counted import counted
+from spike4dgs.benchmark.spikes.counted_recording import counted
 from spike4dgs.benchmark.spikes.stream import open_stream
-from spike4dgs.benchmark.untrusted.npz import read_npz
+from spike4dgs.benchmark.untrusted import read_npz
 
 FORMAT = "spike4dgs-content/1"
 Arrays = dict[str, NDArray[Any]]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
+from spike4dgs.benchmark.untrusted import MAX_SIDE
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]

@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate, find_recordings
 from spike4dgs.benchmark.scene.camera_state import PERFECT, CameraState
 from spike4dgs.benchmark.scene.cameras import Camera, camera_facts, read_cameras
 from spike4dgs.benchmark.scene.content import revision_of
-from spike4dgs.benchmark.scene.events import EventStream, events_of, find_events
-from spike4dgs.benchmark.scene.frames import Frames, find_frames, frames_of
 from spike4dgs.benchmark.scene.images import read_exr, read_mask, read_rgb
 from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
+from spike4dgs.benchmark.scene.other_sensors import EventStream, Frames, events_of, find_events, find_frames, frames_of
 from spike4dgs.benchmark.scene.splits import Split, check_splits
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.benchmark.spikes.calibration import Calibration, Recordings, estimate, find_recordings
 from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream

@@ -10,7 +10,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.untrusted.names import check_ids
+from spike4dgs.benchmark.untrusted import check_ids
 
 DEFAULT_SPLIT = "center"
 _FEWEST, _MOST = 3, 8  # training views of the splits views-N

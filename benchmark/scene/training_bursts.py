@@ -35,9 +35,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, parse_json
-from spike4dgs.benchmark.untrusted.names import is_id
-from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN, MAX_SIDE, positive, shown, whole
-from spike4dgs.benchmark.untrusted.tensor_header import check_header
+from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_SIDE, check_header, is_id, positive, shown, whole
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 
 Float32 = NDArray[np.float32]

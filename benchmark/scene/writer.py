@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.croissant import write_croissant
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json, write_text, writing
 from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
-from spike4dgs.benchmark.scene.croissant import write_croissant
 from spike4dgs.benchmark.scene.lens import Distortion, make_distortion
 from spike4dgs.benchmark.scene.manifest import Manifest, write_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA, Target, check_meta

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.counted import WINDOW_TICKS, Recording
+from spike4dgs.benchmark.spikes.counted_recording import WINDOW_TICKS, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream

@@ -13,8 +13,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.spikes.gaps import read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
-from spike4dgs.benchmark.untrusted.names import check_ids, inside
-from spike4dgs.benchmark.untrusted.numbers import MAX_HZ, MAX_SIDE, MAX_TICKS, positive, whole
+from spike4dgs.benchmark.untrusted import MAX_HZ, MAX_SIDE, MAX_TICKS, check_ids, inside, positive, whole
 
 NAME = "stream.json"
 _SCHEMA = "spike4dgs-streams/1"

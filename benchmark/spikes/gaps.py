@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.untrusted.numbers import MAX_TICKS, whole
+from spike4dgs.benchmark.untrusted import MAX_TICKS, whole
 
 
 @dataclass(frozen=True, order=True)

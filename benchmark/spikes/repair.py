@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.spikes.bits import UInt8, find_spike, in_threads, kernel
-from spike4dgs.benchmark.spikes.counted import CountedRecording, Recording
+from spike4dgs.benchmark.spikes.counted_recording import CountedRecording, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 

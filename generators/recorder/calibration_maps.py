@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
+from spike4dgs.benchmark.untrusted import Expected, read_npz
 
 Float32 = NDArray[np.float32]
 

@@ -19,7 +19,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.untrusted.numbers import MAX_TICKS
+from spike4dgs.benchmark.untrusted import MAX_TICKS
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import check_machine, find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles

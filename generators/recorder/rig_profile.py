@@ -16,7 +16,7 @@ import numpy as np
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE, shown
+from spike4dgs.benchmark.untrusted import MAX_SIDE, shown
 from spike4dgs.generators.recorder.calibration_maps import read_maps
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.toml_table import (

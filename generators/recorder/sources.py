@@ -10,9 +10,9 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.spikes.counted import raw
+from spike4dgs.benchmark.spikes.counted_recording import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
-from spike4dgs.benchmark.untrusted.numbers import MAX_GAIN
+from spike4dgs.benchmark.untrusted import MAX_GAIN
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.imperfections import (

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_text
-from spike4dgs.benchmark.untrusted.numbers import shown
+from spike4dgs.benchmark.untrusted import shown
 
 T = TypeVar("T")
 D = TypeVar("D")

@@ -20,12 +20,12 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.benchmark.spikes.calibration import Calibration, estimate
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
+from spike4dgs.benchmark.untrusted import Expected, read_npz
 from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.locks import locked
-from spike4dgs.benchmark.metrics.selection import AUTO, select_metrics
+from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
 from spike4dgs.benchmark.runs.run import Settings

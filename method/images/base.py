@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.spikes.calibration import Calibration
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
 from spike4dgs.method.settings import Settings

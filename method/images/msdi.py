@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.spikes.calibration import Calibration
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
 from spike4dgs.method.images.windows import window

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_ticks
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views

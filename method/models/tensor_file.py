@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.untrusted.tensor_header import check_header
+from spike4dgs.benchmark.untrusted import check_header
 
 Tensors = dict[str, Tensor]
 _DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)  # a foreign header, among others

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spike4dgs.benchmark.metrics.measure import Values, scene_means
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import Values, scene_means, select_metrics
 from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
 from spike4dgs.benchmark.runs.score import open_for, score_scene

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.self_calibration.clocks import with_camera
 from spike4dgs.method.self_calibration.pose_adjustment import Adjusted, AdjustSettings, adjust

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.lens import resample
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.training_views.pinholes import Lens, lenses_of

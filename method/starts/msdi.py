@@ -30,10 +30,10 @@ from torch.nn import functional
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
+from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_ticks
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.method.images.windows import window
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.camera_state import Clock
+from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_window
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from spike4dgs.benchmark.scene.camera_state import local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_window
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.training_views.pinholes import AtSensors
 from spike4dgs.method.training_views.unmeasured import bad_pixels, missing_images

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.scene.shared_time import local_ticks
 from spike4dgs.benchmark.spikes.gaps import present
 
 NEAR_TICKS = 20  # on each side of an image's tick: most makers look no further

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 _WIDTH, _HEIGHT, _TICKS = 64, 40, 81  # as small as the smallest profile

@@ -13,7 +13,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.reports.video import Write, check_video, video_writer
 from spike4dgs.benchmark.scene.images import UInt8, encode_srgb, write_png
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
+from spike4dgs.benchmark.untrusted import MAX_SIDE
 from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.viewing import camera_paths
 from spike4dgs.method.viewing.camera_paths import PathName, make_path, resized

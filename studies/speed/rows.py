@@ -15,8 +15,8 @@ import numpy as np
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.scene import Scene, Target
-from spike4dgs.benchmark.spikes.calibration import estimate
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import Float32, ImageMaker
 from spike4dgs.studies.speed.streams import fired_stream

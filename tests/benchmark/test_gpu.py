@@ -13,10 +13,9 @@ import pytest
 import torch
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.benchmark import environment, gpu
-from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark import environment
+from spike4dgs.benchmark.environment import Missing, choose_device, missing_rasterizer
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.gpu import Missing, missing_rasterizer
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 # A PyTorch that claims a GPU, in an environment that has no numba-cuda.
@@ -112,23 +111,23 @@ def test_image_makers_with_a_network_follow_the_fit(name: str, monkeypatch: pyte
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """numba-cuda beside a PyTorch for CUDA 12.8, and a trial that succeeds."""
-    found = gpu.find_spec
-    monkeypatch.setattr(gpu, "find_spec", lambda name: found("numba") if name == "numba_cuda" else found(name))
+    found = environment.find_spec
+    monkeypatch.setattr(environment, "find_spec", lambda name: found("numba") if name == "numba_cuda" else found(name))
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    monkeypatch.setattr(gpu, "trial", lambda: "")
+    monkeypatch.setattr(environment, "trial", lambda: "")
 
 
 @pytest.mark.usefixtures("installed")
 def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert missing_rasterizer() is None
-    monkeypatch.setattr(gpu, "trial", lambda: "CudaAPIError: the driver is too old")
+    monkeypatch.setattr(environment, "trial", lambda: "CudaAPIError: the driver is too old")
     missing = missing_rasterizer()
     assert missing and missing.found == "CudaAPIError: the driver is too old"
     assert missing.fix == "pip install 'spike4dgs[cuda12]', or update the driver"
     monkeypatch.setattr(torch.version, "cuda", None)
     missing = missing_rasterizer()
     assert missing and missing.expected == "a PyTorch with CUDA" and "pytorch.org" in missing.fix
-    monkeypatch.setattr(gpu, "find_spec", lambda name: None)
+    monkeypatch.setattr(environment, "find_spec", lambda name: None)
     missing = missing_rasterizer()
     assert missing and missing.expected == "the package numba-cuda" and missing.fix == "pip install 'spike4dgs[cuda]'"
 
@@ -136,12 +135,12 @@ def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(("cuda", "extra"), [("12.6", "cuda12"), ("13.0", "cuda"), (None, "cuda")])
 def test_the_extra_is_that_of_pytorchs_cuda(cuda: str | None, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", cuda)
-    assert gpu.install_line() == f"pip install 'spike4dgs[{extra}]'"
+    assert environment.install_line() == f"pip install 'spike4dgs[{extra}]'"
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert extra in project["optional-dependencies"]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
 def test_a_trial_without_a_device_fails_in_one_line() -> None:
-    failure = gpu.trial()
+    failure = environment.trial()
     assert failure and "\n" not in failure

@@ -12,8 +12,8 @@ from safetensors.torch import save_file
 
 from spike4dgs.benchmark import weights
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.neural_trunks import alexnet_features
-from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.weights import (
     ALEXNET,

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import torch
 
+from spike4dgs.benchmark.environment import Missing
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.gpu import Missing
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.cli import doctor
 from spike4dgs.cli.doctor import (

@@ -11,9 +11,9 @@ from PIL import Image
 from small_scenes import shared_file
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream, pack
 from spike4dgs.cli import main
 from spike4dgs.cli.inspect import examine, inspect

@@ -9,8 +9,8 @@ import pytest
 from small_scenes import array_cameras
 
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

@@ -13,8 +13,8 @@ from toy_world import ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings

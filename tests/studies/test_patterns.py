@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.method import find_methods, training_for
+from spike4dgs.benchmark.scene.calibration import Calibration, Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
-from spike4dgs.benchmark.spikes.calibration import Calibration, Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.studies import patterns as pattern_report

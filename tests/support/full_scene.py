@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from small_scenes import HEIGHT, WIDTH, write_small_scene
 
-from spike4dgs.benchmark.scene.events import Events, write_events
 from spike4dgs.benchmark.scene.images import write_geometry, write_png
 from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.other_sensors import Events, write_events
 from spike4dgs.benchmark.spikes.stream import SpikeWriter, pack
 
 FLAT_TICKS, DARK_TICKS = 130, 220  # no multiples of the 50 ticks of a window

@@ -59,9 +59,9 @@ class Outcome:
 def make_scene(folder: Path) -> None:
     from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
-    from spike4dgs.benchmark.scene.events import Events, write_events
     from spike4dgs.benchmark.scene.images import write_geometry, write_png
     from spike4dgs.benchmark.scene.manifest import write_manifest
+    from spike4dgs.benchmark.scene.other_sensors import Events, write_events
     from spike4dgs.benchmark.spikes.stream import pack
 
     facts = {
@@ -146,7 +146,7 @@ def resum(folder: Path) -> None:
 
 
 def read_predictions(folder: Path, out: Path) -> None:
-    from spike4dgs.benchmark.metrics.selection import select_metrics
+    from spike4dgs.benchmark.metrics.measure import select_metrics
     from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.scene import open_scene
 
@@ -159,7 +159,7 @@ def read_predictions(folder: Path, out: Path) -> None:
 
 
 def make_record(folder: Path) -> None:
-    from spike4dgs.benchmark.metrics.selection import select_metrics
+    from spike4dgs.benchmark.metrics.measure import select_metrics
     from spike4dgs.benchmark.runs.record import write_record
     from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.scene import open_scene

@@ -25,10 +25,10 @@ from spike4dgs.benchmark.metrics.iqa.natural_scene_statistics import (
     fit_asymmetric,
     fit_symmetric,
     halve,
+    load_parameters,
     neighbour_sums,
     normalise,
 )
-from spike4dgs.benchmark.metrics.iqa.parameters import load_parameters
 
 _LEAST = 2 * WINDOW  # pixels a side: at half the size, one window
 

@@ -1,5 +1,7 @@
 """The statistics that BRISQUE and NIQE share: locally normalised brightness, and distributions fitted to it.
 
+The statistics that BRISQUE and NIQE share: locally normalised brightness, and distributions fitted to it.
+
 A natural image, after each pixel loses its neighbourhood's mean and is divided by its neighbourhood's contrast
 ("mean subtracted, contrast normalised": MSCN), has nearly Gaussian values, and the products of neighbours follow an
 asymmetric distribution. Blur, noise and compression bend these laws; the shapes and widths of the fits measure that.
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -24,6 +27,19 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.spikes.bits import kernel
+
+_FILE = "live_parameters.npz"
+
+
+def load_parameters(metric: str) -> dict[str, Float64]:
+    """Return the arrays of one metric ("brisque" or "niqe") by name, in float64."""
+    with files("spike4dgs.benchmark.metrics.iqa").joinpath(_FILE).open("rb") as f, np.load(f) as arrays:
+        return {
+            name.removeprefix(f"{metric}_"): arrays[name].astype(np.float64)
+            for name in arrays.files
+            if name.startswith(f"{metric}_")
+        }
+
 
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]

@@ -26,10 +26,10 @@ from spike4dgs.benchmark.metrics.iqa.natural_scene_statistics import (
     degenerate,
     fit_asymmetric,
     halve,
+    load_parameters,
     neighbour_sums,
     normalise,
 )
-from spike4dgs.benchmark.metrics.iqa.parameters import load_parameters
 
 BLOCK = 96  # pixels a side; the pristine model was made with blocks of this size
 

@@ -25,7 +25,7 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.benchmark.untrusted.numbers import MAX_SIDE
+from spike4dgs.benchmark.untrusted import MAX_SIDE
 from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.environment import missing_rasterizer
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.gpu import missing_rasterizer
 from spike4dgs.method.splat.cuda.launch import launch, simulated
 from spike4dgs.method.splat.cuda.lists import TILE, Grid, Lists, all_tiles, make_pairs, sort_pairs
 from spike4dgs.method.splat.cuda.project import Seen, project

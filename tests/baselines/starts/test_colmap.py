@@ -14,9 +14,9 @@ from spike4dgs.baselines.starts import colmap as module
 from spike4dgs.baselines.starts.colmap import ColmapSettings, colmap
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.starts.structure_from_motion import Mapping, clip_means, map_views

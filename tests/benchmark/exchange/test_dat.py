@@ -224,7 +224,7 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
 
 
 def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
-    from spike4dgs.benchmark.exchange.found_camera import fisheye_distortion
+    from spike4dgs.benchmark.exchange.foreign_camera import fisheye_distortion
 
     k, xy = np.array([0.1, -0.02, 0.003, -0.001]), np.random.default_rng(3).uniform(-1, 1, (50, 2))
     expected = cv2.fisheye.distortPoints(xy[:, None], np.eye(3), k)[:, 0]

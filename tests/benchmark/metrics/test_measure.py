@@ -16,8 +16,7 @@ from small_scenes import write_small_scene
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.flip import flip
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.measure import Measured, measure, scene_means, scene_notes
-from spike4dgs.benchmark.metrics.selection import Selection, select_metrics
+from spike4dgs.benchmark.metrics.measure import Measured, Selection, measure, scene_means, scene_notes, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
 from spike4dgs.benchmark.runs.record import check_record, read_record

@@ -12,10 +12,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
-from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes, score_image
+from spike4dgs.benchmark.metrics.measure import Values, fit_gain, scene_means, scene_notes, score_image, select_metrics
 from spike4dgs.benchmark.metrics.measure import measure as measure_pair
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images
-from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 
 EVERYWHERE = np.ones((24, 40), bool)

@@ -13,7 +13,7 @@ from small_scenes import TICKS
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter

@@ -28,7 +28,7 @@ from spike4dgs.benchmark.scene.content import data_files, hash_arrays
 from spike4dgs.benchmark.scene.images import read_channels, read_mask, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.counted import encode_recording
+from spike4dgs.benchmark.spikes.counted_recording import encode_recording
 
 Change = Callable[[Path], None]
 CAMERAS = st.sampled_from([f"cam_{i:02d}" for i in range(4)])

@@ -6,8 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from spike4dgs.benchmark.scene.camera_state import Clock
-from spike4dgs.benchmark.scene.shared_time import local_tick, local_ticks, local_window
+from spike4dgs.benchmark.scene.camera_state import Clock, local_tick, local_ticks, local_window
 
 
 def test_the_nearest_tick_of_the_camera_is_taken() -> None:

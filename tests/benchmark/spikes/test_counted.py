@@ -14,10 +14,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.spikes.recorded import response_of
+from spike4dgs.benchmark.metrics.held_out_spikes import response_of
+from spike4dgs.benchmark.scene.calibration import Recordings, estimate
 from spike4dgs.benchmark.spikes.bad_pixels import deviation, find_bad, total_counts
-from spike4dgs.benchmark.spikes.calibration import Recordings, estimate
-from spike4dgs.benchmark.spikes.counted import (
+from spike4dgs.benchmark.spikes.counted_recording import (
     CountedRecording,
     counted,
     encode_recording,

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.benchmark.spikes.spans import is_recorded, spans_around
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.benchmark.spikes.times import is_recorded, spans_around
 
 
 def plain_spans(spikes: np.ndarray, lowest: int, highest: int, start: int, stop: int) -> np.ndarray:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 from spike4dgs.generators.sensor import calibration as calibration

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from small_scenes import shared_file
 
-from spike4dgs.benchmark.spikes.calibration import rates
+from spike4dgs.benchmark.scene.calibration import rates
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map

@@ -10,7 +10,7 @@ from fake_renderer import files
 from made_season import Made
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.score import open_for, score_scene
 from spike4dgs.benchmark.runs.targets import has_truth

@@ -10,7 +10,7 @@ from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.spikes.calibration import Recordings
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.training import ImageSettings, make_training_images

@@ -15,8 +15,8 @@ from toy_world import GAIN, ToyWorld
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.network import Msdi

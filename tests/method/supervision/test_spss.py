@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toy_world import GAIN, RATE_HZ, ToyWorld, run_neurons
 
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Recordings
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.supervision.base import Sample, Supervision

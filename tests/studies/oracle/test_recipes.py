@@ -18,8 +18,8 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.runs.record import read_record
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.calibration import Calibration
 from spike4dgs.cli import main
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images

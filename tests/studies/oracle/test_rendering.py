@@ -14,7 +14,7 @@ from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.untrusted.npz import read_npz
+from spike4dgs.benchmark.untrusted import read_npz
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.render_tasks import recorded_job
 from spike4dgs.studies.oracle.rendering import find_truth

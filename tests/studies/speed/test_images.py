@@ -18,9 +18,9 @@ from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.baselines.images.tfstp import tfstp_image
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.calibration import estimate
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.generators.sensor import calibration as calibration

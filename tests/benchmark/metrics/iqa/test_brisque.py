@@ -23,9 +23,9 @@ from spike4dgs.benchmark.metrics.iqa.natural_scene_statistics import (
     fit_asymmetric,
     fit_symmetric,
     halve,
+    load_parameters,
     neighbour_sums,
 )
-from spike4dgs.benchmark.metrics.iqa.parameters import load_parameters
 
 # The authors' MATLAB code on five photographs, and how far ours may be. I08 has six flat squares (2 % of its pixels),
 # I19 is flat in 30 % of its pixels: there, MATLAB counts rounding noise by its sign (see the test below).

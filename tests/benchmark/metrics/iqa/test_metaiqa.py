@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa, metaiqa_network, predict
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.neural_trunks import ResNet18
-from spike4dgs.benchmark.metrics.selection import select_metrics
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE, load_into
 
 State = dict[str, torch.Tensor]

@@ -14,8 +14,8 @@ from small_scenes import shared_file
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa import niqe
+from spike4dgs.benchmark.metrics.iqa.natural_scene_statistics import load_parameters
 from spike4dgs.benchmark.metrics.iqa.niqe import distance, niqe_features
-from spike4dgs.benchmark.metrics.iqa.parameters import load_parameters
 
 # The authors' MATLAB code on five photographs; the flat pixels of I08 and I19 matter less here than for BRISQUE.
 MATLAB = {"I03": 15.754, "I04": 3.655, "I06": 3.235, "I08": 3.184, "I19": 8.635}

@@ -16,7 +16,7 @@ import torch
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.gpu import missing_rasterizer
+from spike4dgs.benchmark.environment import missing_rasterizer
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views

@@ -1,5 +1,7 @@
 """Counted recordings: all that a calibration reads of a recording of steady light or of darkness, in fewer bytes.
 
+Counted recordings: all that a calibration reads of a recording of steady light or of darkness, in fewer bytes.
+
 A pixel's rate needs the ticks of its first and last spike and their number; a flickering pixel shows in its counts in
 windows of WINDOW_TICKS. Estimates from a counted recording equal those from the raw one to the last bit. The file is an
 .npz of the arrays below. It holds no single spike: what emulates an array needs the raw recording.
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.untrusted.npz import read_npz
+from spike4dgs.benchmark.untrusted import read_npz
 
 WINDOW_TICKS = 50  # of a flickering pixel's counts: a state that holds for a few milliseconds shows
 _AGAIN = "restore it or make the scene again"

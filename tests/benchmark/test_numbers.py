@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spike4dgs.benchmark.untrusted.numbers import number, positive, shown, whole
+from spike4dgs.benchmark.untrusted import number, positive, shown, whole
 
 
 @pytest.mark.parametrize("value", [10**400, 1e308, float("inf"), float("nan"), True, None, "1", [1], -1, 10.5])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.untrusted.npz import Expected, read_npz
+from spike4dgs.benchmark.untrusted import Expected, read_npz
 
 WANTED = {"a": Expected("f", (None, 3)), "b": Expected("iu", (2,))}
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from spike4dgs.benchmark.metrics.spikes.law import log_probability
+from spike4dgs.benchmark.metrics.held_out_spikes import log_probability
 from spike4dgs.benchmark.spikes.bits import unpack
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.untrusted.names import check_ids, inside, is_id
+from spike4dgs.benchmark.untrusted import check_ids, inside, is_id
 
 HOSTILE = ["", ".", "..", "../x", "a/b", "/a", "a\\b", "-o", ".a", "a b", "a\n", "a\0", "ä", "C:a", "a+b", "a@b"]
 HOSTILE += ["x" * 101]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.untrusted.yaml_file import MOST_BYTES, read_yaml
+from spike4dgs.benchmark.untrusted import MOST_YAML_BYTES, read_yaml
 
 BOMB = "a: &a [x, x, x]\n" + "".join(
     f"{b}: &{b} [*{a}, *{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
@@ -30,7 +30,7 @@ def test_plain_values(tmp_path: Path) -> None:
         ("a: " + "9" * 5000, "damaged text"),
         ("a: 2001-99-99", "damaged text"),
         ("? [a]\n: 1", "unhashable"),
-        ("a: 1\n" * MOST_BYTES, f"{MOST_BYTES} bytes at most"),
+        ("a: 1\n" * MOST_YAML_BYTES, f"{MOST_YAML_BYTES} bytes at most"),
         (b"a: \xff", "damaged text"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.benchmark.metrics.spikes.time_mean import time_mean
+from spike4dgs.benchmark.metrics.held_out_spikes import time_mean
 
 
 @settings(max_examples=40, deadline=None)

@@ -20,7 +20,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 from spike4dgs.benchmark.files import MOST_BYTES, parse_json, read_json
-from spike4dgs.benchmark.metrics.selection import select_metrics
+from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.runs.record import check_record, read_record
 from spike4dgs.benchmark.runs.score import score_predictions

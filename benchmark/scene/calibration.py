@@ -1,5 +1,7 @@
 """A camera's response to light, estimated from recordings that any owner can make: under uniform light, in the dark.
 
+A camera's response to light, estimated from recordings that any owner can make: under uniform light, in the dark.
+
 A pixel's rate is (spikes - 1) / (ticks between the first and the last), which does not depend on the charge before the
 first spike and after the last: over T ticks it is wrong by about 1 / T, where a count is by 1 / (rate T). Then
 
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
-from spike4dgs.benchmark.spikes.counted import Recording, first_last_total, open_counted
+from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 Float32 = NDArray[np.float32]

@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.metrics.held_out_spikes import Recorded, Response, record_around, response_of, view_spikes
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.spikes.recorded import Recorded, Response, record_around, response_of
-from spike4dgs.benchmark.metrics.spikes.view import view_spikes
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.spikes.calibration import Recordings
+from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

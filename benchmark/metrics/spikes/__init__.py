@@ -1,1 +1,0 @@
-"""Metrics that judge a prediction by the spikes that a held-out camera recorded itself."""
