@@ -143,12 +143,12 @@ COMMANDS: dict[str, Command] = {
         "inspect recording.dat --width 400 --height 250 --fps 20000",
     ),
     "render": Command(
-        "spike4dgs.method.viewing.render_video:render",
+        "spike4dgs.cli.render:render",
         "make a slow-motion video of a fitted model",
         "render runs/small/models/tfp+4dgs/car-0-small.safetensors --path orbit --slow-motion 1000 --out car.mp4",
     ),
     "view": Command(
-        "spike4dgs.method.viewing.viewer:view",
+        "spike4dgs.cli.view:view",
         "show a fitted model in the browser",
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
@@ -214,7 +214,7 @@ COMMANDS: dict[str, Command] = {
         "export-colmap data/car-0-small --out car-colmap",
     ),
     "export-ply": Command(
-        "spike4dgs.method.viewing.export_ply:export_ply",
+        "spike4dgs.cli.export_ply:export_ply",
         "write the Gaussians of a fitted model at several times as .ply files",
         "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
     ),

@@ -9,9 +9,9 @@ import functools
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.untrusted import shown
@@ -88,24 +88,33 @@ def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
 def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity and 1e300."""
 
+    from tyro.conf import OmitArgPrefixes
+
+    flat = {n for n, t in get_type_hints(function, include_extras=True).items() if OmitArgPrefixes in get_args(t)}
+
     @functools.wraps(function)
     def bounded(*args: Any, **kwargs: Any) -> Any:
         for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
-            _check_numbers(f"--{name.replace('_', '-')}", value)
+            for option, number in _numbers("" if name in flat else name.replace("_", "-"), value):
+                if not abs(number) <= _MOST:
+                    expected = f"a number from {-_MOST:g} to {_MOST:g}"
+                    raise problem(f"--{option}", expected, shown(number), "correct it")
         return function(*args, **kwargs)
 
     return bounded
 
 
-def _check_numbers(option: str, value: Any) -> None:
+def _numbers(option: str, value: Any) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an option, which may be a group of options, each with its name."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         for field in dataclasses.fields(value):
-            _check_numbers(f"{option}.{field.name.replace('_', '-')}", getattr(value, field.name))
+            name = field.name.replace("_", "-")
+            yield from _numbers(f"{option}.{name}" if option else name, getattr(value, field.name))
     elif isinstance(value, tuple | list):
         for item in value:
-            _check_numbers(option, item)
-    elif isinstance(value, int | float) and not abs(value) <= _MOST:
-        raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", shown(value), "correct it")
+            yield from _numbers(option, item)
+    elif isinstance(value, int | float):
+        yield option, value
 
 
 def _speed(arguments: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""`view`: a fitted model in the browser. The project's own rasteriser renders the images, which are sent as JPEG.
+"""A fitted model in the browser. The project's own rasteriser renders the images, which are sent as JPEG.
 
 While something changes, images have as many pixels as a training view; at rest they are rendered once more, with four
 times as many. All browsers share the controls; each has its own camera.
@@ -8,55 +8,21 @@ from __future__ import annotations
 
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import fixed, focus, resized
-from spike4dgs.method.viewing.content import Content, free_camera, matching, open_content, padded
+from spike4dgs.method.viewing.content import Content, free_camera, matching, padded
 
 FREE = "free"
 LOOP_S = 4.0  # duration of the clip when it plays
 SHARP = 2.0  # times as many pixels each way at rest
 JPEG = 85
 MOVED = 1e-3  # of the distance to the focus: farther from the set position, a user has moved the camera
-
-
-def view(
-    model: Positional[Path],
-    *,
-    scene: Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    allow_gaps: bool = False,
-    device: str = "cpu",
-) -> int:
-    """Show a fitted model in the browser: camera, time, and the spikes beside it. Ctrl-C ends it.
-
-    Args:
-        model: A model that run-benchmark has saved, OUT/models/METHOD/SCENE.safetensors, or fit, OUT/model.safetensors.
-        scene: The folder of its scene: also shows spike rates and errors at the training cameras.
-        host: Address to serve at; 0.0.0.0 admits other machines.
-        port: Port to serve at; the next free one where it is taken.
-        allow_gaps: Accept a recording with gaps.
-        device: cpu or cuda.
-    """
-    need_viser()
-    viewer = Viewer(open_content(load_model(model, device), scene, allow_gaps), host, port)
-    print(f"{viewer.content.saved.title}: {viewer.url} (Ctrl-C ends it)", flush=True)
-    try:
-        viewer.run()
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        viewer.stop()
-    return 0
 
 
 def need_viser() -> Any:

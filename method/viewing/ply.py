@@ -1,4 +1,4 @@
-"""`export-ply`: the Gaussians of a fitted model at several times, as `.ply` files in the layout of 3DGS.
+"""The Gaussians of a fitted model at several times, as `.ply` files in the layout of 3DGS.
 
 Floats, binary little endian, one row for each Gaussian (`FIELDS`): position in metres, normal (0), colour, opacity
 before the sigmoid, natural logarithms of the standard deviations, unit quaternion wxyz.
@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_bytes
 from spike4dgs.method.models.fitted_model import GaussianModel
-from spike4dgs.method.models.saved_model import load_model
+from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.splat.types import ALPHA_MIN
 
@@ -35,18 +34,10 @@ SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the spherical harmonic of degre
 _MOST_OPAQUE = 1 - 1e-6  # whose logit is finite
 
 
-def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: str = "cpu") -> int:
-    """Write the Gaussians of a fitted model at equally spaced times as .ply files, which splat viewers open.
+def write_ply(model: Path, out: Path, times: int, device: str = "cpu") -> tuple[SavedModel, list[int]]:
+    """Write the Gaussians of a model file at the middles of equal parts of the clip as OUT/TICK.ply.
 
-    A file is named by its tick. Colour is the sRGB-encoded gray radiance at degree 0 of the spherical harmonics.
-    Gaussians that have faded away at a time are left out of its file. Radiance fields have no Gaussians, and colours
-    that a network decodes (the motion `spacetime`) have no place in a .ply: both are refused.
-
-    Args:
-        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
-        out: New folder to write.
-        times: Number of files, in the middles of so many equal parts of the clip.
-        device: cpu or cuda.
+    Return the model and the ticks. Raises UserError for a radiance field, and for colours that a network decodes.
     """
     saved = load_model(model, device)
     about, fitted = saved.provenance, saved.model
@@ -63,8 +54,7 @@ def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: s
             found = f"{about.name}, whose colours a network decodes for each ray"
             raise problem(model, "Gaussians with a gray value", found, "fit the motion spacetime-lite")
         write_bytes(out / f"{tick:06d}.ply", to_ply(splats))
-    print(f"{out}: {times} files of the ticks {ticks[0]} to {ticks[-1]}, {about.rate_hz:g} ticks/s ({saved.title})")
-    return 0
+    return saved, ticks
 
 
 @torch.no_grad()

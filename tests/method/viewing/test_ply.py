@@ -12,7 +12,7 @@ from saved_models import DURATION_US, WORLD, model, provenance
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.cli import main
 from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.viewing.export_ply import export_ply, to_ply
+from spike4dgs.method.viewing.ply import to_ply, write_ply
 
 FIELDS = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
 
@@ -57,7 +57,7 @@ def saved(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     "saved", ["static", "hexplane", "hexplane, background", "paths", "spacetime-lite", "tracking"], indirect=True
 )
 def test_the_files_render_as_the_model_does(saved: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    assert export_ply(saved, tmp_path / "out", times=4) == 0
+    assert main(["export-ply", str(saved), "--out", str(tmp_path / "out"), "--times", "4"]) == 0
     files = sorted((tmp_path / "out").iterdir())
     assert [f.name for f in files] == [f"{tick:06d}.ply" for tick in (12, 37, 62, 87)]
     made, camera = model(request.node.callspec.params["saved"]), WORLD.cameras[1]
@@ -109,6 +109,6 @@ def test_models_that_no_ply_can_hold_are_refused(
 def test_bad_numbers_of_times(saved: Path, tmp_path: Path) -> None:
     for times in (0, 101):
         with pytest.raises(UserError, match=f"--times: expected 1 to 100, the ticks of the clip, found {times}"):
-            export_ply(saved, tmp_path / "out", times=times)
+            write_ply(saved, tmp_path / "out", times)
     with pytest.raises(UserError, match="a new or empty folder"):
-        export_ply(saved, tmp_path, times=1)
+        write_ply(saved, tmp_path, 1)
