@@ -14,7 +14,6 @@ from importlib.metadata import version
 from typing import Any, get_args, get_type_hints
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.untrusted import shown
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.commands import COMMANDS, MOVED
 from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY
@@ -89,6 +88,8 @@ def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity and 1e300."""
 
     from tyro.conf import OmitArgPrefixes
+
+    from spike4dgs.benchmark.untrusted import shown
 
     flat = {n for n, t in get_type_hints(function, include_extras=True).items() if OmitArgPrefixes in get_args(t)}
 
