@@ -14,6 +14,7 @@ from typing import Any
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.radiance_field import RADIANCE_FIELD
+from spike4dgs.baselines.spacetime import MOTIONS
 from spike4dgs.baselines.spike_render import SpikeRender
 from spike4dgs.baselines.starts.colmap import (
     ColmapSettings,
@@ -22,7 +23,6 @@ from spike4dgs.baselines.starts.colmap import (
     colmap_uncalibrated,
 )
 from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
-from spike4dgs.baselines.stg.spacetime import MOTIONS
 from spike4dgs.baselines.tracking.fit import TRACKING
 from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.method import recipes as ours

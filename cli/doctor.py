@@ -221,7 +221,7 @@ def _msdi() -> Path:
 
 
 def _spk2img() -> Path:
-    from spike4dgs.baselines.images.spk2img.weights import check_weights
+    from spike4dgs.baselines.images.spk2img.maker import check_weights
 
     return check_weights()
 

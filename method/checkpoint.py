@@ -10,7 +10,7 @@ from torch.optim import Adam
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.gaussians.optimizer import export_state, import_state
-from spike4dgs.method.models.tensor_file import part, read_tensors, write_tensors
+from spike4dgs.method.models.model_file import part, read_tensors, write_tensors
 
 _SCHEMA = "spike4dgs-checkpoint/1"
 

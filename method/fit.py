@@ -23,12 +23,12 @@ from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.method.training_views.warm_up_scene import warm_up_scene

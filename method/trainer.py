@@ -32,12 +32,11 @@ from spike4dgs.method.gaussians.parameters import Gaussians, appended
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.coherence import Coherence
 from spike4dgs.method.pose_refinement import Poses
-from spike4dgs.method.schedule import Stage, choose_time, choose_views, stages
+from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, choose_views, stages
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.torch_state import one_torch_thread, seeded
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.foreground import moving_points
 from spike4dgs.method.training_views.instants import Corrections, RenderViews
 from spike4dgs.method.training_views.training_images import TrainingImages

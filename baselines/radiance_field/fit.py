@@ -31,7 +31,7 @@ from spike4dgs.method.motion.hexplane import (
     time_sparsity,
 )
 from spike4dgs.method.schedule import GOLDEN
-from spike4dgs.method.supervision.spike_neuron import firing_rate, spike_loss
+from spike4dgs.method.supervision.spike import firing_rate, spike_loss
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 from spike4dgs.method.training_views.changes import RAYS, changing
 from spike4dgs.method.training_views.training_images import known

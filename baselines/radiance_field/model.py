@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from spike4dgs.baselines.radiance_field.blocks import in_blocks
-from spike4dgs.baselines.radiance_field.field import Deformation, Field, encode_position
+from spike4dgs.baselines.radiance_field.field import Deformation, Field, encode_position, in_blocks
 from spike4dgs.baselines.radiance_field.march import Rays, camera_rays, resample, spread, weigh
 from spike4dgs.baselines.radiance_field.occupancy import Occupancy
 from spike4dgs.benchmark.runs.provenance import Provenance

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from spike4dgs.method.settings import Settings
-from spike4dgs.method.supervision.spike_neuron import Reset
+from spike4dgs.method.supervision.spike import Reset
 
 # SpikeNeRF's own values, for synthetic scenes (its learning rate falls by 0.1^(step / 500,000), its two networks are
 # alike), and for the deformation 4DGS's, for the settings of the same name.

@@ -46,13 +46,13 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.optimizer import Decay, make_adam, set_learning_rates
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings
-from spike4dgs.method.motion.static import Static
+from spike4dgs.method.motion.table import Static
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision.base import difference
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.foreground import foreground_masks, foreground_points, moving_window, stray_points
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
@@ -107,8 +108,6 @@ def from_points(
 
     Raises UserError for fewer than 4 points or values that are not finite.
     """
-    from scipy.spatial import cKDTree
-
     if len(points) < 4 or not (np.isfinite(points).all() and np.isfinite(values).all()):
         finite = int(np.isfinite(points).all(axis=1).sum())
         raise problem("initialization", "at least 4 finite points", f"{finite}", "check the poses and the streams")
@@ -202,3 +201,17 @@ def share(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 def _log_binomial(n: Tensor, k: Tensor) -> Tensor:
     return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp(min=0) + 1)
+
+
+def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Return (indices int64 [N, k], distances float64 [N, k], m) of the `k` < N points nearest each of `points` [N, 3].
+
+    The nearest comes first. No point is its own neighbour; points that coincide are neighbours of each other.
+    """
+    at = points.detach().cpu().double().numpy()
+    distance, index = (torch.as_tensor(found) for found in cKDTree(at).query(at, k=k + 1))
+    # A point is not always its own first neighbour: coincident points come in any order.
+    itself = index == torch.arange(len(at))[:, None]  # [N, k + 1]
+    itself[:, -1] |= ~itself.any(dim=1)
+    others = ~itself
+    return index[others].view(-1, k).to(points.device), distance[others].view(-1, k).to(points.device)

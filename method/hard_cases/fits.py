@@ -31,6 +31,7 @@ from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.motion.table import MOTIONS
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import set_threads
 from spike4dgs.method.splat.kernels.threads import get_threads
 from spike4dgs.method.splat.ssim import ssim
@@ -38,7 +39,6 @@ from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.warm_up_scene import radiance_of, warm_up_scene
 
 STOPS = (10, 20, 30)  # steps after which a fit is interrupted

@@ -19,7 +19,7 @@ from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.pose import solve_poses
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.ssim import ssim, ssim_reference
-from spike4dgs.method.supervision.spike_neuron import encode, firing_rate
+from spike4dgs.method.supervision.spike import encode, firing_rate
 from spike4dgs.method.training_views.instants import correction, node
 from spike4dgs.method.training_views.training_images import Spans
 

@@ -18,8 +18,7 @@ from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
-from spike4dgs.method.training_views.training_images import Spans, TrainingImages
-from spike4dgs.method.training_views.unmeasured import bad_pixels, missing_images
+from spike4dgs.method.training_views.training_images import Spans, TrainingImages, bad_pixels, missing_images
 
 Half = NDArray[np.float16]
 

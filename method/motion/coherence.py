@@ -22,8 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spike4dgs.method.gaussians.neighbours import nearest
-from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.gaussians.parameters import Gaussians, nearest
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.kernels.jit import kernel
 

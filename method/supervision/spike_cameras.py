@@ -13,7 +13,7 @@ from spike4dgs.benchmark.scene.camera_state import local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.training_views.pinholes import AtSensors
-from spike4dgs.method.training_views.unmeasured import bad_pixels, missing_images
+from spike4dgs.method.training_views.training_images import bad_pixels, missing_images
 
 
 class SpikeCameras(nn.Module):

@@ -320,7 +320,7 @@ def test_a_png_is_not_decoded_before_its_size_is_known(tmp_path: Path, size: tup
     ],
 )
 def test_texts_of_model_files(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
-    from spike4dgs.method.models.tensor_file import read_tensors, write_tensors
+    from spike4dgs.method.models.model_file import read_tensors, write_tensors
 
     path = tmp_path / "a.safetensors"
     model(name).save(path, provenance())

@@ -20,10 +20,10 @@ from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import render
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 
 MOTIONS = PARTS.motion
 SUPERVISIONS = PARTS.supervision

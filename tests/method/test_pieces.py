@@ -23,14 +23,13 @@ from spike4dgs.method.motion import paths as paths_module
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.schedule import choose_time, stages
+from spike4dgs.method.schedule import TrainerSettings, choose_time, stages
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
 

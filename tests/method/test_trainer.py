@@ -17,12 +17,11 @@ from spike4dgs.method.gaussians.density import DensitySettings, GradientStatisti
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
-from spike4dgs.method.schedule import Stage, choose_time, stages
+from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
 from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.splat import render
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.instants import Corrections, correction, node
 from spike4dgs.method.training_views.points import variation_at
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages

@@ -14,13 +14,13 @@ from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference
 from spike4dgs.method.supervision.base import Render, Sample
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 
 MOTIONS = PARTS.motion
 

@@ -226,7 +226,7 @@ def rehash_model(folder: Path) -> None:
     """Make the models' own hashes agree."""
     import safetensors.torch
 
-    from spike4dgs.method.models.tensor_file import _digest
+    from spike4dgs.method.models.model_file import _digest
 
     for path in folder.glob("*.safetensors"):
         with contextlib.suppress(Exception):
@@ -282,13 +282,13 @@ def _saved(torch: Any, value: Any) -> bytes:
 
 
 def _shipped() -> Path:
-    from spike4dgs.baselines.images.spk2img.weights import WEIGHTS
+    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
 
     return WEIGHTS.shipped
 
 
 def read_tensors(folder: Path, out: Path) -> None:
-    from spike4dgs.baselines.images.spk2img.weights import WEIGHTS
+    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
     from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.scene.training_bursts import open_bursts
     from spike4dgs.benchmark.weights import read_state

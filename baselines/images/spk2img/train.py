@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 from spike4dgs.baselines.images.spk2img.data import Batch, Example, draw, open_for_training, read_examples
-from spike4dgs.baselines.images.spk2img.maker import reconstruct
+from spike4dgs.baselines.images.spk2img.maker import Card, reconstruct, save_weights
 from spike4dgs.baselines.images.spk2img.network import BLOCK_STARTS, MIDDLE, Reconstruction, Spk2ImgNet
-from spike4dgs.baselines.images.spk2img.weights import Card, save_weights
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json

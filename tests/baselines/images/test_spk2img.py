@@ -13,12 +13,11 @@ import safetensors.torch
 import torch
 from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
 
-from spike4dgs.baselines.images.spk2img import weights
+from spike4dgs.baselines.images.spk2img import maker as weights
 from spike4dgs.baselines.images.spk2img.data import Example, draw, open_for_training, read_examples
-from spike4dgs.baselines.images.spk2img.maker import reconstruct
+from spike4dgs.baselines.images.spk2img.maker import Card, load_network, read_card, reconstruct, save_weights
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
 from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of, train_spk2img
-from spike4dgs.baselines.images.spk2img.weights import Card, load_network, read_card, save_weights
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.manifest import write_manifest

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from spike4dgs.baselines.images.spk2img.deformable import DeformableConv, deformable_conv
-from spike4dgs.baselines.images.spk2img.deformable_cpu import convolve
+from spike4dgs.baselines.images.spk2img.deformable import DeformableConv, convolve, deformable_conv
 from spike4dgs.baselines.images.spk2img.network import Extractor, Spk2ImgNet
 from spike4dgs.method.images.windows import mirrored
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from small_scenes import array_cameras
 from torch import nn
 
-from spike4dgs.baselines.radiance_field import blocks
-from spike4dgs.baselines.radiance_field.blocks import in_blocks
-from spike4dgs.baselines.radiance_field.field import Deformation, Field, encode_position, encoded_size
+from spike4dgs.baselines.radiance_field import field as blocks
+from spike4dgs.baselines.radiance_field.field import Deformation, Field, encode_position, encoded_size, in_blocks
 from spike4dgs.baselines.radiance_field.march import camera_rays, resample, spread, weigh
 from spike4dgs.baselines.radiance_field.occupancy import Occupancy, may_move
 from spike4dgs.method.motion.hexplane import HexPlaneShape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from spike4dgs.method.gaussians.neighbours import nearest
+from spike4dgs.method.gaussians.parameters import nearest
 
 
 @pytest.mark.parametrize(("n", "k"), [(2, 1), (7, 6), (200, 6)])

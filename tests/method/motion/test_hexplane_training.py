@@ -16,12 +16,12 @@ from spike4dgs.method.motion.hexplane import (
     time_smoothness,
     time_sparsity,
 )
-from spike4dgs.method.motion.static import Static
+from spike4dgs.method.motion.table import Static
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=32, height=20, side=2)

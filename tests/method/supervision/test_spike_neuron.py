@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.method.supervision.spike_neuron import FLOOR, encode, firing_rate, spike_loss
+from spike4dgs.method.supervision.spike import FLOOR, encode, firing_rate, spike_loss
 
 RESETS = ("subtract", "hard")
 

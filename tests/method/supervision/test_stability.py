@@ -19,12 +19,12 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.motion.static import Static
+from spike4dgs.method.motion.table import Static
+from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.trainer_settings import TrainerSettings
 
 SUPERVISIONS = PARTS.supervision
 

@@ -4,8 +4,7 @@ import numpy as np
 import torch
 from small_scenes import array_cameras
 
-from spike4dgs.baselines.stg.guided_sampling import BAD_PIXELS, PATCH, along_rays, bad_pixels, guide
-from spike4dgs.baselines.stg.spacetime import SpacetimeLite
+from spike4dgs.baselines.spacetime import BAD_PIXELS, PATCH, SpacetimeLite, along_rays, bad_pixels, guide
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent

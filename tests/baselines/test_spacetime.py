@@ -14,8 +14,7 @@ from torch import Tensor
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.stg.spacetime import Spacetime, SpacetimeLite, SpacetimeSettings
-from spike4dgs.baselines.stg.spacetime_decoder import Decoder, rays
+from spike4dgs.baselines.spacetime import Decoder, Spacetime, SpacetimeLite, SpacetimeSettings, rays
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
