@@ -58,7 +58,7 @@ COMMANDS: dict[str, Command] = {
         "make-msdi-data --variants 40 --out data/msdi",
     ),
     "train-msdi": Command(
-        "spike4dgs.method.msdi.training.train:train_msdi",
+        "spike4dgs.method.msdi.train:train_msdi",
         "train the network that estimates points, poses and images from spikes",
         "train-msdi --data data/msdi --out runs/msdi",
     ),

@@ -19,8 +19,7 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.weights import load_into, read_tensors
 from spike4dgs.method.msdi.checkpoints import canonical_head
-from spike4dgs.method.msdi.dpt import Dpt, unpack
-from spike4dgs.method.msdi.transformer import NORM_EPS, Block, Mlp, SelfAttention, attend_rotary, grid
+from spike4dgs.method.msdi.layers import NORM_EPS, Block, Dpt, Mlp, SelfAttention, attend_rotary, grid, unpack
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ is in units of the firing threshold. At charge 1 the pixel fires and loses the c
 (subtractive reset). Shot noise makes the charge of each spike vary by 1 / sqrt(photons per spike).
 
 The scenes' simulator (`generators.sensor`, integer charge) and the training windows of MSDI
-(`method.msdi.training.spikes`, float64) follow this model and take its constants from here.
+(`method.msdi.training_data`, float64) follow this model and take its constants from here.
 """
 
 from __future__ import annotations

@@ -23,10 +23,9 @@ from torch.nn import functional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.msdi.config import MsdiConfig
-from spike4dgs.method.msdi.dpt import Dpt, unpack, widened
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
 from spike4dgs.method.msdi.inputs import Sensors, network_inputs
-from spike4dgs.method.msdi.transformer import NORM_EPS, Block, grid, initialize
+from spike4dgs.method.msdi.layers import NORM_EPS, Block, Dpt, grid, initialize, unpack, widened
 
 VIEW_IDS = 1000  # numbers that views may have, as in Fast3R; view 0 has number 0
 _FUSION_EPS = 1e-5  # of Fast3R's fusion layers, unlike the encoder's

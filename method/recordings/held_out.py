@@ -19,7 +19,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
 from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.method.models.saved_model import SavedModel
-from spike4dgs.method.recordings.clocks import LARGEST_ERROR_TICKS
+from spike4dgs.method.recordings.self_calibrated import LARGEST_ERROR_TICKS
 from spike4dgs.method.self_calibration.clocks import clock_of_another
 from spike4dgs.method.self_calibration.poses import pose_of_another
 

@@ -15,7 +15,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, Mask, find_bad
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.repair import LONGEST_TICKS, fill_gaps, fill_pixels
-from spike4dgs.method.recordings.gains import between_views, from_recordings
+from spike4dgs.method.recordings.camera_facts import between_views, from_recordings
 
 LEAST_PRESENT = 0.5  # share of its ticks with which a camera is used: a shorter one would be filled more than recorded
 MOST_BAD = 0.5  # share of its pixels with which it is: half of an image tells little, and its recordings may be wrong

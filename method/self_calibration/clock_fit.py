@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.method.self_calibration.normal_equations import Prior, Reduced, reduce, residuals
-from spike4dgs.method.self_calibration.patches import BASIS, Patches, observe, strongest, sweep
-from spike4dgs.method.self_calibration.window_images import Moment, Viewer, moment
+from spike4dgs.method.self_calibration.patches import BASIS, Moment, Patches, Viewer, moment, observe, strongest, sweep
 
 Float64 = NDArray[np.float64]
 

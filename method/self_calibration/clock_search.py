@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings, least_change, reach_ticks
-from spike4dgs.method.self_calibration.patches import CAP, Patches, Rays, rays, strongest
-from spike4dgs.method.self_calibration.window_images import Viewer, moment, window_image
+from spike4dgs.method.self_calibration.patches import CAP, Patches, Rays, Viewer, moment, rays, strongest, window_image
 
 Float64 = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from spike4dgs.method.self_calibration.clock_fit import (
     to_clock,
 )
 from spike4dgs.method.self_calibration.clock_search import SearchSettings, search_offsets
-from spike4dgs.method.self_calibration.window_images import viewers
+from spike4dgs.method.self_calibration.patches import viewers
 from spike4dgs.method.starts.plane_sweep import find_range
 from spike4dgs.method.starts.rig import window_means
 from spike4dgs.method.training_views.pinholes import as_pinholes

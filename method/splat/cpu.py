@@ -18,12 +18,12 @@ from spike4dgs.method.splat.kernels import project as project_kernels
 from spike4dgs.method.splat.kernels import project_gradient
 from spike4dgs.method.splat.kernels import tiles as tile_kernels
 from spike4dgs.method.splat.kernels.blend_ir import PLANE, TILE_HEIGHT, TILE_WIDTH
-from spike4dgs.method.splat.kernels.blocks import AHEAD, BATCH, MAX_BLOCKS
 from spike4dgs.method.splat.kernels.jit import announce_compilation
 from spike4dgs.method.splat.kernels.project import Cameras, Geometry, Projected
 from spike4dgs.method.splat.kernels.project_gradient import Gradients, Records
 from spike4dgs.method.splat.kernels.raster import Layer, Lists, raster_kernels, record_width
 from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run, useful_threads
+from spike4dgs.method.splat.kernels.tiles import AHEAD, BATCH, MAX_BLOCKS
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
 

@@ -35,9 +35,8 @@ from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.windows import window
-from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
-from spike4dgs.method.msdi.shrink import shrink
 from spike4dgs.method.msdi.weights import load_network, weights_path
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat.cuda.lists import Lists, all_tiles, make_pairs, sort_pairs
+from spike4dgs.method.splat.cuda.prepare import Lists, all_tiles, make_pairs, sort_pairs
 from spike4dgs.method.splat.cuda.render import Behind, Job, Projected, blend, grid_of, project_splats
 from spike4dgs.method.splat.types import CUSTOMARY, NEAR, PixelFilter, RenderOutput, Splats, Views
 

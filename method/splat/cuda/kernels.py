@@ -22,7 +22,7 @@ import numpy as np
 from numba import cuda, float32, int64
 
 from spike4dgs.benchmark.compilation import cached_jit
-from spike4dgs.method.splat.cuda.lists import TILE
+from spike4dgs.method.splat.cuda.prepare import TILE
 from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, T_MIN
 
 THREADS = TILE * TILE

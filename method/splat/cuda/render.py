@@ -14,9 +14,18 @@ from torch import Tensor
 
 from spike4dgs.benchmark.environment import missing_rasterizer
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.splat.cuda.launch import launch, simulated
-from spike4dgs.method.splat.cuda.lists import TILE, Grid, Lists, all_tiles, make_pairs, sort_pairs
-from spike4dgs.method.splat.cuda.project import Seen, project
+from spike4dgs.method.splat.cuda.prepare import (
+    TILE,
+    Grid,
+    Lists,
+    Seen,
+    all_tiles,
+    launch,
+    make_pairs,
+    project,
+    simulated,
+    sort_pairs,
+)
 from spike4dgs.method.splat.types import RenderOutput, Splats, Views, require_finite
 
 THREADS = TILE * TILE  # of a block: one for each pixel

@@ -23,9 +23,8 @@ from spike4dgs.method.splat.kernels.blend_ir import (
     differentiate_blocks,
     replay_blocks,
 )
-from spike4dgs.method.splat.kernels.blocks import BATCH, list_blocks
 from spike4dgs.method.splat.kernels.jit import helper, kernel, source_digest
-from spike4dgs.method.splat.kernels.tiles import sort_tile
+from spike4dgs.method.splat.kernels.tiles import BATCH, list_blocks, sort_tile
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 

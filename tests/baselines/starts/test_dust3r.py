@@ -17,9 +17,8 @@ from spike4dgs.baselines.starts.dust3r_network import Dust3r, Dust3rShape, canon
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.method.msdi.dpt import unpack
+from spike4dgs.method.msdi.layers import rotate, unpack
 from spike4dgs.method.msdi.pose import solve_pose
-from spike4dgs.method.msdi.transformer import rotate
 from spike4dgs.method.starts.structure_from_motion import clip_means
 
 TINY = Dust3rShape(2, 32, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)

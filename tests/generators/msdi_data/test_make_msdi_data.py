@@ -21,7 +21,7 @@ from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_msdi_
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
-from spike4dgs.method.msdi.training.data import points_of
+from spike4dgs.method.msdi.training_data import points_of
 
 
 def test_jittered_rigs_stay_near_the_worlds_own() -> None:

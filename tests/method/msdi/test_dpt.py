@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from spike4dgs.method.msdi.dpt import Fusion, unpack
+from spike4dgs.method.msdi.layers import Fusion, unpack
 
 
 def test_output_is_unpacked_by_the_exponentials_and_bounded() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from spike4dgs.method.msdi.training.losses import ALPHA, image_loss, point_loss
+from spike4dgs.method.msdi.losses import ALPHA, image_loss, point_loss
 
 SHAPE = (2, 3, 4, 5)
 

@@ -14,8 +14,8 @@ from toy_world import ToyWorld
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.msdi import PAPER, SMALL, TINY, Msdi
 from spike4dgs.method.msdi import network as module
+from spike4dgs.method.msdi.losses import image_loss, point_loss
 from spike4dgs.method.msdi.network import margins, ray_map, view_numbers
-from spike4dgs.method.msdi.training.losses import image_loss, point_loss
 
 
 @pytest.fixture(autouse=True)

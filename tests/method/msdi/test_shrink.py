@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.msdi.inputs import shrink, shrink_intrinsics
 from spike4dgs.method.msdi.network import ray_map
-from spike4dgs.method.msdi.shrink import shrink, shrink_intrinsics
 
 
 @pytest.mark.parametrize(("factor", "size"), [(2, (6, 8)), (3, (7, 5)), (4, (5, 9))])

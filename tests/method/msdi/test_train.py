@@ -14,18 +14,18 @@ from toy_bursts import write_toy_shard
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.msdi import TINY, Estimate, Msdi
+from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.inputs import Sensors
-from spike4dgs.method.msdi.training.curves import Curve
-from spike4dgs.method.msdi.training.data import Batch, Bursts
-from spike4dgs.method.msdi.training.evaluate import GROUPS, calibrate, evaluate, tfp
-from spike4dgs.method.msdi.training.losses import ALPHA
-from spike4dgs.method.msdi.training.train import (
+from spike4dgs.method.msdi.losses import ALPHA
+from spike4dgs.method.msdi.records import Curve
+from spike4dgs.method.msdi.train import (
     Training,
     TrainingSettings,
     checkpoint_key,
     start_from,
     train_msdi,
 )
+from spike4dgs.method.msdi.training_data import Batch, Bursts
 from spike4dgs.method.msdi.weights import load_network, read_card
 
 FAST = TrainingSettings(steps=150, views=4, most_views=3, lr_points=4e-3, warm_up=10)
@@ -101,7 +101,7 @@ def test_batches_have_a_steady_number_of_views(data: Bursts) -> None:
 def test_a_step_without_a_finite_gradient_changes_nothing(data: Bursts, monkeypatch: pytest.MonkeyPatch) -> None:
     training = Training(data, TINY, FAST, "cpu", seed=3)
     before = {name: value.clone() for name, value in training.network.state_dict().items()}
-    monkeypatch.setattr("spike4dgs.method.msdi.training.train.point_loss", lambda p, c, t, v: (c * float("inf")).sum())
+    monkeypatch.setattr("spike4dgs.method.msdi.train.point_loss", lambda p, c, t, v: (c * float("inf")).sum())
     training.train_step()
     assert training.step == 1
     for name, value in training.network.state_dict().items():

@@ -20,8 +20,17 @@ from spike4dgs.generators.msdi_data.rigs import jittered_cameras
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.worlds import WORLDS
-from spike4dgs.method.msdi.training.data import Bursts, check_ticks, chosen, mirrored, points_of, varied
-from spike4dgs.method.msdi.training.spikes import Pixels, fire, make_spikes
+from spike4dgs.method.msdi.training_data import (
+    Bursts,
+    Pixels,
+    check_ticks,
+    chosen,
+    fire,
+    make_spikes,
+    mirrored,
+    points_of,
+    varied,
+)
 
 
 def test_jittered_rigs_stay_near_the_worlds_own() -> None:

@@ -12,9 +12,8 @@ from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.scene.camera_state import CameraState, Clock
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.recordings.clocks import survey_clocks
 from spike4dgs.method.recordings.recording import GIVEN, Recording
-from spike4dgs.method.recordings.self_calibrated import self_calibrated
+from spike4dgs.method.recordings.self_calibrated import self_calibrated, survey_clocks
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings
 from spike4dgs.method.self_calibration.pose_adjustment import turn

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.recordings.gains import log_gains, shrunk
+from spike4dgs.method.recordings.camera_facts import log_gains, shrunk
 from spike4dgs.method.recordings.survey import survey_gains, survey_streams
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=200, travel=0.0, seed=1)

@@ -5,8 +5,18 @@ from __future__ import annotations
 import numpy as np
 from clock_world import ClockWorld
 
-from spike4dgs.method.self_calibration.patches import BASIS, POINTS, STRIDE_PX, Patches, rays, strongest, sweep
-from spike4dgs.method.self_calibration.window_images import look_up, moment, viewers
+from spike4dgs.method.self_calibration.patches import (
+    BASIS,
+    POINTS,
+    STRIDE_PX,
+    Patches,
+    look_up,
+    moment,
+    rays,
+    strongest,
+    sweep,
+    viewers,
+)
 
 WORLD = ClockWorld(n_ticks=120)
 CAMERAS = WORLD.training.cameras

@@ -11,9 +11,8 @@ from clock_world import ClockWorld
 
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, angle_deg
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings, adjust, triangulated, turn
+from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings, Tracks, adjust, triangulated, turn
 from spike4dgs.method.self_calibration.poses import check_poses, pose_of_another
-from spike4dgs.method.self_calibration.tracks import Tracks
 
 WORLD = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1)
 SCENE = WORLD.training

@@ -9,7 +9,7 @@ from clock_world import ClockWorld
 
 from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.method.self_calibration.window_images import blurred, moment, viewers, window_image
+from spike4dgs.method.self_calibration.patches import blurred, moment, viewers, window_image
 
 WORLD = ClockWorld(n_ticks=120)
 SCENE = WORLD.training

@@ -14,7 +14,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import PoseErrors, pose_errors
-from spike4dgs.method.msdi.training.data import points_of
+from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.starts import matched_poses as module
 from spike4dgs.method.starts.matched_poses import Pose, Seen, bundle

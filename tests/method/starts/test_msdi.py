@@ -20,7 +20,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.network import Msdi
-from spike4dgs.method.msdi.training.data import points_of
+from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.msdi.weights import VARIABLE, Card, load_network, save_weights
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.msdi import (

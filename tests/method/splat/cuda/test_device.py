@@ -22,8 +22,8 @@ from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.msdi import TINY
-from spike4dgs.method.msdi.training.data import Bursts
-from spike4dgs.method.msdi.training.train import Training, TrainingSettings
+from spike4dgs.method.msdi.train import Training, TrainingSettings
+from spike4dgs.method.msdi.training_data import Bursts
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.splat.ssim import ssim, ssim_reference

@@ -8,8 +8,7 @@ import torch
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.hard_cases.splat_scenes import HARD, random_splats, views
 from spike4dgs.method.splat import render
-from spike4dgs.method.splat.cuda.lists import TILE, all_tiles, make_pairs, sort_pairs
-from spike4dgs.method.splat.cuda.project import project
+from spike4dgs.method.splat.cuda.prepare import TILE, all_tiles, make_pairs, project, sort_pairs
 from spike4dgs.method.splat.cuda.render import grid_of
 from spike4dgs.method.splat.reference import project as project_reference
 

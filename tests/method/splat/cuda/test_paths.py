@@ -14,8 +14,8 @@ from spike4dgs.benchmark.method import FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.msdi import TINY
-from spike4dgs.method.msdi.training.data import Bursts
-from spike4dgs.method.msdi.training.train import Training, TrainingSettings
+from spike4dgs.method.msdi.train import Training, TrainingSettings
+from spike4dgs.method.msdi.training_data import Bursts
 
 METHODS = find_methods()
 

@@ -1,5 +1,7 @@
 """Scores of MSDI on data that it was not trained on: images, points, confidence and poses, against the truth.
 
+Scores of MSDI on data that it was not trained on: images, points, confidence and poses, against the truth.
+
 Names and units of `Scores.measured`:
 
 - `psnr_db`, `psnr_dynamic_db`: of the images, mean over views; `raw_...`: of those without knowledge of the sensors;
@@ -29,10 +31,10 @@ from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.training_bursts import Float64
 from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.losses import ALPHA, normalized
 from spike4dgs.method.msdi.network import Estimate, Msdi
 from spike4dgs.method.msdi.pose import poses_of
-from spike4dgs.method.msdi.training.data import Batch
-from spike4dgs.method.msdi.training.losses import ALPHA, normalized
+from spike4dgs.method.msdi.training_data import Batch
 
 GROUPS = 10
 _POINTS = 10_000  # pixels of a sample that are compared

@@ -1,5 +1,7 @@
 """Train MSDI on training bursts: `train-msdi`.
 
+Train MSDI on training bursts: `train-msdi`.
+
 Loss: L1 of the images in radiance, which trains extractor and generator, and DUSt3R's confidence-weighted regression of
 points (`losses`), which trains everything behind them. Each step has a fixed number of views: few samples of many
 views, or many of few.
@@ -30,14 +32,12 @@ from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
 from spike4dgs.method.msdi.checkpoints import transfer
 from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
+from spike4dgs.method.msdi.evaluate import Scores, evaluate
 from spike4dgs.method.msdi.inputs import Sensors
+from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings, image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
-from spike4dgs.method.msdi.training.curves import Curve, plot_calibration, plot_curves
-from spike4dgs.method.msdi.training.data import Batch, Bursts, check_ticks
-from spike4dgs.method.msdi.training.evaluate import Scores, evaluate
-from spike4dgs.method.msdi.training.losses import image_loss, point_loss
-from spike4dgs.method.msdi.training.model_card import model_card
-from spike4dgs.method.msdi.training.settings import PUBLISHED, TrainingSettings
+from spike4dgs.method.msdi.records import Curve, model_card, plot_calibration, plot_curves
+from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
 from spike4dgs.method.msdi.weights import Card, save_weights
 
 ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only

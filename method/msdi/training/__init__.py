@@ -1,1 +1,0 @@
-"""Training of MSDI: data, losses, the loop, evaluation, the model card."""

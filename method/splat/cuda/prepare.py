@@ -1,0 +1,177 @@
+"""What the CUDA back end does first: project by torch, list the tiles' Gaussians, launch kernels on torch's stream.
+
+Launching numba's CUDA kernels on torch tensors: on torch's current stream, or in numba's simulator.
+
+With NUMBA_ENABLE_CUDASIM=1 numba runs a kernel as Python threads on NumPy arrays. That shows the arithmetic on a
+machine without a device, slowly, and nothing else: neither the compilation nor the speed.
+
+Projection into all views at once, by differentiable torch operations in float64, on any device.
+
+The formulas are those of `reference.py`; its docstring has the symbols. Here only Gaussians that are seen are kept, as
+M rows of (view, Gaussian), and each becomes what the kernels need: a centre and whitened coordinates.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from numba.core import config
+from torch import Tensor
+
+from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, Splats, Views
+
+# A small image has few tiles. That a grid could be larger is no news to the user.
+warnings.filterwarnings("ignore", message=".*Grid size")
+
+
+def simulated() -> bool:
+    """Return whether numba runs CUDA kernels in its simulator, which takes tensors of the CPU."""
+    return bool(config.ENABLE_CUDASIM)  # type: ignore[attr-defined, unused-ignore]
+
+
+def launch(kernel: Any, blocks: int, threads: int, device: torch.device, *arguments: Any) -> None:
+    """Run `kernel` on a grid of `blocks` x `threads`; tensors among the arguments are passed as arrays."""
+    if blocks == 0:
+        return
+    if simulated():
+        kernel[blocks, threads](*(a.detach().numpy() if isinstance(a, Tensor) else a for a in arguments))
+        return
+    from numba import cuda
+
+    with cuda.gpus[device.index or 0]:
+        stream = cuda.external_stream(torch.cuda.current_stream(device).cuda_stream)
+        arrays = (cuda.as_cuda_array(a.detach(), sync=False) if isinstance(a, Tensor) else a for a in arguments)
+        kernel[blocks, threads, stream](*arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The M pairs of a view and a Gaussian that is visible in it, in the order of views, then Gaussians."""
+
+    view: Tensor  # [M] int64
+    index: Tensor  # [M] int64 into the N Gaussians
+    center: Tensor  # [M, 2] px
+    shape: Tensor  # [M, 4] slope, xi scale, eta scale, opacity; see kernels.py
+    depth: Tensor  # [M]
+    box: Tensor  # [M, 4] int64: first and last + 1 pixel column, then row, whose centres the ellipse may cover
+    radius: Tensor  # [M] px
+
+
+def project(splats: Splats, views: Views, antialiased: bool, near: float, eps2d: float) -> Seen:
+    """Project Gaussians into views; all tensors on one device. See `render` for the arguments."""
+    means, quats, scales, opacities = (t.double() for t in splats.geometry)
+    w2c, K = views.w2c.double(), views.K.double()
+    p = means @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]  # [C, N, 3]
+    exists = (quats.square().sum(-1) > 0) & (opacities >= ALPHA_MIN)
+    view, index = torch.nonzero((p[..., 2] >= near) & exists, as_tuple=True)
+    axes = rotation_matrices(torch.where(exists[:, None], quats, quats.new_tensor([1.0, 0, 0, 0]))) * scales[:, None]
+    p, f, c = p[view, index], K[:, [0, 1], [0, 1]][view], K[:, :2, 2][view]
+    z = p[:, 2:]
+    slope = p[:, :2] / z  # [M, 2] tangent of the viewing angle
+    image = p.new_tensor([views.width, views.height])
+    margin = FRUSTUM_MARGIN * 0.5 * image / f
+    inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
+    J = torch.cat([torch.diag_embed(f / z), (-f * inside / z)[:, :, None]], -1)  # [M, 2, 3]
+    half = J @ (w2c[:, None, :3, :3] @ axes)[view, index]
+    b0, b1 = half.unbind(1)
+    det_sharp = torch.linalg.cross(b0, b1).square().sum(-1)
+    xx, xy, yy = (b0 * b0).sum(-1), (b0 * b1).sum(-1), (b1 * b1).sum(-1)
+    det = det_sharp + eps2d * (xx + yy) + eps2d**2
+    xx, yy = xx + eps2d, yy + eps2d
+    center, opacity = f * slope + c, opacities[index]
+    with torch.no_grad():
+        share = (det_sharp / det).sqrt() if antialiased else torch.ones_like(det)
+        reach = 2 * (255 * opacity * share).clamp(min=1).log()
+        extent = (reach[:, None] * torch.stack([xx, yy], -1)).sqrt()  # [M, 2] half sides of the visible box
+        first = torch.ceil(center - extent - 0.5).clamp(min=0)
+        last = torch.minimum(torch.floor(center + extent + 0.5), image)
+        visible = (opacity * share >= ALPHA_MIN) & (det > 0) & torch.isfinite(det) & (first < last).all(-1)
+        keep = torch.nonzero(visible)[:, 0]
+        box = torch.stack([first, last], -1)[keep].flatten(1).long()
+    xx, xy, det, opacity = (t.index_select(0, keep) for t in (xx, xy, det, opacity))
+    if antialiased:  # after the selection: the root's slope is infinite at 0
+        opacity = opacity * (det_sharp.index_select(0, keep) / det).sqrt()
+    shape = torch.stack([xy / xx, (0.5 / xx).sqrt(), (0.5 * xx / det).sqrt(), opacity], -1)
+    center, depth = center.index_select(0, keep), z[:, 0].index_select(0, keep)
+    return Seen(view[keep], index[keep], center, shape, depth, box, extent[keep].amax(-1))
+
+
+TILE = 16  # pixels
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The tiles of `views` images of one size. A tile's number is view * (across * down) + row * across + column."""
+
+    views: int
+    width: int
+    height: int
+
+    @property
+    def across(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def down(self) -> int:
+        """Rows of tiles."""
+        return -(-self.height // TILE)
+
+    def __len__(self) -> int:
+        return self.views * self.across * self.down
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """P Gaussian-tile pairs, in the order of the Gaussians."""
+
+    keys: Tensor  # [P] int64: tile number << 32 | bits of the float32 depth
+    rows: Tensor  # [P] the Gaussian's row
+    starts: Tensor  # [M + 1] the pairs of row m are starts[m]:starts[m + 1]
+
+
+def make_pairs(view: Tensor, box: Tensor, depth: Tensor, grid: Grid) -> Pairs:
+    """Return the pairs of M Gaussians.
+
+    view [M]: image of each; box [M, 4]: first and last + 1 pixel column, then row; depth [M], positive.
+    """
+    first, last = box[:, 0::2] // TILE, (box[:, 1::2] - 1) // TILE + 1  # [M, 2] tiles in x and y
+    width, height = (last - first).unbind(-1)
+    starts = torch.zeros(len(view) + 1, dtype=torch.int64, device=view.device)
+    torch.cumsum(width * height, 0, out=starts[1:])
+    total = int(starts[-1])
+    rows = torch.repeat_interleave(torch.arange(len(view), device=view.device), width * height, output_size=total)
+    inside = torch.arange(total, device=view.device) - starts[rows]
+    wide = width[rows]
+    column, row = first[rows, 0] + inside % wide, first[rows, 1] + inside // wide
+    tile = (view[rows] * grid.down + row) * grid.across + column
+    bits = depth.detach().float().view(torch.int32).long()[rows]
+    return Pairs((tile << 32) | bits, rows, starts)
+
+
+@dataclass(frozen=True, eq=False)
+class Lists:
+    """The pairs, tile by tile and nearest first, ties by row; and the tiles that are rendered."""
+
+    grid: Grid
+    keys: Tensor  # [P] int64, see Pairs
+    rows: Tensor  # [P] the Gaussian's row in the kernels' records
+    slots: Tensor  # [P] the pair's row in the gradient records, or -1
+    offsets: Tensor  # [tiles + 1] the list of tile t is offsets[t]:offsets[t + 1]
+    tiles: Tensor  # [K] the numbers of the tiles to render
+
+
+def all_tiles(grid: Grid, device: torch.device) -> Tensor:
+    """Return the numbers of all tiles."""
+    return torch.arange(len(grid), device=device)
+
+
+def sort_pairs(grid: Grid, keys: Tensor, rows: Tensor, slots: Tensor, tiles: Tensor) -> Lists:
+    """Return the lists of pairs in any order of tiles; pairs of one tile and depth keep their order."""
+    ordered, order = torch.sort(keys, stable=True)
+    bounds = torch.arange(len(grid) + 1, device=keys.device) << 32
+    return Lists(grid, ordered, rows[order], slots[order], torch.searchsorted(ordered, bounds), tiles)
