@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Recipe, find_methods, get_method
     from spike4dgs.benchmark.metrics.measure import score_image
     from spike4dgs.benchmark.metrics.table import METRICS
-    from spike4dgs.benchmark.runs.dataframe import records_to_dataframe
     from spike4dgs.benchmark.runs.record import read_record
+    from spike4dgs.benchmark.runs.results import records_to_dataframe
     from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.cameras import Camera
     from spike4dgs.benchmark.scene.scene import Scene, Target, TrainingScene, open_scene

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.record import COSTS
@@ -116,8 +117,5 @@ def ranking_table(board: Board, metric: str) -> Table:
 def _costs(records: tuple[Mapping[str, Any], ...]) -> list[str]:
     """Return the means over scenes and seeds; a dash where one is missing."""
     cells = [cell for r in records for cell in r["scenes"].values()]
-    values = {cost: [cell[cost] for cell in cells] for cost in COSTS}
-    return [
-        "-" if None in values[cost] else f"{sum(values[cost]) / len(cells):.{digits}f}"
-        for cost, (_, digits) in COSTS.items()
-    ]
+    means = [(mean(cell[cost] for cell in cells), digits) for cost, (_, digits) in COSTS.items()]
+    return ["-" if value is None else f"{value:.{digits}f}" for value, digits in means]

@@ -16,14 +16,14 @@ from tyro.conf import OmitArgPrefixes, Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, Method, choose_device_for, find_methods, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
-from spike4dgs.benchmark.release.track import track_folders
+from spike4dgs.benchmark.release.scenes import track_folders
+from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
-from spike4dgs.benchmark.runs.benchmark import SplitRun, run_split
-from spike4dgs.benchmark.runs.earlier import of_one_seed
 from spike4dgs.benchmark.runs.record import Record
 from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.benchmark.runs.results import of_one_seed
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From

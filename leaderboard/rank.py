@@ -20,6 +20,7 @@ from typing import Any
 
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -186,15 +187,15 @@ def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
         "seeds": sorted({r["method"]["seed"] or 0 for r in records}),
         "entries": list(paths),
         "submitted": min(e["submitted"] for e in entries),
-        "mean": {metric: _mean(r["mean"][metric] for r in records) for metric in METRICS},
+        "mean": {metric: mean(r["mean"][metric] for r in records) for metric in METRICS},
         "unverified": [m for m in METRICS if any(m in c["unverified"] for c in checks)],
         "status": {scene: cell["status"] for scene, cell in first["scenes"].items()},
         "given": first["method"].get("given", list(GIVEN)),
         "trained_on": first["method"]["trained_on"],
         "costs": {
             cost: {
-                "claimed": _mean(_of_scenes(cost, r["scenes"]) for r in records),
-                "re-fitted": _mean(_of_scenes(cost, c["refit"]["costs"] if c["refit"] else {}) for c in checks),
+                "claimed": mean(_of_scenes(cost, r["scenes"]) for r in records),
+                "re-fitted": mean(_of_scenes(cost, c["refit"]["costs"] if c["refit"] else {}) for c in checks),
             }
             for cost in COSTS
         },
@@ -207,15 +208,8 @@ def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
 
 def _of_scenes(cost: str, cells: Mapping[str, Mapping[str, Any]]) -> float | None:
     """Return a cost over scenes: the sum of fit times, the mean of others; None where a scene has none."""
-    mean = _mean(cell[cost] for cell in cells.values())
-    return mean if mean is None or cost != "fit_seconds" else mean * len(cells)
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    """Return the mean; None where a value is None, and for no values."""
-    found = list(values)
-    numbers = [v for v in found if v is not None]
-    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(found) else None
+    value = mean(cell[cost] for cell in cells.values())
+    return value if value is None or cost != "fit_seconds" else value * len(cells)
 
 
 def _code(harness: Mapping[str, Any]) -> str:

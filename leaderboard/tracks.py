@@ -21,7 +21,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.method import GIVEN
-from spike4dgs.benchmark.runs.sensors import NOISY
+from spike4dgs.benchmark.runs.record import NOISY
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))

@@ -16,11 +16,10 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.runs.held_out import has_truth
 from spike4dgs.benchmark.runs.predictions import SUMS
-from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value
+from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value, sensor_of
 from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
-from spike4dgs.benchmark.runs.sensors import sensor_of
-from spike4dgs.benchmark.runs.targets import has_truth
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import FOLDERS, Entry, check_folder, read_entries
 from spike4dgs.leaderboard.rank import FILES, make_boards

@@ -20,9 +20,8 @@ from spike4dgs.benchmark.metrics.measure import Values, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
-from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
+from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, has_truth
 from spike4dgs.benchmark.runs.score import open_for, score_scene
-from spike4dgs.benchmark.runs.targets import has_truth
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
 FEWEST = 3  # methods with two values, of which an order says something

@@ -145,6 +145,13 @@ def fit_gain(pairs: Iterable[tuple[Image, Image]]) -> float | None:
     return cross / power if power > 0 and cross > 0 else None
 
 
+def mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean; None where a value is missing, and for no values."""
+    found = list(values)
+    known = [v for v in found if v is not None]
+    return math.fsum(known) / len(known) if known and len(known) == len(found) else None
+
+
 def scene_means(per_image: Mapping[str, Mapping[str, float | None]]) -> Values:
     """Return each metric's mean over the images (camera/tick) for which it is defined; None if one lacks a value."""
     means: Values = {}
@@ -155,8 +162,7 @@ def scene_means(per_image: Mapping[str, Mapping[str, float | None]]) -> Values:
             values = {name: v for name, v in values.items() if v is not None}
         elif m.images is Images.LATER:
             values = {name: v for name, v in values.items() if name in later}
-        known = [v for v in values.values() if v is not None]
-        means[m.id] = math.fsum(known) / len(known) if known and len(known) == len(values) else None
+        means[m.id] = mean(values.values())
     return means
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark import croissant as croissant
+from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.files import sha256_file, write_json, write_text
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import SceneEntry, Shard

@@ -12,13 +12,13 @@ what it wants, so a release of many terabytes costs its clients no more than the
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import parse_json
-from spike4dgs.benchmark.release.layout import part_of
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 NAME = "release.json"
@@ -206,3 +206,38 @@ def read_release(root: Path) -> Release:
         raise problem(path, "the description of a release", "no such file", "name a folder of `spike4dgs release pack`")
     text = path.read_bytes()
     return parse_release(text, hashlib.sha256(text).hexdigest(), str(path))
+
+
+DESCRIPTION = "description"  # the part of the files at the top of a scene folder
+SCENE_SAMPLE = "scene"  # the sample of what belongs to no camera
+# What comes first of a camera; other parts follow by name.
+_ORDER = ("spikes", "calibration", "truth", "images", "masks", "geometry", "events", "conventional")
+
+
+def part_of(path: str) -> str:
+    """Return the part that a file belongs to: the folder at the top of its path, such as `spikes`, or DESCRIPTION."""
+    top, _, rest = path.partition("/")
+    return top if rest else DESCRIPTION
+
+
+def camera_of(path: str, cameras: Collection[str]) -> str | None:
+    """Return the camera that a file belongs to, by the names of its folders and its own; None for the scene's files."""
+    *folders, name = path.split("/")
+    named = [word for word in (*folders, name.partition(".")[0]) if word in cameras]
+    return named[0] if folders and named else None
+
+
+def member_name(scene: str, path: str, camera: str | None) -> str:
+    """Return the name of a file in its shard: SCENE/SAMPLE.REST, the rest being the path with dots for slashes."""
+    words = path.split("/")
+    if camera is not None:
+        words[-1] = words[-1].removeprefix(f"{camera}.")
+        words = [word for word in words if word != camera]
+    return f"{scene}/{SCENE_SAMPLE if camera is None else camera}.{'.'.join(words)}"
+
+
+def order_of(path: str, camera: str | None) -> tuple[str, int, str]:
+    """Return a file's place in its scene: the scene's own files first, then camera by camera."""
+    part = part_of(path)
+    rank = -1 if part == DESCRIPTION else _ORDER.index(part) if part in _ORDER else len(_ORDER)
+    return camera or "", rank, path

@@ -5,6 +5,7 @@ The same scenes give the same bytes. A killed run resumes: shards that are finis
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,17 +13,30 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import sha256_file, write_json, write_text
+from spike4dgs.benchmark.files import check_new, read_json, sha256_file, write_bytes, write_json, write_text, writing
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.release import card, index
-from spike4dgs.benchmark.release.counted_copy import counted_copy
-from spike4dgs.benchmark.release.index import Release, Sample, SceneEntry, Shard, index_of, read_release, release_json
-from spike4dgs.benchmark.release.layout import camera_of, member_name, order_of, part_of
+from spike4dgs.benchmark.release.index import (
+    Release,
+    Sample,
+    SceneEntry,
+    Shard,
+    camera_of,
+    index_of,
+    member_name,
+    order_of,
+    part_of,
+    read_release,
+    release_json,
+)
 from spike4dgs.benchmark.release.progress import ByteProgress
 from spike4dgs.benchmark.release.shard import PlannedFile, find_shard, write_shard
 from spike4dgs.benchmark.scene import manifest
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.benchmark.spikes.counted_recording import encode_recording
 
 SUMS = "SHA256SUMS"
 _COUNTED = ".counted"  # copies of scenes, while they are packed
@@ -166,3 +180,38 @@ def _entry(scene: Scene, samples: tuple[Sample, ...]) -> SceneEntry:
         streams=dict(scene.meta["streams"]),
         gaps=tuple(gap.record for gap in scene.gaps),
     )
+
+
+def counted_copy(scene: Scene, out: Path) -> Scene:
+    """Write the scene to the new folder `out`, its recordings counted, and return the copy, which has its revision.
+
+    Raises UserError where `out` is not new, and where a file is missing or damaged.
+    """
+    check_new(out)
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        for name in scene.manifest.files:
+            if not name.startswith(("calibration/flat/", "calibration/dark/")):
+                _copy(scene.manifest.path(name), part / name)
+        for camera in scene.cameras:
+            if found := scene.recordings(camera):
+                for kind, recording in (("flat", found.flat), ("dark", found.dark)):
+                    write_bytes(part / f"calibration/{kind}/{camera}.npz", encode_recording(recording))
+        if (part / croissant.NAME).is_file():
+            about = read_json(part / croissant.NAME, "a scene's description")["description"]
+            croissant.write_croissant(part, scene.meta, str(about))
+        write_manifest(part)
+        if (found_revision := open_scene(part, allow_gaps=True).revision) != scene.revision:
+            fix = "check it with `spike4dgs verify`"
+            raise problem(scene.root, f"revision {scene.revision[:16]}...", f"{found_revision[:16]}...", fix)
+        with writing(out):
+            os.replace(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return open_scene(out, allow_gaps=True, split=scene.split)
+
+
+def _copy(source: Path, target: Path) -> None:
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)

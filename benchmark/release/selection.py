@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.release.index import Member, Release, Sample, SceneEntry
-from spike4dgs.benchmark.release.layout import DESCRIPTION, part_of
+from spike4dgs.benchmark.release.index import DESCRIPTION, Member, Release, Sample, SceneEntry, part_of
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import stdev
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record
@@ -81,7 +81,7 @@ class _Row:
     cells: Sequence[Cell] = ()
 
     def mean(self, metric: str) -> float | None:
-        return _mean([values[metric] for values in self.values])
+        return mean(values[metric] for values in self.values)
 
     def text(self, metric: Metric) -> str:
         known = [v for values in self.values if (v := values[metric.id]) is not None]
@@ -89,14 +89,8 @@ class _Row:
         return metric.format(self.mean(metric.id)) + spread
 
     def cost(self, key: str, digits: int) -> str:
-        mean = _mean([cell[key] for cell in self.cells]) if self.cells else None
-        return "" if mean is None else f"{mean:.{digits}f}"
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Return the mean, or None where one does not exist."""
-    known = [v for v in values if v is not None]
-    return math.fsum(known) / len(known) if len(known) == len(values) else None
+        value = mean(cell[key] for cell in self.cells)
+        return "" if value is None else f"{value:.{digits}f}"
 
 
 def _add_block(table: Table, title: str, metrics: Sequence[Metric], rows: Sequence[_Row]) -> None:
@@ -114,14 +108,3 @@ def _add_block(table: Table, title: str, metrics: Sequence[Metric], rows: Sequen
         failed = sorted({cell["status"] for cell in row.cells} - {"ok"})
         shown = escape(row.name) + (f" [red]({', '.join(failed)})[/red]" if failed else "")
         table.add_row(escape(title) if i == 0 else "", shown, *texts, *costs, end_section=i == len(rows) - 1)
-
-
-def cell_summary(cell: Cell) -> str:
-    """Return one line about a cell: its scores and costs, or why it has none."""
-    if cell["status"] != "ok":
-        return f"{cell['status']}: {cell['error']}"
-    ids = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
-    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ids]
-    costs = [("fit", "fit_seconds", "s"), ("render", "render_fps", "images/s"), ("peak", "peak_memory_mb", "MB")]
-    shown += [f"{name} {cell[k]:.1f} {unit}" for name, k, unit in costs if cell[k] is not None]
-    return ", ".join(shown)

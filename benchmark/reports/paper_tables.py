@@ -16,7 +16,7 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.measure import measure
+from spike4dgs.benchmark.metrics.measure import mean, measure
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.record import COSTS, Record
@@ -60,9 +60,7 @@ class PublishedTable:
         """Return the mean over the table's columns, or the published mean."""
         if (published_mean := self.value(method, MEAN, metric)) is not None:
             return published_mean
-        values = [self.value(method, column, metric) for column in self.splits or self.worlds]
-        known = [v for v in values if v is not None]
-        return sum(known) / len(known) if len(known) == len(values) else None
+        return mean(self.value(method, column, metric) for column in self.splits or self.worlds)
 
 
 @cache
@@ -126,11 +124,7 @@ def truth_scores(scene: Scene, metrics: Sequence[Metric]) -> dict[str, float | N
         values = measure(pair, None, [METRICS[m] for m in found]).values
         for metric, gathered in found.items():
             gathered.append(values[metric])
-    means = {}
-    for metric, gathered in found.items():
-        known = [v for v in gathered if v is not None]
-        means[metric] = sum(known) / len(known) if known and len(known) == len(gathered) else None
-    return means
+    return {metric: mean(gathered) for metric, gathered in found.items()}
 
 
 def build_table(
@@ -186,14 +180,9 @@ def _row(table: PublishedTable, record: Record, worlds: Mapping[str, str]) -> di
                 "published": table.value(name, worlds[scene], metric),
             }
         scenes[scene] = {"status": cell["status"], "values": values, **{k: cell.get(k) for k in COSTS}}
-    mean = {m: {"value": record["mean"][m], "published": table.mean(name, m)} for m in columns}
-    return {"method": name, "scenes": scenes, "mean": mean, "costs": {k: _mean_cost(record, k) for k in COSTS}}
-
-
-def _mean_cost(record: Record, cost: str) -> float | None:
-    values = [cell.get(cost) for cell in record["scenes"].values()]
-    known = [v for v in values if v is not None]
-    return sum(known) / len(known) if known else None
+    means = {m: {"value": record["mean"][m], "published": table.mean(name, m)} for m in columns}
+    costs = {k: mean(v for c in scenes.values() if (v := c[k]) is not None) for k in COSTS}
+    return {"method": name, "scenes": scenes, "mean": means, "costs": costs}
 
 
 def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:

@@ -1,4 +1,4 @@
-"""Progress of a run: bars with an estimate on a terminal, lines with one elsewhere."""
+"""Progress of a run: bars with an estimate on a terminal, lines with one elsewhere; what came of each cell."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.runs.record import Cell
 
 
 @dataclass(frozen=True)
@@ -61,3 +64,14 @@ class RunDisplay:
         if left := self._cells - self._done:
             elapsed = time.perf_counter() - self._start
             note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
+
+
+def cell_summary(cell: Cell) -> str:
+    """Return one line about a cell: its scores and costs, or why it has none."""
+    if cell["status"] != "ok":
+        return f"{cell['status']}: {cell['error']}"
+    ids = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
+    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ids]
+    costs = [("fit", "fit_seconds", "s"), ("render", "render_fps", "images/s"), ("peak", "peak_memory_mb", "MB")]
+    shown += [f"{name} {cell[k]:.1f} {unit}" for name, k, unit in costs if cell[k] is not None]
+    return ", ".join(shown)

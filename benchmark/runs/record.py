@@ -6,7 +6,6 @@ and a scene without a value makes the mean null, never smaller.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,12 +14,32 @@ from typing import Any
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.metrics.measure import Values, scene_means
+from spike4dgs.benchmark.metrics.measure import Values, mean, scene_means
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo
-from spike4dgs.benchmark.runs.sensors import sensor_of
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+
+IDEAL, PARTLY, NOISY, RECORDED = "ideal", "partly noisy", "noisy", "recorded"
+SENSORS = (IDEAL, PARTLY, NOISY, RECORDED)  # as in result.schema.json
+TERMS = ("gain_map", "dark_map", "photons_per_spike")  # of the simulated noise; false or null where it is off
+
+
+def sensor_of(meta: Mapping[str, Any]) -> str | None:
+    """Return the sensor that scene.json states: one of `SENSORS`, or None where it does not say.
+
+    A simulated one is noisy with all `TERMS`, ideal without any, and partly noisy between.
+
+    >>> sensor_of({"sensor": {"gain_map": True, "dark_map": True, "photons_per_spike": None}, "source": {"kind": "x"}})
+    'partly noisy'
+    """
+    if meta["source"]["kind"] == "recorder":
+        return RECORDED
+    if not all(term in meta["sensor"] for term in TERMS):
+        return None
+    on = sum(bool(meta["sensor"][term]) for term in TERMS)
+    return IDEAL if not on else NOISY if on == len(TERMS) else PARTLY
+
 
 SCHEMA = "spike4dgs-result/1"
 PROTOCOL: dict[str, Any] = {"name": "held-out-views", "version": 1}  # raise the version when a score would change
@@ -78,11 +97,7 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
 
 def dataset_means(cells: Mapping[str, Cell]) -> Values:
     """Return the mean over scenes of each metric; None where any scene has no value."""
-    means: Values = {}
-    for metric in METRICS:
-        values = [cell["metrics"].get(metric) for cell in cells.values()]
-        means[metric] = None if None in values else math.fsum(values) / len(values)
-    return means
+    return {metric: mean(cell["metrics"].get(metric) for cell in cells.values()) for metric in METRICS}
 
 
 def is_complete(record: Record) -> bool:

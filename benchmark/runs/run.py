@@ -25,9 +25,8 @@ from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.locks import locked
 from spike4dgs.benchmark.method import Budget, Method
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.reports.console import cell_summary
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job
-from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell
+from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
 from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
 from spike4dgs.benchmark.runs.record import Cell, Record, build_record, check_method_name, missing_cell, write_record
 from spike4dgs.benchmark.runs.refinement import SUFFIX

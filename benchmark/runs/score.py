@@ -12,10 +12,9 @@ import numpy as np
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
 from spike4dgs.benchmark.metrics.measure import Selection, fit_gain, measure, scene_means, scene_notes, select_metrics
-from spike4dgs.benchmark.runs.own_spikes import Cameras, open_cameras, view_of, without_truth
+from spike4dgs.benchmark.runs.held_out import Cameras, has_truth, open_cameras, targets_of, view_of, without_truth
 from spike4dgs.benchmark.runs.predictions import SUMS, MethodInfo, Predictions, open_predictions
 from spike4dgs.benchmark.runs.record import Cell, Record, build_record, missing_cell
-from spike4dgs.benchmark.runs.targets import has_truth, targets_of
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
 _KEPT = 16  # targets whose images stay in memory: spikes around one are compared with those near it

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.runs.record import COSTS
@@ -97,16 +97,10 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
 
 def _cell(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return a cell: the means over seeds, null where one has none, and the reason where one was not scored."""
-    values = [_mean(c["metrics"].get(m) for c in seeds) for m in METRICS]
-    costs = [_mean(c[cost] for c in seeds) for cost in COSTS]
+    values = [mean(c["metrics"].get(m) for c in seeds) for m in METRICS]
+    costs = [mean(c[cost] for c in seeds) for cost in COSTS]
     failed = [f"{c['status']}: {c['error']}" for c in seeds if c["status"] != "ok"]
     return {"v": [rounded(v) for v in (*values, *costs)], "why": failed[0] if failed else ""}
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    found = list(values)
-    known = [v for v in found if v is not None]
-    return math.fsum(known) / len(known) if known and len(known) == len(found) else None
 
 
 def _budget(budget: float | str | None) -> str:

@@ -25,7 +25,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_bytes, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.error_map import ERROR_MAX, SCALES, error_colors
-from spike4dgs.benchmark.runs.earlier import write_results
+from spike4dgs.benchmark.runs.results import write_results
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics, score_content
 from spike4dgs.leaderboard.page.intervals import (
     FEWEST_SCENES,

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spike4dgs.benchmark.metrics.measure import Values, scene_means, select_metrics
-from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
+from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, targets_of
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
 from spike4dgs.benchmark.runs.score import open_for, score_scene
-from spike4dgs.benchmark.runs.targets import targets_of
 from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.runs.record import Record
 
@@ -57,7 +58,7 @@ def make_table(
     for title, name in rungs:
         mine = [r for r in records if r["method"]["name"] == name]
         cells = {scene: _of_seeds([r["scenes"][scene] for r in mine]) for scene in scenes}
-        every = {c: _mean([cell.values[c] for cell in cells.values()]) for c in COLUMNS}
+        every = {c: mean([cell.values[c] for cell in cells.values()]) for c in COLUMNS}
         rows[title] = {**cells, MEAN: Cell(every)}
     return LadderTable(method, tuple(scenes), rows)
 
@@ -65,18 +66,12 @@ def make_table(
 def _of_seeds(cells: Sequence[dict[str, object]]) -> Cell:
     errors = [str(c["error"]) for c in cells if c["error"]]
     found = [{**dict.fromkeys(COLUMNS), **_metrics(c), "fit_seconds": c["fit_seconds"]} for c in cells]
-    return Cell({name: _mean([v[name] for v in found]) for name in COLUMNS}, "; ".join(errors))
+    return Cell({name: mean([v[name] for v in found]) for name in COLUMNS}, "; ".join(errors))
 
 
 def _metrics(cell: dict[str, object]) -> dict[str, object]:
     metrics = cell["metrics"]
     return {name: metrics[name] for name in _GAINS} if isinstance(metrics, dict) else {}
-
-
-def _mean(values: Sequence[object]) -> float | None:
-    """Return the mean; None where a value is missing."""
-    known = [float(v) for v in values if isinstance(v, int | float)]
-    return math.fsum(known) / len(known) if known and len(known) == len(values) else None
 
 
 def write_ladder(out: Path, tables: Sequence[LadderTable]) -> None:

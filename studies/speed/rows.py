@@ -6,7 +6,6 @@ scored ticks are compared with the ground truth, as the benchmark compares a met
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
+from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.scene import Scene, Target
@@ -49,11 +49,11 @@ class Row:
 
     def mean(self, metric: str) -> float | None:
         """Return the mean over the scenes of a metric; None where there is none."""
-        return _mean([values[metric] for values in self.quality.values()])
+        return mean([values[metric] for values in self.quality.values()])
 
     def corrected_mean(self, metric: str) -> float | None:
         """Return the same of corrected images."""
-        return _mean([values[metric] for values in self.corrected.values()])
+        return mean([values[metric] for values in self.corrected.values()])
 
 
 def timed_stream() -> SpikeStream:
@@ -117,9 +117,4 @@ def _score(make: Callable[[Scene, Target], Float32], scene: Scene) -> dict[str, 
         pair = ImagePair(truth, image, moving, where)
         for metric in QUALITY:
             found[metric].append(METRICS[metric].measure(pair))
-    return {metric: _mean([v for v in values if v is not None]) for metric, values in found.items()}
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return math.fsum(known) / len(known) if known and len(known) == len(values) else None
+    return {metric: mean([v for v in values if v is not None]) for metric, values in found.items()}

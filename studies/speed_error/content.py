@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.reports.html.chart import Axis, Curve, Dot, chart
-from spike4dgs.benchmark.reports.html.page import (
+from spike4dgs.benchmark.reports.html_chart import Axis, Curve, Dot, chart, short
+from spike4dgs.benchmark.reports.html_page import (
     Html,
     contents,
     facts,
@@ -21,7 +21,6 @@ from spike4dgs.benchmark.reports.html.page import (
     table,
     write_page,
 )
-from spike4dgs.benchmark.reports.html.scales import short
 
 _OPEN_ROWS = 12  # a longer table is folded
 

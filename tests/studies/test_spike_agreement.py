@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.stats import spearmanr
 
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
+from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS
 from spike4dgs.cli import main
 from spike4dgs.studies.spike_agreement import correlations, means, partner
 

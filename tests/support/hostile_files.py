@@ -183,8 +183,8 @@ def make_board(folder: Path) -> None:
 def read_record_file(folder: Path, out: Path) -> None:
     from submissions import submit
 
-    from spike4dgs.benchmark.runs.dataframe import records_to_dataframe
     from spike4dgs.benchmark.runs.record import read_record
+    from spike4dgs.benchmark.runs.results import records_to_dataframe
 
     record = read_record(folder / "mine.json")
     with contextlib.suppress(ImportError):

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.reports.html.page import (
+from spike4dgs.benchmark.reports.html_chart import short
+from spike4dgs.benchmark.reports.html_page import (
     Html,
     bullets,
     contents,
@@ -19,7 +20,6 @@ from spike4dgs.benchmark.reports.html.page import (
     wide,
     write_page,
 )
-from spike4dgs.benchmark.reports.html.scales import short
 
 Rows = Sequence[dict[str, Any]]
 _INTRO = (

@@ -8,7 +8,7 @@ from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json
-from spike4dgs.benchmark.release.counted_copy import counted_copy
+from spike4dgs.benchmark.release.pack import counted_copy
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.verify import verify_content
 from spike4dgs.cli.verify import verify

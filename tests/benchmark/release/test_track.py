@@ -11,8 +11,8 @@ from range_server import serve
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.release import source as source_module
 from spike4dgs.benchmark.release.index import Release
+from spike4dgs.benchmark.release.scenes import track_folders
 from spike4dgs.benchmark.release.selection import Selection
-from spike4dgs.benchmark.release.track import track_folders
 from spike4dgs.cli import download as command
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spike4dgs.benchmark.reports.crop import SMALLEST, bounds, crops
+from spike4dgs.benchmark.reports.panels import SMALLEST, bounds, crops
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.floats(0.0005, 0.2))

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.brisque import brisque
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.reports.paper_files import to_csv, to_latex, to_markdown, write_table
 from spike4dgs.benchmark.reports.paper_tables import (
     build_table,
     kendall_tau,
@@ -25,7 +26,6 @@ from spike4dgs.benchmark.reports.paper_tables import (
     table_scenes,
     truth_scores,
 )
-from spike4dgs.benchmark.reports.table_files import to_csv, to_latex, to_markdown, write_table
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
 

@@ -12,8 +12,8 @@ from dummy_methods import CountMethod, FailingMethod, run
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.runs.dataframe import records_to_dataframe
 from spike4dgs.benchmark.runs.record import COSTS
+from spike4dgs.benchmark.runs.results import records_to_dataframe
 
 pytest.importorskip("pandas")
 

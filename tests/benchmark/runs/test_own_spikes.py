@@ -15,11 +15,10 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.runs.own_spikes import SPIKE_METRICS
+from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, has_truth, targets_of
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
 from spike4dgs.benchmark.runs.record import Cell, check_record, read_record, with_later_metrics, write_record
 from spike4dgs.benchmark.runs.score import open_for, score_predictions, score_scene
-from spike4dgs.benchmark.runs.targets import has_truth, targets_of
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.cli import main

@@ -12,8 +12,7 @@ from dummy_methods import CountMethod, run
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.predictions import MethodInfo
-from spike4dgs.benchmark.runs.record import build_record, check_record
-from spike4dgs.benchmark.runs.sensors import SENSORS, sensor_of
+from spike4dgs.benchmark.runs.record import SENSORS, build_record, check_record, sensor_of
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.schemas import load_schema
 

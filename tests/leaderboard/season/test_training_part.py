@@ -12,8 +12,8 @@ from made_season import Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.runs.held_out import has_truth
 from spike4dgs.benchmark.runs.score import open_for, score_scene
-from spike4dgs.benchmark.runs.targets import has_truth
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season.opening import NAME, read_opening

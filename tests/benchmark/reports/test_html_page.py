@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from devtools import Page, browser
 
-from spike4dgs.benchmark.reports.html import page
-from spike4dgs.benchmark.reports.html.chart import Axis, Curve, Dot, chart
+from spike4dgs.benchmark.reports import html_page as page
+from spike4dgs.benchmark.reports.html_chart import Axis, Curve, Dot, chart
 
 HOSTILE = '<img src=x onerror="window.hacked=1"></title></style><script>window.hacked=1</script>&'
 VOID = {"meta", "link", "img", "br", "line", "circle", "polyline"}

@@ -21,8 +21,8 @@ from spike4dgs.benchmark.reports.console import results_table
 from spike4dgs.benchmark.reports.scatter import write_scatter
 from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.reports.sheet_video import write_sheet_video
-from spike4dgs.benchmark.runs.earlier import earlier_records, is_shown, of_one_seed, write_results
 from spike4dgs.benchmark.runs.record import Record
+from spike4dgs.benchmark.runs.results import earlier_records, is_shown, of_one_seed, write_results
 from spike4dgs.benchmark.runs.run import Settings, predictions_folder, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene
 
