@@ -18,7 +18,7 @@ MOVED = {
 
 COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
-        "spike4dgs.generators.make_dataset:make_dataset",
+        "spike4dgs.cli.make_dataset:make_dataset",
         "render a world and simulate its spike cameras",
         "make-dataset --all --profile small --out data",
     ),

@@ -2,8 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
 From = Annotated[str | None, arg(name="from")]  # where a release or a weight file is fetched from
+
+
+@dataclass(frozen=True)
+class Renderers:
+    """What renders.
+
+    Args:
+        workers: Processes that render; one uses all cores.
+        scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
+        device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
+    """
+
+    workers: int = 1
+    scheduler: str | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+RENDERERS = Renderers()

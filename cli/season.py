@@ -53,11 +53,11 @@ def make(
         workers: Processes that render.
         seasons: Folder of the public files.
     """
-    from spike4dgs.generators.make_dataset import make_dataset
+    from spike4dgs.generators import make_dataset as scenes
 
     def make_scene(seed: Seed, out: Path) -> int:
-        options = {"profile": seed.profile, "seed": int(seed.seed), "variant": seed.variant}
-        return make_dataset((seed.world,), out=out, workers=workers, **options)
+        settings = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant)
+        return scenes.make_dataset([settings.job(seed.world)], out, workers=workers)
 
     folder = season_folder(seasons, number)
     if make_season(

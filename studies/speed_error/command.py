@@ -11,6 +11,7 @@ from spike4dgs.benchmark.environment import choose_device, command_line, environ
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.generators.make_dataset import SceneSettings
 from spike4dgs.studies.speed_error.measurement import Measurement, Request, Size
 from spike4dgs.studies.speed_error.runner import in_order, measure_all, measured_from_to
 
@@ -61,7 +62,7 @@ def make_speed_error(make_dataset: Callable[..., int], *rooms: Room) -> Callable
             if scene is not None:
                 return scene
             profile = "small" if size == "whole" else "tiny"
-            make_dataset(("car",), profile=profile, out=out / "scenes", seed=seed)
+            make_dataset([SceneSettings(profile, seed).job("car")], out / "scenes")
             return out / "scenes" / f"car-0-{profile}"
 
         key = {"size": size, "seed": seed, "device": device, "scene": str(scene or ""), "commit": harness()["commit"]}

@@ -12,8 +12,9 @@ from fake_renderer import FakeRenderer, files, render_fakes
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.generators import make_dataset as command
+from spike4dgs.cli.make_dataset import make_dataset as command
 from spike4dgs.generators import scene_maker
+from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.scene_maker import Maker
 
@@ -23,6 +24,13 @@ JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 @pytest.fixture
 def fake(monkeypatch):
     render_fakes(monkeypatch)
+
+
+def make(*worlds, out, **settings):
+    options = {name: settings.pop(name) for name in ("audit", "replace") if name in settings}
+    return make_dataset(
+        [SceneSettings(**{"profile": "tiny"} | settings).job(world) for world in worlds], out, **options
+    )
 
 
 def plain(stage, steps, total):
@@ -125,22 +133,22 @@ def test_two_processes_do_not_make_one_scene(fake, tmp_path):
 
 
 def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
-    assert command.make_dataset(("car",), profile="tiny", out=tmp_path) == 0
+    assert make("car", out=tmp_path) == 0
     before = files(tmp_path / "car-0-tiny")
     report = json.loads((tmp_path / "car-0-tiny.report.json").read_text())
     assert set(report["stages_s"]) == {"background", "key frames", "ground truth", "streams", "description"}
     capsys.readouterr()
-    assert command.make_dataset(("car",), profile="tiny", out=tmp_path) == 0
+    assert make("car", out=tmp_path) == 0
     assert "kept" in capsys.readouterr().out
     with pytest.raises(UserError, match="seed 0 instead of 1; pass --replace"):
-        command.make_dataset(("car",), profile="tiny", out=tmp_path, seed=1)
+        make("car", out=tmp_path, seed=1)
     stream = tmp_path / "car-0-tiny/spikes/cam_02.dat"
     data = bytearray(stream.read_bytes())
     data[100] ^= 1
     stream.write_bytes(data)
     with pytest.raises(UserError, match=r"cam_02\.dat.*--replace"):
-        command.make_dataset(("car",), profile="tiny", out=tmp_path)
-    assert command.make_dataset(("car",), profile="tiny", out=tmp_path, replace=True) == 0
+        make("car", out=tmp_path)
+    assert make("car", out=tmp_path, replace=True) == 0
     assert files(tmp_path / "car-0-tiny") == before
 
 
@@ -150,36 +158,35 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
     (folder / "thesis.txt").write_text("three years of work")
     for replace in (False, True):
         with pytest.raises(UserError, match="move them away"):
-            command.make_dataset(("car",), profile="tiny", out=tmp_path, replace=replace)
+            make("car", out=tmp_path, replace=replace)
     (folder / "scene.json").write_text("{}")
     with pytest.raises(UserError, match="other files"):
-        command.make_dataset(("car",), profile="tiny", out=tmp_path, replace=True)
+        make("car", out=tmp_path, replace=True)
     assert (folder / "thesis.txt").exists()
 
 
 @pytest.mark.parametrize(
-    ("worlds", "options", "words"),
+    ("world", "options", "words"),
     [
-        (("moon",), {}, "world: expected one of jaywalk, bicycle, "),
-        ((), {}, "at least one world"),
-        (("car",), {"profile": "huge"}, "--profile: expected one of tiny, small, paper"),
-        (("car",), {"seconds": 0.0}, "--seconds"),
-        (("car",), {"seconds": -0.02}, "--seconds"),
-        (("car",), {"seconds": 0.0205}, "--seconds"),
-        (("car",), {"seconds": float("nan")}, "--seconds"),
-        (("car",), {"seed": -1}, "--seed"),
-        (("car",), {"variant": -1}, "--seed and --variant"),
-        (("car",), {"lens": (0.1,) * 6}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
-        (("car",), {"lens": (float("nan"),)}, "--lens"),
-        (("car",), {"lens": (-0.1,), "audit": True}, "--audit: expected pinhole cameras"),
-        (("car",), {"lens": (-9.0,)}, "whose model holds up to the image's corners"),
-        (("car",), {"lens": (-0.1,), "lens_spread": 1.0}, "--lens-spread: expected a share from 0 to below 1"),
-        (("car",), {"lens_spread": 0.2}, "--lens-spread: expected the mean lens"),
+        ("moon", {}, "world: expected one of jaywalk, bicycle, "),
+        ("car", {"profile": "huge"}, "--profile: expected one of tiny, small, paper"),
+        ("car", {"seconds": 0.0}, "--seconds"),
+        ("car", {"seconds": -0.02}, "--seconds"),
+        ("car", {"seconds": 0.0205}, "--seconds"),
+        ("car", {"seconds": float("nan")}, "--seconds"),
+        ("car", {"seed": -1}, "--seed"),
+        ("car", {"variant": -1}, "--seed and --variant"),
+        ("car", {"lens": (0.1,) * 6}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
+        ("car", {"lens": (float("nan"),)}, "--lens"),
+        ("car", {"lens": (-0.1,), "audit": True}, "--audit: expected pinhole cameras"),
+        ("car", {"lens": (-9.0,)}, "whose model holds up to the image's corners"),
+        ("car", {"lens": (-0.1,), "lens_spread": 1.0}, "--lens-spread: expected a share from 0 to below 1"),
+        ("car", {"lens_spread": 0.2}, "--lens-spread: expected the mean lens"),
     ],
 )
-def test_bad_arguments_are_one_line(worlds, options, words, tmp_path):
+def test_bad_arguments_are_one_line(world, options, words, tmp_path):
     with pytest.raises(UserError, match=words) as e:
-        command.make_dataset(worlds, **{"profile": "tiny", "out": tmp_path} | options)
+        make(world, out=tmp_path, **options)
     assert "\n" not in str(e.value)
     assert not list(tmp_path.iterdir())
 
@@ -187,23 +194,25 @@ def test_bad_arguments_are_one_line(worlds, options, words, tmp_path):
 def test_a_full_disk_is_noticed_before_work_begins(fake, tmp_path, monkeypatch):
     monkeypatch.setattr(scene_maker.shutil, "disk_usage", lambda path: SimpleNamespace(free=10_000))
     with pytest.raises(UserError, match="free disk space"):
-        command.make_dataset(("car",), profile="tiny", out=tmp_path)
+        make("car", out=tmp_path)
 
 
 @pytest.mark.parametrize("worlds", [("car",), ()])
 def test_folders_that_cannot_be_written_are_one_error(worlds, fake, tmp_path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(UserError, match="file"):
-        command.make_dataset(worlds, all=not worlds, profile="tiny", out=tmp_path / "file" / "data")
+        command(worlds, all=not worlds, settings=SceneSettings("tiny"), out=tmp_path / "file" / "data")
     assert (tmp_path / "file").read_text() == "no folder"
 
 
 def test_a_variant_of_seasons_is_named_as_such(fake, tmp_path, capsys):
     for variant, kept in ((8999, False), (9000, True)):
-        assert command.make_dataset(("car",), profile="tiny", variant=variant, out=tmp_path) == 0
+        assert make("car", variant=variant, out=tmp_path) == 0
         assert (f"variant {variant} is kept for hidden seasons" in capsys.readouterr().out) is kept
 
 
 def test_worlds_are_named_or_all(tmp_path):
     with pytest.raises(UserError, match="names or --all"):
-        command.make_dataset(("car",), all=True, out=tmp_path)
+        command(("car",), all=True, out=tmp_path)
+    with pytest.raises(UserError, match="at least one world, or --all, found none; choose among jaywalk, "):
+        command(out=tmp_path)

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli.season import check, reveal
-from spike4dgs.generators.make_dataset import make_dataset
+from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
 from spike4dgs.leaderboard.season.opening import NAME, draw_opening, read_opening
 from spike4dgs.leaderboard.season.results import write_table
 
@@ -78,11 +78,11 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
 ) -> None:
     render_fakes(monkeypatch)
     for seed in read_opening(over.public / NAME).scenes:
-        options = {"profile": seed.profile, "variant": seed.variant, "seed": int(seed.seed)}
-        make_dataset((seed.world,), out=over.root / "again", **options)  # type: ignore[arg-type]
+        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant)
+        make_dataset([settings.job(seed.world)], over.root / "again")
     assert checked(over, scenes=over.root / "again") == 0
     assert capsys.readouterr().out.count("is the scene committed to") == 2
-    make_dataset(("car",), out=over.root / "wrong", profile="tiny", variant=9003, seed=int(seed.seed) ^ 1)
+    make_dataset([SceneSettings("tiny", int(seed.seed) ^ 1, 9003).job("car")], over.root / "wrong")
     assert checked(over, scenes=over.root / "wrong", predictions=None) == 2
     assert "render other bytes" in capsys.readouterr().err
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import make
 from spike4dgs.generators.make_dataset import make_dataset
+from spike4dgs.generators.profiles import Job
 from spike4dgs.leaderboard.season.opening import NAME, read_opening
 from spike4dgs.leaderboard.season.secret_folder import pack_file, scene_folder, training_folder
 
@@ -51,12 +53,12 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
     render_fakes(monkeypatch)
     made, rendered = Made(tmp_path), []
 
-    def dying(worlds: tuple[str, ...], **options: Any) -> int:
-        if worlds == ("turntable",) and len(rendered) == 1:
+    def dying(jobs: Sequence[Job], out: Path, **options: Any) -> int:
+        if jobs[0].world == "turntable" and len(rendered) == 1:
             rendered.append("died")
             raise KeyboardInterrupt
-        rendered.append(worlds[0])
-        return make_dataset(worlds, **options)
+        rendered.append(jobs[0].world)
+        return make_dataset(jobs, out, **options)
 
     monkeypatch.setattr("spike4dgs.generators.make_dataset.make_dataset", dying)
     given: dict[str, Any] = {"worlds": WORLDS, "profile": "tiny", "secret": made.secret, "seasons": made.seasons}

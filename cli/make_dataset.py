@@ -1,0 +1,54 @@
+"""`make-dataset`: render worlds, simulate their spike cameras, write scene folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.cli.options import RENDERERS, Renderers
+from spike4dgs.generators import make_dataset as scenes
+from spike4dgs.generators.make_dataset import SceneSettings
+from spike4dgs.generators.rendering.mitsuba_variant import choose_device
+
+DEFAULTS = SceneSettings()
+
+
+def make_dataset(
+    worlds: Positional[tuple[str, ...]] = (),
+    *,
+    all: bool = False,
+    out: Path = Path("data"),
+    settings: OmitArgPrefixes[SceneSettings] = DEFAULTS,
+    renderers: OmitArgPrefixes[Renderers] = RENDERERS,
+    audit: bool = False,
+    replace: bool = False,
+    check: Path | None = None,
+) -> int:
+    """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
+
+    Give the same command again to resume a killed run. Existing scenes are checked and kept. OUT/ID.report.json lists
+    the time of each stage. Equal arguments give equal bytes, with any number of workers.
+
+    Args:
+        worlds: Names of worlds, such as car turntable.
+        all: Make all worlds.
+        out: Folder in which the scene folders appear.
+        audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
+        replace: Make damaged scenes, and scenes with other settings, again.
+        check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
+            they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
+            world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.
+    """
+    from spike4dgs.generators.worlds import WORLDS  # it loads other packages' worlds
+
+    if all and worlds:
+        raise problem("worlds", "names or --all", "both", "leave one out")
+    names = WORLDS if all else dict.fromkeys(worlds)
+    if not names:
+        raise problem("worlds", "at least one world, or --all", "none", f"choose among {', '.join(WORLDS)}")
+    jobs = [settings.job(name) for name in names]
+    choose_device(renderers.device)
+    parallel = {"workers": renderers.workers, "scheduler": renderers.scheduler}
+    return scenes.make_dataset(jobs, out, **parallel, audit=audit, replace=replace, check=check)
