@@ -9,11 +9,7 @@ if TYPE_CHECKING:
     from spike4dgs.baselines.recipes import METHODS
 else:
     __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "recipes": ("METHODS",),
-            "images.table": ("IMAGES", "ImageMaker", "make_image"),
-        },
+        __name__, {"recipes": ("METHODS",), "images.table": ("IMAGES", "ImageMaker", "make_image")}
     )
 
 __all__ = ["IMAGES", "METHODS", "ImageMaker", "make_image"]

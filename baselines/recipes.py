@@ -16,12 +16,7 @@ from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.radiance_field import RADIANCE_FIELD
 from spike4dgs.baselines.spacetime import MOTIONS
 from spike4dgs.baselines.spike_render import SpikeRender
-from spike4dgs.baselines.starts.colmap import (
-    ColmapSettings,
-    UncalibratedSettings,
-    colmap,
-    colmap_uncalibrated,
-)
+from spike4dgs.baselines.starts.colmap import ColmapSettings, UncalibratedSettings, colmap, colmap_uncalibrated
 from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
 from spike4dgs.baselines.tracking.fit import TRACKING
 from spike4dgs.benchmark.method import Method, Recipe
@@ -33,10 +28,7 @@ from spike4dgs.method.starts.base import Initialization
 INITIALIZATIONS = {
     **ours.PARTS.initialization,
     "colmap": Initialization(
-        lambda r: colmap(r.scene, r.seed, r.settings),
-        ColmapSettings(),
-        label="poses by COLMAP",
-        estimates_poses=True,
+        lambda r: colmap(r.scene, r.seed, r.settings), ColmapSettings(), label="poses by COLMAP", estimates_poses=True
     ),
     "colmap-uncalibrated": Initialization(
         lambda r: colmap_uncalibrated(r.scene, r.seed, r.settings), UncalibratedSettings(), estimates_poses=True

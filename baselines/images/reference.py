@@ -140,10 +140,7 @@ def slow_tfstp_pixel(
     U0, f, D, F = constants
 
     def update(R: Decimal, u: Decimal, d: int) -> tuple[Decimal, Decimal]:
-        return (
-            1 - (1 - R * (1 - u)) * (-d / D).exp(),
-            U0 + (u + f * (1 - u) - U0) * (-d / F).exp(),
-        )
+        return (1 - (1 - R * (1 - u)) * (-d / D).exp(), U0 + (u + f * (1 - u) - U0) * (-d / F).exp())
 
     before, after = [t for t in fired if t < tick], [t for t in fired if t >= tick]
     if len(fired) < 2:

@@ -78,14 +78,7 @@ def tfstp_image(stream: SpikeStream, tick: int, settings: TfstpSettings | None =
 
 @kernel
 def _image(
-    packed: UInt8,
-    decays: Float64,
-    synapse: Synapse,
-    memory: int,
-    tick: int,
-    image: Float32,
-    start: int,
-    stop: int,
+    packed: UInt8, decays: Float64, synapse: Synapse, memory: int, tick: int, image: Float32, start: int, stop: int
 ) -> None:
     for p in range(start, stop):
         image[p] = np.float32(_rate(packed, decays, synapse, memory, p, tick))

@@ -23,13 +23,7 @@ from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkp
 from spike4dgs.method.fit import Algorithm, FitJob
 from spike4dgs.method.gaussians.optimizer import Decay, export_state, import_state, make_adam, set_learning_rates
 from spike4dgs.method.images.training import ImageSettings
-from spike4dgs.method.motion.hexplane import (
-    HexPlaneSettings,
-    hexplane_shape,
-    plane_tv,
-    time_smoothness,
-    time_sparsity,
-)
+from spike4dgs.method.motion.hexplane import HexPlaneSettings, hexplane_shape, plane_tv, time_smoothness, time_sparsity
 from spike4dgs.method.schedule import GOLDEN
 from spike4dgs.method.supervision.spike import firing_rate, spike_loss
 from spike4dgs.method.torch_state import one_torch_thread, seeded

@@ -97,12 +97,7 @@ def concatenate(parts: list[Gaussians]) -> Gaussians:
 
 
 def from_points(
-    points: NDArray[np.float32],
-    values: NDArray[np.float32],
-    *,
-    opacity: float,
-    scale: float = 1.0,
-    device: str = "cpu",
+    points: NDArray[np.float32], values: NDArray[np.float32], *, opacity: float, scale: float = 1.0, device: str = "cpu"
 ) -> Gaussians:
     """Return round Gaussians at points [N, 3] with gray values [N]; width: `scale` x mean distance of the 3 nearest.
 

@@ -26,12 +26,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import spike_times
-from spike4dgs.method.images.adaptive import (
-    AdaptiveSettings,
-    half_windows,
-    rates,
-    shared_levels,
-)
+from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
 from spike4dgs.method.images.base import Float32, ImageMaker
 
 

@@ -41,16 +41,7 @@ from spike4dgs.method.msdi.weights import load_network, weights_path
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
-from spike4dgs.method.starts.rig import (
-    Cloud,
-    CloudSettings,
-    PointSettings,
-    fill,
-    filled,
-    matched,
-    thin,
-    window_means,
-)
+from spike4dgs.method.starts.rig import Cloud, CloudSettings, PointSettings, fill, filled, matched, thin, window_means
 from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
