@@ -37,10 +37,7 @@ class MappingSettings(FeatureSettings, PointSettings):
 
 @dataclass(frozen=True)
 class ColmapSettings(MappingSettings, RigSettings):
-    """Numbers of `colmap` (prefix `initialization`).
-
-    With `flat_field` all points come from a plane sweep.
-    """
+    """Numbers of `colmap` (prefix `initialization`). With `flat_field` all points come from a plane sweep."""
 
 
 @dataclass(frozen=True)
