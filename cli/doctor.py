@@ -215,15 +215,15 @@ def _network(name: str, find: Callable[[], Path]) -> Iterator[Finding]:
 
 
 def _msdi() -> Path:
-    from spike4dgs.method.msdi.weights import check_weights
+    from spike4dgs.method.msdi.weights import WEIGHTS
 
-    return check_weights()
+    return WEIGHTS.check()
 
 
 def _spk2img() -> Path:
-    from spike4dgs.baselines.images.spk2img.maker import check_weights
+    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
 
-    return check_weights()
+    return WEIGHTS.check()
 
 
 def _dust3r() -> Path:

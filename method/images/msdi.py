@@ -10,7 +10,7 @@ from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
 from spike4dgs.method.images.windows import window
-from spike4dgs.method.msdi.weights import WEIGHTS, load_network, read_card, weights_path
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 
 if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Msdi
@@ -23,7 +23,7 @@ def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None
     the weights are missing or damaged.
     """
     chosen = choose_device(device, rasterizes=False)
-    return reconstruct(load_network(weights_path(), chosen), stream, tick, camera)
+    return reconstruct(load_network(WEIGHTS.in_use().path, chosen), stream, tick, camera)
 
 
 def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
@@ -50,7 +50,7 @@ def msdi_maker(device: str) -> ImageMaker:
         definition="MSDI's image generator on the 41 ticks around tick t",
         source="Spike4DGS, eq. 12",
         rate=lambda stream, tick, _: msdi_image(stream, tick, device=device),
-        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        learned=partial(learned_from, WEIGHTS.in_use, WEIGHTS.read_card),
         corrected=partial(msdi_image, device=device),
         made_on=msdi_maker,
         label="by MSDI",

@@ -6,6 +6,7 @@ Each network states its facts as a `WeightKind`. Files are found, checked and re
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -24,7 +25,7 @@ CardT = TypeVar("CardT")
 
 @dataclass(frozen=True)
 class WeightKind(Generic[CardT]):
-    """The facts that tell one network's weight files from another's."""
+    """The facts that tell one network's weight files from another's, and their reading and writing."""
 
     network: str  # its name in messages
     schema: str  # the only key of the metadata: two would be written in any order
@@ -32,6 +33,7 @@ class WeightKind(Generic[CardT]):
     variable: str  # the environment variable that names a file in place of the shipped one
     shipped: Path
     command: str  # the command that trains it
+    check_card: Callable[[CardT, Path], None] = lambda card, path: None  # raises UserError for one that is not known
 
     @property
     def fix(self) -> str:
@@ -50,39 +52,46 @@ class WeightKind(Generic[CardT]):
         """
         return find_weights(NamedWeights(self.description, self.variable, self.fix, self.shipped))
 
+    def check(self) -> Path:
+        """Return the path of the file in use, its card read. Raises UserError where it is missing or damaged."""
+        path = self.in_use().path
+        self.read_card(path)
+        return path
 
-def write_weights(kind: WeightKind[CardT], path: Path, network: nn.Module, card: CardT) -> str:
-    """Write the network's parameters as half floats, atomically, and return the file's SHA-256.
+    def save(self, path: Path, network: nn.Module, card: CardT) -> str:
+        """Write the network's parameters as half floats, atomically, and return the file's SHA-256.
 
-    Raises UserError where a parameter is not finite as a half float: the file would give NaN.
-    """
-    import safetensors.torch
-    import torch
+        Raises UserError where a parameter is not finite as a half float: the file would give NaN.
+        """
+        import safetensors.torch
+        import torch
 
-    tensors = {k: v.detach().to("cpu", torch.float16).contiguous() for k, v in network.state_dict().items()}
-    if bad := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise problem(path, "finite parameters", f"NaN or more than 65504 in {bad[0]}", "go back to an earlier step")
-    fields: dict[str, Any] = asdict(card)  # type: ignore[call-overload]
-    with atomic_path(path) as part:
-        safetensors.torch.save_file(tensors, part, metadata={kind.schema: json.dumps(fields, sort_keys=True)})
-    return sha256_file(path)
+        tensors = {k: v.detach().to("cpu", torch.float16).contiguous() for k, v in network.state_dict().items()}
+        if bad := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+            raise problem(
+                path, "finite parameters", f"NaN or more than 65504 in {bad[0]}", "go back to an earlier step"
+            )
+        fields: dict[str, Any] = asdict(card)  # type: ignore[call-overload]
+        with atomic_path(path) as part:
+            safetensors.torch.save_file(tensors, part, metadata={self.schema: json.dumps(fields, sort_keys=True)})
+        return sha256_file(path)
 
+    def read_card(self, path: Path) -> CardT:
+        """Return the file's card. Raises UserError for a damaged or foreign file. torch is not imported."""
+        text = read_header(path, self.schema, self.description, self.fix)
+        try:
+            fields: dict[str, Any] = parse_json(text)
+            card = self.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
+        except (LookupError, TypeError, ValueError) as e:
+            raise problem(path, self.description, f"damaged data in its card ({e})", self.fix) from None
+        self.check_card(card, path)
+        return card
 
-def read_weights_card(kind: WeightKind[CardT], path: Path) -> CardT:
-    """Return the file's card. Raises UserError for a damaged or foreign file. torch is not imported."""
-    text = read_header(path, kind.schema, kind.description, kind.fix)
-    try:
-        fields: dict[str, Any] = parse_json(text)
-        return kind.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
-    except (LookupError, TypeError, ValueError) as e:
-        raise problem(path, kind.description, f"damaged data in its card ({e})", kind.fix) from None
+    def fill(self, path: Path, network: NetworkT, shape: str) -> NetworkT:
+        """Give `network`, which may be on torch's device `meta`, the file's parameters as float32 on the CPU.
 
-
-def fill_network(kind: WeightKind[Any], path: Path, network: NetworkT, shape: str) -> NetworkT:
-    """Give `network`, which may be on torch's device `meta`, the file's parameters as float32 on the CPU; return it.
-
-    It is left ready to run, without gradients. Raises UserError where the file is damaged or its tensors are not those
-    of a network of this `shape`, such as "width 8".
-    """
-    state = read_tensors(path, kind.description, kind.fix)
-    return load_into(network, state, path, f"parameters of {shape}", kind.fix)
+        It is left ready to run, without gradients. Raises UserError where the file is damaged or its tensors are not
+        those of a network of this `shape`, such as "width 8".
+        """
+        state = read_tensors(path, self.description, self.fix)
+        return load_into(network, state, path, f"parameters of {shape}", self.fix)

@@ -38,7 +38,7 @@ from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings, image_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.records import Curve, model_card, plot_calibration, plot_curves
 from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
-from spike4dgs.method.msdi.weights import Card, save_weights
+from spike4dgs.method.msdi.weights import WEIGHTS, Card
 
 ROW_EVERY = 50  # steps between rows of the losses; checkpoints are written at rows only
 _LINE_EVERY_S = 30.0  # between lines of progress
@@ -255,7 +255,7 @@ class _Run:
         measured = {name: round(value, 4) for name, value in scores.measured.items()}
         card = Card(training.network.config.name, training.step, training.seed, self.seen, measured)
         path = self.out / f"msdi-{card.config}.safetensors"
-        digest = save_weights(path, training.network, card)
+        digest = WEIGHTS.save(path, training.network, card)
         self.scores.add(training.step, scores.measured)
         self.scores.write()
         self.losses.write()

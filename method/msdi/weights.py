@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.models.network_weights import WeightKind, fill_network, read_weights_card, write_weights
+from spike4dgs.method.models.network_weights import WeightKind
 from spike4dgs.method.msdi.config import CONFIGS
 
 if TYPE_CHECKING:
@@ -29,6 +29,11 @@ class Card:
     measured: dict[str, float]  # what was measured on data that was not trained on, by name with its unit
 
 
+def _check_card(card: Card, path: Path) -> None:
+    if card.config not in CONFIGS:
+        raise problem(path, f"a configuration of {', '.join(CONFIGS)}", repr(card.config), WEIGHTS.fix)
+
+
 WEIGHTS = WeightKind(
     network="MSDI",
     schema="spike4dgs-msdi/1",
@@ -36,38 +41,8 @@ WEIGHTS = WeightKind(
     variable=VARIABLE,
     shipped=SHIPPED,
     command="train-msdi",
+    check_card=_check_card,
 )
-
-
-def weights_path() -> Path:
-    """Return the weight file in use: what the environment variable SPIKE4DGS_MSDI names, else the shipped one.
-
-    Raises WeightsError where there is no such file.
-    """
-    return WEIGHTS.in_use().path
-
-
-def save_weights(path: Path, network: Msdi, card: Card) -> str:
-    """Write the network's parameters as half floats, atomically, and return the file's SHA-256.
-
-    Raises UserError where a parameter is not finite as a half float.
-    """
-    return write_weights(WEIGHTS, path, network, card)
-
-
-def read_card(path: Path) -> Card:
-    """Return the file's card. Raises UserError for a damaged or foreign file."""
-    card = read_weights_card(WEIGHTS, path)
-    if card.config not in CONFIGS:
-        raise problem(path, f"a configuration of {', '.join(CONFIGS)}", repr(card.config), WEIGHTS.fix)
-    return card
-
-
-def check_weights() -> Path:
-    """Return the weight file in use, its card read. Raises UserError where it is missing, damaged or foreign."""
-    path = weights_path()
-    read_card(path)
-    return path
 
 
 @cache
@@ -77,7 +52,7 @@ def load_network(path: Path, device: str) -> Msdi:
 
     from spike4dgs.method.msdi.network import Msdi
 
-    config = CONFIGS[read_card(path).config]
+    config = CONFIGS[WEIGHTS.read_card(path).config]
     with torch.device("meta"):  # parameters need not be drawn at random first
         network = Msdi(config)
-    return fill_network(WEIGHTS, path, network, f"configuration {config.name}").to(device)
+    return WEIGHTS.fill(path, network, f"configuration {config.name}").to(device)

@@ -37,7 +37,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.windows import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
-from spike4dgs.method.msdi.weights import load_network, weights_path
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
@@ -142,7 +142,7 @@ def infer(
 ) -> Estimate:
     """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
     device = choose_device(device, rasterizes=False)
-    network = load_network(weights_path(), device)
+    network = load_network(WEIGHTS.in_use().path, device)
     factor = max(1, round(max(scene.cameras[0].width, scene.cameras[0].height) / settings.trained_px))
     clocks = [scene.state(camera.id).clock for camera in scene.cameras]
     middles = [local_ticks(clock, [scene.n_ticks // 2], scene.n_ticks)[0][0] for clock in clocks]

@@ -13,7 +13,7 @@ from torch import Tensor
 from spike4dgs.method.motion.hexplane import sample_level
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.network import has_bfloat16
-from spike4dgs.method.msdi.weights import load_network, weights_path
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.studies.speed.timing import by_turns_ms
 from spike4dgs.studies.speed_error.measurement import (
@@ -30,7 +30,7 @@ GROUP = "Losses and networks"
 
 
 def _msdi(request: Request) -> Iterator[Series]:
-    network = load_network(weights_path(), "cpu").eval()
+    network = load_network(WEIGHTS.in_use().path, "cpu").eval()
     height, width = request.pick((16, 24), (40, 64), (125, 200))
     g = torch.Generator().manual_seed(request.seed)
     rates = {

@@ -293,7 +293,6 @@ def read_tensors(folder: Path, out: Path) -> None:
     from spike4dgs.benchmark.scene.training_bursts import open_bursts
     from spike4dgs.benchmark.weights import read_state
     from spike4dgs.method.checkpoint import load_checkpoint
-    from spike4dgs.method.models.network_weights import read_weights_card
 
     def bursts() -> None:
         file = open_bursts(folder / "toy-13.safetensors")
@@ -304,7 +303,7 @@ def read_tensors(folder: Path, out: Path) -> None:
     for read in (
         bursts,
         lambda: load_checkpoint(folder / "fit.ckpt", "fit"),
-        lambda: read_weights_card(WEIGHTS, folder / "weights.safetensors"),
+        lambda: WEIGHTS.read_card(folder / "weights.safetensors"),
         lambda: read_state(folder / "weights.safetensors"),
         lambda: read_state(folder / "state.pth"),
     ):

@@ -11,13 +11,10 @@ from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
 from spike4dgs.method.images.windows import WINDOW, window
-from spike4dgs.method.models.network_weights import WeightKind, fill_network, read_weights_card, write_weights
+from spike4dgs.method.models.network_weights import WeightKind
 
 if TYPE_CHECKING:
     from spike4dgs.baselines.images.spk2img.network import Spk2ImgNet
-
-VARIABLE = "SPIKE4DGS_SPK2IMG"  # the environment variable that names another weight file
-SHIPPED = Path(__file__).with_name("spk2img-8.safetensors")
 
 
 @dataclass(frozen=True)
@@ -35,38 +32,10 @@ WEIGHTS = WeightKind(
     network="Spk2ImgNet",
     schema="spike4dgs-spk2img/1",
     card=Card,
-    variable=VARIABLE,
-    shipped=SHIPPED,
+    variable="SPIKE4DGS_SPK2IMG",
+    shipped=Path(__file__).with_name("spk2img-8.safetensors"),
     command="train-spk2img",
 )
-
-
-def weights_path() -> Path:
-    """Return the weight file in use: what the environment variable SPIKE4DGS_SPK2IMG names, else the shipped one.
-
-    Raises WeightsError where there is no such file.
-    """
-    return WEIGHTS.in_use().path
-
-
-def save_weights(path: Path, network: Spk2ImgNet, card: Card) -> str:
-    """Write the network's parameters as half floats, atomically, and return the file's SHA-256.
-
-    Raises UserError where a parameter is not finite as a half float.
-    """
-    return write_weights(WEIGHTS, path, network, card)
-
-
-def read_card(path: Path) -> Card:
-    """Return the file's card. Raises UserError for a damaged or foreign file."""
-    return read_weights_card(WEIGHTS, path)
-
-
-def check_weights() -> Path:
-    """Return the weight file in use, its card read. Raises UserError where it is missing, damaged or foreign."""
-    path = weights_path()
-    read_card(path)
-    return path
 
 
 @cache
@@ -74,12 +43,8 @@ def load_network(path: Path, device: str) -> Spk2ImgNet:
     """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
     from spike4dgs.baselines.images.spk2img.network import Spk2ImgNet, on_device
 
-    network = Spk2ImgNet(read_card(path).width)
-    return on_device(fill_network(WEIGHTS, path, network, f"width {network.width}"), device)
-
-
-if TYPE_CHECKING:
-    from spike4dgs.baselines.images.spk2img.network import Spk2ImgNet
+    network = Spk2ImgNet(WEIGHTS.read_card(path).width)
+    return on_device(WEIGHTS.fill(path, network, f"width {network.width}"), device)
 
 
 def spk2img_image(stream: SpikeStream, tick: int, device: str = "auto") -> Float32:
@@ -87,7 +52,7 @@ def spk2img_image(stream: SpikeStream, tick: int, device: str = "auto") -> Float
 
     Beyond its ends the clip is mirrored. Raises UserError where the weights are missing or damaged.
     """
-    return reconstruct(load_network(weights_path(), choose_device(device, rasterizes=False)), stream, tick)
+    return reconstruct(load_network(WEIGHTS.in_use().path, choose_device(device, rasterizes=False)), stream, tick)
 
 
 def reconstruct(network: Spk2ImgNet, stream: SpikeStream, tick: int) -> Float32:
@@ -110,7 +75,7 @@ def spk2img_maker(device: str) -> ImageMaker:
         source="Zhao, Xiong, Liu, Huang: Spk2ImgNet: learning to reconstruct dynamic scene from continuous spike "
         "stream, CVPR 2021",
         rate=lambda stream, tick, _: spk2img_image(stream, tick, device),
-        learned=partial(learned_from, WEIGHTS.in_use, read_card),
+        learned=partial(learned_from, WEIGHTS.in_use, WEIGHTS.read_card),
         made_on=spk2img_maker,
         label="by Spk2ImgNet",
     )

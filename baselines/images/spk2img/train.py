@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.baselines.images.spk2img.data import Batch, Example, draw, open_for_training, read_examples
-from spike4dgs.baselines.images.spk2img.maker import Card, reconstruct, save_weights
+from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, reconstruct
 from spike4dgs.baselines.images.spk2img.network import BLOCK_STARTS, MIDDLE, Reconstruction, Spk2ImgNet
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
@@ -190,6 +190,6 @@ def _export(training: Training, hidden: Sequence[Scene], names: tuple[str, ...],
     scores = {s.id: round(score(training.network, s), 2) for s in hidden}
     card = Card(training.settings.width, training.step, training.seed, names, scores)
     path = out / f"spk2img-{card.width}.safetensors"
-    digest = save_weights(path, training.network, card)
+    digest = WEIGHTS.save(path, training.network, card)
     shown = "".join(f", {scene} {db:.2f} dB" for scene, db in scores.items())
     print(f"written: {path}, sha256 {digest}{shown}", flush=True)

@@ -13,9 +13,9 @@ import safetensors.torch
 import torch
 from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
 
-from spike4dgs.baselines.images.spk2img import maker as weights
+from spike4dgs.baselines.images.spk2img import maker
 from spike4dgs.baselines.images.spk2img.data import Example, draw, open_for_training, read_examples
-from spike4dgs.baselines.images.spk2img.maker import Card, load_network, read_card, reconstruct, save_weights
+from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network, reconstruct
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
 from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of, train_spk2img
 from spike4dgs.baselines.images.table import IMAGES
@@ -182,7 +182,7 @@ def test_command_to_weights_to_images(
     assert train_spk2img(**arguments) == 0
     assert "step 2/2, loss" in capsys.readouterr().out
     path = out / "spk2img-2.safetensors"
-    card, scene = read_card(path), open_scene(two)
+    card, scene = WEIGHTS.read_card(path), open_scene(two)
     assert (card.width, card.steps, card.seed) == (2, 2, 0)
     assert card.trained_on == (f"pattern-1@{open_scene(one).revision[:16]}",)
     assert list(card.hidden_psnr_db) == ["pattern-2"] and 0 < card.hidden_psnr_db["pattern-2"] < 40
@@ -190,7 +190,7 @@ def test_command_to_weights_to_images(
     assert train_spk2img(**arguments) == 0  # done already
     assert path.read_bytes() == before
 
-    monkeypatch.setenv(weights.VARIABLE, str(path))
+    monkeypatch.setenv(WEIGHTS.variable, str(path))
     stream = scene.stream("cam_03")
     images = IMAGES["spk2img"](stream, [0, 40, 79], GAIN)
     assert images.shape == (3, HEIGHT, WIDTH) and images.dtype == np.float32
@@ -213,8 +213,8 @@ def test_hidden_scenes_are_not_trained_on(small_scene: Path, tmp_path: Path) -> 
 def test_weights_survive_as_half_floats(tmp_path: Path) -> None:
     network, path = Spk2ImgNet(4), tmp_path / "w.safetensors"
     card = Card(4, 7, 1, ("a@0",), {"b": 31.5})
-    save_weights(path, network, card)
-    assert read_card(path) == card
+    WEIGHTS.save(path, network, card)
+    assert WEIGHTS.read_card(path) == card
     loaded = load_network(path, "cpu")
     for name, value in network.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value.half().float())
@@ -224,11 +224,11 @@ def test_weights_survive_as_half_floats(tmp_path: Path) -> None:
 
 def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stream = stream_of(np.ones((50, 6, 9), np.uint8))
-    monkeypatch.setenv(weights.VARIABLE, str(tmp_path / "none.safetensors"))
+    monkeypatch.setenv(WEIGHTS.variable, str(tmp_path / "none.safetensors"))
     with pytest.raises(UserError, match=r"none\.safetensors: expected weights of Spk2ImgNet, found no such file; "):
         IMAGES["spk2img"](stream, [25], GAIN)
-    monkeypatch.delenv(weights.VARIABLE)
-    monkeypatch.setattr(weights, "WEIGHTS", replace(weights.WEIGHTS, shipped=tmp_path / "spk2img-8.safetensors"))
+    monkeypatch.delenv(WEIGHTS.variable)
+    monkeypatch.setattr(maker, "WEIGHTS", replace(WEIGHTS, shipped=tmp_path / "spk2img-8.safetensors"))
     with pytest.raises(UserError, match=r"spk2img-8.*`spike4dgs train-spk2img`, or set SPIKE4DGS_SPK2IMG to a file"):
         IMAGES["spk2img"](stream, [25], GAIN)
 
@@ -239,11 +239,11 @@ def test_foreign_and_damaged_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="expected metadata spike4dgs-spk2img/1, found none"):
         load_network(foreign, "cpu")
     path = tmp_path / "w.safetensors"
-    save_weights(path, Spk2ImgNet(4), Card(8, 7, 1, (), {}))  # the card says 8
+    WEIGHTS.save(path, Spk2ImgNet(4), Card(8, 7, 1, (), {}))  # the card says 8
     with pytest.raises(
         UserError, match=r"parameters of width 8, found \d+ other tensors, the first align\S+ \(4,\); t"
     ):
         load_network(path, "cpu")
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(UserError, match="expected weights of Spk2ImgNet, found damaged data"):
-        read_card(path)
+        WEIGHTS.read_card(path)

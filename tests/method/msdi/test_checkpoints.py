@@ -18,7 +18,7 @@ from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
 from spike4dgs.method.msdi.checkpoints import load_pretrained, source_of, transfer
-from spike4dgs.method.msdi.weights import SHIPPED, Card, load_network, read_card, save_weights, weights_path
+from spike4dgs.method.msdi.weights import SHIPPED, WEIGHTS, Card, load_network
 
 EMBED = replace(TINY, embed_channels=3)  # as the published patch embedding
 DUST3R = Dust3rShape(2, 16, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
@@ -187,9 +187,9 @@ CARD = Card("tiny", 12, 3, ("toy-1@abc",), {"psnr_db": 30.5})
 
 def test_weights_come_back_with_their_card(tmp_path: Path) -> None:
     network, path = fresh(TINY, 5), tmp_path / "w.safetensors"
-    digest = save_weights(path, network, CARD)
-    assert digest == save_weights(tmp_path / "again.safetensors", network, CARD)
-    assert read_card(path) == CARD
+    digest = WEIGHTS.save(path, network, CARD)
+    assert digest == WEIGHTS.save(tmp_path / "again.safetensors", network, CARD)
+    assert WEIGHTS.read_card(path) == CARD
     loaded = load_network(path, "cpu")
     assert not loaded.training and not any(p.requires_grad for p in loaded.parameters())
     x = (torch.rand(1, 3, 9, 16, 32) < 0.4).float()
@@ -203,36 +203,36 @@ def test_damaged_and_foreign_weights_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     path.write_bytes(b"\x80\x02pickle")
     with pytest.raises(UserError, match="weights of MSDI, found damaged data"):
-        read_card(path)
+        WEIGHTS.read_card(path)
     save_file({"weight": torch.zeros(1)}, path)
     with pytest.raises(UserError, match="metadata spike4dgs-msdi/1, found none"):
-        read_card(path)
+        WEIGHTS.read_card(path)
     save_file({"weight": torch.zeros(1)}, path, metadata={"spike4dgs-msdi/1": json.dumps({"config": "tiny"})})
     with pytest.raises(UserError, match="damaged data"):
-        read_card(path)
-    save_weights(path, fresh(TINY), replace(CARD, config="huge"))
+        WEIGHTS.read_card(path)
+    WEIGHTS.save(path, fresh(TINY), replace(CARD, config="huge"))
     with pytest.raises(UserError, match="a configuration of paper, small, tiny, found 'huge'"):
-        read_card(path)
+        WEIGHTS.read_card(path)
     other = tmp_path / "other.safetensors"
-    save_weights(other, fresh(replace(TINY, fusion_width=8)), CARD)
+    WEIGHTS.save(other, fresh(replace(TINY, fusion_width=8)), CARD)
     with pytest.raises(UserError, match="parameters of configuration tiny"):
         load_network(other, "cpu")
     broken = fresh(TINY)
     torch.nn.init.constant_(broken.encoder.norm.weight, torch.nan)
     with pytest.raises(UserError, match="found NaN or more than 65504 in encoder.norm.weight"):
-        save_weights(path, broken, CARD)
+        WEIGHTS.save(path, broken, CARD)
 
 
 def test_the_environment_names_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("SPIKE4DGS_MSDI", str(tmp_path / "absent.safetensors"))
     with pytest.raises(WeightsError, match="no such file"):
-        weights_path()
+        WEIGHTS.in_use()
     (tmp_path / "absent.safetensors").touch()
-    assert weights_path() == tmp_path / "absent.safetensors"
+    assert WEIGHTS.in_use().path == tmp_path / "absent.safetensors"
 
 
 def test_the_shipped_weights_are_those_of_their_card() -> None:
-    card = read_card(SHIPPED)
+    card = WEIGHTS.read_card(SHIPPED)
     text = (SHIPPED.parent / "README.md").read_text()
     assert sha256_file(SHIPPED) in text and f"Weights of step {card.steps}" in text
     assert load_network(SHIPPED, "cpu").config.name == card.config == "small"

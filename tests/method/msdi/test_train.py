@@ -26,7 +26,7 @@ from spike4dgs.method.msdi.train import (
     train_msdi,
 )
 from spike4dgs.method.msdi.training_data import Batch, Bursts
-from spike4dgs.method.msdi.weights import load_network, read_card
+from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 
 FAST = TrainingSettings(steps=150, views=4, most_views=3, lr_points=4e-3, warm_up=10)
 
@@ -194,7 +194,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     assert "4 bursts, tiny" in printed and "step 3/3, L1" in printed
     path = out / "msdi-tiny.safetensors"
-    card = read_card(path)
+    card = WEIGHTS.read_card(path)
     hashes = {f.facts.id: f.sha256[:16] for f in open_folder(folder)}
     assert card.trained_on == tuple(f"toy-{v}@{hashes[f'toy-{v}']}" for v in (13, 14))
     assert (card.config, card.steps) == ("tiny", 3) and 0 < card.measured["psnr_db"] < 40

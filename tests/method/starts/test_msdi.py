@@ -21,7 +21,7 @@ from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.training_data import points_of
-from spike4dgs.method.msdi.weights import VARIABLE, Card, load_network, save_weights
+from spike4dgs.method.msdi.weights import VARIABLE, WEIGHTS, Card, load_network
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.msdi import (
     Estimate,
@@ -182,7 +182,7 @@ def random_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Weights that nobody trained."""
     torch.manual_seed(0)
     path = tmp_path / "network.safetensors"
-    save_weights(path, Msdi(TINY), Card("tiny", 0, 0, ("toy-1",), {}))
+    WEIGHTS.save(path, Msdi(TINY), Card("tiny", 0, 0, ("toy-1",), {}))
     monkeypatch.setenv(VARIABLE, str(path))
     return path
 
