@@ -1,4 +1,6 @@
-"""Files that are whole or absent: atomic writes, strict JSON, hashes.
+"""Files that are whole or absent: atomic writes, strict JSON, hashes, locks.
+
+Files that are whole or absent: atomic writes, strict JSON, hashes.
 
 A killed process leaves at most a `*.part` file behind, never a half-written result under its final name.
 """
@@ -17,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
 from spike4dgs.benchmark.errors import problem
@@ -205,3 +208,29 @@ def sha256_json(value: Any) -> str:
     return hashlib.sha256(
         json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     ).hexdigest()
+
+
+@contextmanager
+def locked(
+    file: Path, where: Path | str, expected: str, wait_s: float = 0.0, temporary: bool = False
+) -> Iterator[None]:
+    """Hold the lock on `file`, which is created if need be, and with `temporary` removed at the end.
+
+    The system releases the lock when the process ends, however it ends. Raises UserError where another process still
+    holds it after `wait_s` seconds; `where` and `expected` name for the error what is locked, such as "a folder that no
+    other run uses".
+    """
+    lock = FileLock(file, timeout=wait_s)
+    try:
+        with writing(file.parent):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+    except Timeout:
+        found = "a run in progress" + (f" for {wait_s:.0f} s" if wait_s else "")
+        raise problem(where, expected, found, "wait for it") from None
+    try:
+        yield
+    finally:
+        if temporary:
+            file.unlink(missing_ok=True)
+        lock.release()

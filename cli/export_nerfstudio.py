@@ -19,12 +19,12 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_json
 from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.method.images.base import Float32
 
 _TOLERANCE_PX = 0.005  # the most that one focal length and a principal point in the middle may move a pixel
 _VAL_EVERY = 5  # training images for one validation image, at a time between them

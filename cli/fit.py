@@ -24,8 +24,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.environment import command_line, device_type, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, sha256_json
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, Method, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console

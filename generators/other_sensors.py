@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.other_sensors import Events
 from spike4dgs.benchmark.spikes.bits import kernel
-from spike4dgs.generators.sensor.model import Float32
 
 FPS = 60
 EXPOSURE_S = 1 / 120  # a shutter of 180 degrees

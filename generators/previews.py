@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import encode_srgb, read_geometry
 from spike4dgs.benchmark.scene.other_sensors import read_events
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.generators.sensor.model import Float32
 
 _FRAMES, _FRAME_MS, _QUALITY = 45, 60, 35
 _WINDOW = 16  # ticks of a count image

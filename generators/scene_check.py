@@ -21,20 +21,14 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.generators.profiles import Job
-from spike4dgs.generators.scene_differences import (
-    Difference,
-    Float64,
-    difference,
-    differing_facts,
-    images_of,
-    truth_error,
-)
+from spike4dgs.generators.scene_differences import Difference, difference, differing_facts, images_of, truth_error
 
 EQUAL, NOISE, CHANGE = "equal", "rendering noise", "change of the world"
 # The most that a difference may be of that between two noises. Between Mitsuba's variants the measures of a camera were

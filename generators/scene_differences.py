@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.cameras import camera_facts
 from spike4dgs.benchmark.scene.images import Geometry, read_geometry
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
@@ -118,8 +118,6 @@ def _other_geometry(a: Geometry, b: Geometry) -> float:
 BLOCK_PX = 8  # means of 64 pixels have an eighth of the noise
 WINDOW_TICKS = 100  # of spike counts: 5 ms at 20 kHz
 _TICKS = 256  # compared at a time
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

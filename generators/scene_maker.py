@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_json, write_json, writing
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, writing
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.manifest import write_manifest

@@ -26,8 +26,7 @@ from typing import Any
 
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, place_of

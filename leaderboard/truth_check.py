@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.runs.predictions import Predictions
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
-Float64 = NDArray[np.float64]
 Renderings = tuple[Target, NDArray[np.float32], NDArray[np.float32]]
 SecondRenderings = Callable[[Scene], Renderings | None]
 _WINDOW = 3  # px of the high-pass: texture that predictions blur is left out, Monte Carlo noise is white

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
@@ -25,7 +25,6 @@ from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.recipes import METHODS, SELF_CALIBRATED
 
-Float64 = NDArray[np.float64]
 Row = dict[str, float | str]
 COLUMNS = {  # key of the row -> heading
     "gain_spread": "gain spread, %",

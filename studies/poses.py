@@ -14,6 +14,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
@@ -21,7 +22,6 @@ from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.models.fitted_model import FittedModel

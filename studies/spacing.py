@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge
-from spike4dgs.generators.sensor.reference import Float64, fire, tick_means
+from spike4dgs.generators.sensor.model import Sensor, random_charge
+from spike4dgs.generators.sensor.reference import fire, tick_means
 
 WINDOW = 32  # ticks
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from spike4dgs.baselines.images.reference import slow_adaptive, slow_intervals, slow_tfi, slow_tfp, slow_tfstp
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfp import TfpSettings
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.hard_cases.cores import bytes_by_cores
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 Spikes = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 _GAIN = 0.6  # spikes per tick of white
 _HALF_WINDOW = TfpSettings().half_window
 _HEIGHT, _WIDTH, _TICKS = 5, 9, 70  # odd, and as small as slow twins ask

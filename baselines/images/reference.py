@@ -13,10 +13,10 @@ from decimal import Decimal, localcontext
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows
 from spike4dgs.method.images.intervals import IntervalSettings
 
-Float64 = NDArray[np.float64]
 Spikes = NDArray[np.generic]
 PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # TFSTP's u0, f, D, F
 

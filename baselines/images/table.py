@@ -8,8 +8,8 @@ from spike4dgs.baselines.images.spk2img.maker import SPK2IMG
 from spike4dgs.baselines.images.tfi import TFI
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.baselines.images.tfstp import TFSTP
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.base import ImageMaker

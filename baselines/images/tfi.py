@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, expand, find_spike, in_threads, kernel, lanes, rows
+from spike4dgs.benchmark.arrays import Float32, UInt8, UInt64
+from spike4dgs.benchmark.spikes.bits import expand, find_spike, in_threads, kernel, lanes, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 
 _BLOCK = 128  # bytes of a tick done at a time in the stack: 1024 pixels
 

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8, UInt64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import UInt8, UInt64, in_threads, kernel, lanes, rows
+from spike4dgs.benchmark.spikes.bits import in_threads, kernel, lanes, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 
 Array = NDArray[Any]

@@ -35,15 +35,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64, UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import UInt8, find_spike, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.bits import find_spike, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 
-Float64 = NDArray[np.float64]
 Synapse = tuple[float, float, float, float]  # u0, f, D and F
 
 

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from spike4dgs.baselines.radiance_field.field import Deformation, Field, encode_position, in_blocks
 from spike4dgs.baselines.radiance_field.march import Rays, camera_rays, resample, spread, weigh
 from spike4dgs.baselines.radiance_field.occupancy import Occupancy
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, positive, whole
 from spike4dgs.method.models.fitted_model import count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, make_filled, write_model

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.starts.dust3r_network import Dust3r, load_dust3r
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
@@ -33,9 +34,6 @@ from spike4dgs.method.msdi.pose import focal_from_points, solve_pose
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.structure_from_motion import clip_means
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 FILE = WeightFile(
     "dust3r_vitlarge_512_dpt.safetensors",

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.foreign_camera import Distort, Float64, FoundCamera, check_size, make_camera
+from spike4dgs.benchmark.exchange.foreign_camera import Distort, FoundCamera, check_size, make_camera
 from spike4dgs.benchmark.scene.lens import NAMES
 from spike4dgs.benchmark.scene.writer import colmap_distortion
 

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera, check_rotation, distortion_px
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 
-Float64 = NDArray[np.float64]
 Distort = Callable[[Float64], Float64]  # normalised image coordinates [N, 2] of a pinhole -> of the lens
 
 CENTRE = 0.5  # added to principal points of OpenCV and Kalibr, whose pixel centres are at whole numbers

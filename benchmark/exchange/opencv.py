@@ -16,15 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.foreign_camera import (
-    CENTRE,
-    Float64,
-    FoundCamera,
-    check_size,
-    make_camera,
-    with_brown_lens,
-)
+from spike4dgs.benchmark.exchange.foreign_camera import CENTRE, FoundCamera, check_size, make_camera, with_brown_lens
 from spike4dgs.benchmark.files import read_text
 from spike4dgs.benchmark.untrusted import parse_yaml, shown, whole
 

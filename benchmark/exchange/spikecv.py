@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write_recording
 from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, UInt8, open_stream
+from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids, inside, read_yaml, shown
 
 CONFIG = "config.yaml"

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, angle_deg, pose_errors, umeyama
@@ -24,7 +23,6 @@ from spike4dgs.benchmark.scene.images import (
 )
 from spike4dgs.benchmark.scene.lens import distort, fold_radius, undistort
 
-Float64 = NDArray[np.float64]
 _REFUSAL = "the contract: one clear error each"
 _BARREL = (-0.3, 0.1, 1e-3, -2e-3, -0.02)
 _FOLDS = (-0.2, 0.0, 0.0, 0.0, 0.0)

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.flip import flip
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
@@ -19,7 +20,6 @@ from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.metrics.table import METRICS
 
-Float64 = NDArray[np.float64]
 _SIZE = (48, 64)
 _PSNR, _SSIM = "-10 log10(MSE) in float64", "the formula of Wang et al. with OpenCV's filter, float64"
 

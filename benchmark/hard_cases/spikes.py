@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, described, refused
 from spike4dgs.benchmark.hard_cases.cores import bytes_by_cores
 from spike4dgs.benchmark.spikes.gaps import Gap
@@ -16,7 +16,6 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, bytes_pe
 _RATE_HZ = 20_000.0
 _NUMPY = "numpy.unpackbits"
 _SIZES = ((1, 1), (3, 5), (8, 1), (7, 9), (13, 7), (17, 23), (400, 250))  # width, height
-UInt8 = NDArray[np.uint8]
 
 
 def cases() -> list[Case]:

@@ -16,12 +16,10 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64, UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.images import UInt8
 
-Float64 = NDArray[np.float64]
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * (math.pi / 180)
 _SENSITIVITY = 0.0047  # degrees^2; b1 of the achromatic contrast sensitivity (its second Gaussian has weight 0)
 _WIDEST = 0.04  # degrees^2; the largest b, of the blue-yellow channel: it sets the radius of all three filters

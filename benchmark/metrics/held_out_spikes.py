@@ -26,13 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx, ndtr
 
+from spike4dgs.benchmark.arrays import Float64, Mask
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import Spans, is_recorded, spans_around
-
-Float64 = NDArray[np.float64]
 
 
 def log_probability(intervals: Float64, ticks: Float64, rate: Float64, tolerance: float, photons: float) -> Float64:
@@ -84,8 +83,6 @@ def _ramp_area(x: float | Float64, a: int, b: int) -> Float64:
     risen = np.clip(np.asarray(x, np.float64) - a, 0, b - a)
     return np.asarray(risen**2 / (2 * (b - a)) + np.maximum(np.asarray(x, np.float64) - b, 0))
 
-
-Mask = NDArray[np.bool_]
 
 WINDOWS = (5, 20, 80)  # ticks of the counts: the shortest sees motion, the longest has the least noise of counting
 SPAN_WINDOW = 20  # ticks that the judged intervals cover

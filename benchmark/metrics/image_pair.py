@@ -9,14 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64, Mask, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.held_out_spikes import SpikeView
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 
 Image = NDArray[np.floating]
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from importlib.resources import files as package_files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.images import UInt8
 from spike4dgs.benchmark.weights import ALEXNET, SQUEEZENET, VGG16, WeightFile, find_weights, load_into, read_state
 
 if TYPE_CHECKING:  # torch takes seconds to import and is needed only where there are weights

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.weights import WeightsError, find_weights

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
-
-Float64 = NDArray[np.float64]
 
 # Length of the axes, in median distances between cameras. A narrow array determines its rotations better than its
 # positions: on structure from motion of two scenes, longer axes left 0.2 and 0.1 px between the projections of the

@@ -15,8 +15,16 @@ from pathlib import Path
 
 from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import check_new, read_json, sha256_file, write_bytes, write_json, write_text, writing
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import (
+    check_new,
+    locked,
+    read_json,
+    sha256_file,
+    write_bytes,
+    write_json,
+    write_text,
+    writing,
+)
 from spike4dgs.benchmark.release import card, index
 from spike4dgs.benchmark.release.index import (
     Release,

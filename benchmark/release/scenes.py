@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_file, write_json, writing
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, read_json, sha256_file, write_json, writing
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import Member, Release, SceneEntry, Shard, parse_release, parse_shard
 from spike4dgs.benchmark.release.progress import ByteProgress, size_text

@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import sha256_file, writing
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, sha256_file, writing
 from spike4dgs.benchmark.release.progress import ByteProgress, size_text
 from spike4dgs.benchmark.release.source import Source
 from spike4dgs.benchmark.release.transfer import PIECE

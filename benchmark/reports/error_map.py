@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spike4dgs.benchmark.scene.images import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,10 +11,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.error_map import absolute_error, choose_scale, error_image
 from spike4dgs.benchmark.runs.record import Cell, Record
-from spike4dgs.benchmark.scene.images import Float32, UInt8, encode_srgb, read_exr
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
 Value = TypeVar("Value", bound=np.generic)

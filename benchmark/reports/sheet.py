@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.reports.error_map import COLORS, ERROR_MAX, scale_name
 from spike4dgs.benchmark.reports.figure import new_figure, save_with_pdf, text_width, wrap_name
 from spike4dgs.benchmark.reports.panels import Panels, make_panels, score_text
 from spike4dgs.benchmark.runs.record import Record
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
 
 if TYPE_CHECKING:

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.reports.error_map import scale_name
 from spike4dgs.benchmark.reports.figure import wrap_name
 from spike4dgs.benchmark.reports.panels import Panels, make_panels
 from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.runs.record import Record
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
 
 if TYPE_CHECKING:

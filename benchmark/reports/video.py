@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.scene.images import UInt8
 
 # By suffix: codecs in order of preference. MPEG-4 part 2 is for builds of OpenCV without libvpx: players show it,
 # browsers do not. Motion JPEG opens everywhere and is several times larger.

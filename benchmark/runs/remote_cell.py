@@ -18,8 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import write_bytes
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, write_bytes
 from spike4dgs.benchmark.method import Budget, Method, choose_device_for, find_methods, get_method, no_progress
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, run_job
 from spike4dgs.benchmark.runs.predictions import PredictionWriter

@@ -21,8 +21,7 @@ from uuid import uuid4
 from rich.console import Console
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import write_text
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, write_text
 from spike4dgs.benchmark.method import Budget, Method
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job

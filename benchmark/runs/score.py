@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, Mask, check_images
+from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.measure import Selection, fit_gain, measure, scene_means, scene_notes, select_metrics
 from spike4dgs.benchmark.runs.held_out import Cameras, has_truth, open_cameras, targets_of, view_of, without_truth
 from spike4dgs.benchmark.runs.predictions import SUMS, MethodInfo, Predictions, open_predictions

@@ -20,12 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.lens import NAMES, Distortion, distort, make_distortion, undistort
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, MAX_SIDE, check_ids, number, positive, shown, whole
 
-Float64 = NDArray[np.float64]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # flips y and z between OpenCV and OpenGL camera axes
 _GRID = 33  # points each way, corners included, at which distortion is measured
 _MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # flips x and y between OpenCV and Mitsuba camera axes

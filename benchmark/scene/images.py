@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.untrusted import MAX_SIDE
 
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 GRAY = (0.212671, 0.715160, 0.072169)  # luminance of linear R, G, B (CIE XYZ's Y of sRGB primaries, as Mitsuba has it)
 Shape = tuple[int, int]  # H, W
 _AGAIN = "render or restore it"

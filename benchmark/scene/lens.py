@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
+from spike4dgs.benchmark.arrays import Float32, Float64
+
 T = TypeVar("T", bound=np.generic)
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Distortion = tuple[float, ...]  # k1, k2, p1, p2, k3; empty: a pinhole
 
 NAMES = ("k1", "k2", "p1", "p2", "k3")

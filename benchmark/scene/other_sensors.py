@@ -23,9 +23,10 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.scene.images import Float32, UInt8, decode_srgb, read_png
+from spike4dgs.benchmark.scene.images import decode_srgb, read_png
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.untrusted import Expected, read_npz
 

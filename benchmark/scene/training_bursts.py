@@ -33,13 +33,12 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, parse_json
 from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_SIDE, check_header, is_id, positive, shown, whole
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 
 REACH = 21  # ticks to each side: a window of 41 around the instant, or the same played backwards, lies within

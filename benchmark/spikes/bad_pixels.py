@@ -12,14 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64, Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.counted_recording import WINDOW_TICKS, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-
-Mask = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 
 FEWEST_SPIKES = 10  # fewer say nothing of a rate
 HOT_SIGMA = 6.0  # robust standard deviations of its surroundings that a hot pixel is above its brightest neighbour,

@@ -21,11 +21,10 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8, UInt64
 from spike4dgs.benchmark.compilation import cached_njit
 from spike4dgs.benchmark.environment import available_cores
 
-UInt8 = NDArray[np.uint8]
-UInt64 = NDArray[np.uint64]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _BLOCK = 1024  # bytes of a tick counted at a time: eight planes and a carry of 1 KiB each stay in the L1 cache

@@ -17,7 +17,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.spikes.bits import UInt8, find_spike, in_threads, kernel
+from spike4dgs.benchmark.arrays import Int64, UInt8
+from spike4dgs.benchmark.spikes.bits import find_spike, in_threads, kernel
 from spike4dgs.benchmark.spikes.counted_recording import CountedRecording, Recording
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -27,7 +28,6 @@ NEAR_TICKS = 20  # on each side of a gap whose intervals count: as far as most i
 INTERVALS = 2  # that count in any case, if there are so many
 _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more than it saves
 
-Int64 = NDArray[np.int64]
 AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 

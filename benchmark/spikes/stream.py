@@ -16,11 +16,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import writing
 from spike4dgs.benchmark.spikes.gaps import Gap
 
-UInt8 = NDArray[np.uint8]
 T = TypeVar("T", bound=np.generic)
 
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel, rows
+from spike4dgs.benchmark.arrays import Int32, UInt8
+from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -66,9 +67,6 @@ def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], 
                 if bits >> k & 1 and p < len(at):
                     ticks[at[p]] = t
                     at[p] += 1
-
-
-Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, refused
 from spike4dgs.benchmark.hard_cases.cores import core_counts, equal_bytes
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.other_sensors import events
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
-from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference
 
 _HEIGHT, _WIDTH = 9, 15

@@ -20,9 +20,10 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
-from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, Float32
+from spike4dgs.benchmark.scene.training_bursts import REACH, Burst
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
 from spike4dgs.generators.rendering.render import make_tracer

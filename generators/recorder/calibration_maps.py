@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.untrusted import Expected, read_npz
-
-Float32 = NDArray[np.float32]
 
 
 def read_maps(path: Path, width: int, height: int) -> dict[str, Float32]:

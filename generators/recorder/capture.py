@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
@@ -28,8 +27,6 @@ from spike4dgs.generators.recorder.sync import Rate, Rates
 from spike4dgs.generators.recorder.usb.reader import Reader
 from spike4dgs.generators.recorder.usb.reads import OK, TIME_OUT
 from spike4dgs.generators.recorder.usb.transport import Link
-
-UInt8 = NDArray[np.uint8]
 
 __all__ = ["STATES", "CameraClip", "CameraStats", "Clip", "Rate", "Sink", "capture"]
 

@@ -16,14 +16,14 @@ from types import TracebackType
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import check_new, writing
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import check_new, locked, writing
 from spike4dgs.benchmark.scene.writer import stream_name
 from spike4dgs.generators.recorder.clip_record import ClipRecord, gaps_of, write_description
 from spike4dgs.generators.recorder.disk import Buffers, DiskFile
 from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
-from spike4dgs.generators.recorder.frames.layouts import Int64, UInt8, make_layout
+from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import NAME, TOP_DOWN, CameraProfile, RigProfile
 

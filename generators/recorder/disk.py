@@ -24,9 +24,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-UInt8 = NDArray[np.uint8]
+from spike4dgs.benchmark.arrays import UInt8
 
 BUFFER_BYTES = 4 << 20
 PER_FILE = 4  # buffers

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.manifest import NAME as MANIFEST
@@ -27,7 +28,6 @@ from spike4dgs.generators.recorder.clip_record import ClipRecord
 from spike4dgs.generators.recorder.disk import BUFFER_BYTES
 from spike4dgs.generators.recorder.emulation.imperfections import PERFECT, Imperfections
 from spike4dgs.generators.recorder.frames.clip import Clip, Sink
-from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
 from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, real_time
 from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording

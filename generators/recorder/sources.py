@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.counted_recording import raw
@@ -24,7 +25,7 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
     with_wrong_calibrations,
 )
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
-from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, UInt8, make_layout
+from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.render import StaticViews
-from spike4dgs.generators.sensor.model import Float32
 
 
 class Clip(NamedTuple):

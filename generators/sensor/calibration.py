@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.calibration import Calibration, estimate
@@ -26,7 +27,7 @@ from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.benchmark.untrusted import Expected, read_npz
-from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 
 def gain_map(height: int, width: int, seed: int, camera: str) -> Float32:

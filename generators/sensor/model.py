@@ -43,14 +43,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Int32, UInt8
 from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
-from spike4dgs.benchmark.spikes.stream import UInt8, bytes_per_tick
+from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators.sensor.kernels import BLOCK, STRIP, integrate
 
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
 DEVIATE_SD = 21845**0.5  # of `sensor.kernels.deviate`

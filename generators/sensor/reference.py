@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64, Int32
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD, charge_after_spike, charge_of_tick
-from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_DEVIATION, Float32, Int32, Keys, Sensor
+from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_DEVIATION, Keys, Sensor
 
-Float64 = NDArray[np.float64]
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
 
 

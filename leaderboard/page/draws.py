@@ -8,10 +8,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
-UInt32 = NDArray[np.uint32]
+from spike4dgs.benchmark.arrays import Float64, UInt32
 
 
 def hashed(counters: UInt32, seed: int) -> UInt32:

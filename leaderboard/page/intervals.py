@@ -26,7 +26,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.leaderboard.page.draws import Float64, draw_weights
+from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.leaderboard.page.draws import draw_weights
 
 LEVEL = 0.95
 REPLICATES = 2000

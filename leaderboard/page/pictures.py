@@ -7,13 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_bytes
 from spike4dgs.benchmark.reports.error_map import absolute_error, choose_scale, error_levels
 from spike4dgs.benchmark.reports.panels import crops
 from spike4dgs.benchmark.runs.held_out import has_truth
 from spike4dgs.benchmark.runs.predictions import open_predictions
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.page.rows import Board
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.leaderboard.page.draws import Float64
 from spike4dgs.leaderboard.page.intervals import Comparison, compare
 from spike4dgs.leaderboard.page.rows import Board, Row
 

@@ -6,8 +6,7 @@ import traceback
 from collections.abc import Sequence
 
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.files import write_text
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, write_text
 from spike4dgs.benchmark.method import Method, get_method
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.cell import Job, is_done, run_job

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.environment import cpu_name, harness, utc_now
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.method import make_budget
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season import opening

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import read_json, write_json, write_text
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked, read_json, write_json, write_text
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics

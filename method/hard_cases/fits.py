@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import harness, utc_now
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare
 from spike4dgs.benchmark.hard_cases.cores import core_counts, equal_bytes
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.runs.provenance import Provenance
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod, measure

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.baselines.tracking.losses import Neighbours, find_neighbours, physical_loss, remember
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, compare, worst
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.cameras import look_at
@@ -23,7 +23,6 @@ from spike4dgs.method.supervision.spike import encode, firing_rate
 from spike4dgs.method.training_views.instants import correction, node
 from spike4dgs.method.training_views.training_images import Spans
 
-Float64 = NDArray[np.float64]
 _SSIM_PAIRS: dict[str, tuple[str, Callable[[torch.Generator], tuple[Tensor, Tensor]]]] = {
     "black": ("black against black", lambda g: (torch.zeros(1, 30, 30), torch.zeros(1, 30, 30))),
     "flat": ("0.7 everywhere, twice: variances cancel", lambda g: (_flat(0.7), _flat(0.7))),

@@ -26,11 +26,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import UInt8, in_threads, kernel
+from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import spike_times
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 
 

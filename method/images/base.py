@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
 from spike4dgs.method.settings import Settings
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Half
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages, bad_pixels, missing_images
-
-Half = NDArray[np.float16]
 
 
 @dataclass(frozen=True)

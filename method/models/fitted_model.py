@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.model_file import (

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.method.gaussians.parameters import Gaussians, nearest
 from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.kernels.jit import kernel
@@ -30,8 +31,6 @@ CUBIC = 9  # m1, m2 and m3 of a path in space
 NEAREST = 6
 EASE = 0.1  # e, px: below it the pull weakens
 SHARES = (0.5,) * 3 + (0.25,) * 3 + (0.125,) * 3  # of m1, m2 and m3 half a clip away
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

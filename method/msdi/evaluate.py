@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.scene.training_bursts import Float64
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA, normalized
 from spike4dgs.method.msdi.network import Estimate, Msdi

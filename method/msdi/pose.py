@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
+
 if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Estimate
 
-Float64 = NDArray[np.float64]
 
 FOCAL_ROUNDS = 10
 LEAST_POINTS = 6

@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_text
-from spike4dgs.benchmark.scene.training_bursts import Float64
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import TrainingSettings

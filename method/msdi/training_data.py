@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, BurstFile, Float32, Float64
+from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, BurstFile
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, charge_after_spike, charge_of_tick
 

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.starts.rig import PointSettings, look_up, matched
-
-Float64 = NDArray[np.float64]
 
 LEAST_RADIANCE = 0.02  # of a point, white is 1: a few spikes say little of a ratio
 OWN_ERROR = 0.01  # of an estimate between views, by fixed patterns and gloss: measured on an emulated array

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import new_figure
 from spike4dgs.benchmark.runs.provenance import Provenance
-from spike4dgs.benchmark.scene.cameras import Camera, Float64, array_axes
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes
 from spike4dgs.method.recordings.camera_facts import CameraFacts
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores
 

@@ -18,11 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.method.self_calibration.normal_equations import Prior, Reduced, reduce, residuals
 from spike4dgs.method.self_calibration.patches import BASIS, Moment, Patches, Viewer, moment, observe, strongest, sweep
-
-Float64 = NDArray[np.float64]
 
 OFFSET, DRIFT, GAIN, X, Y = range(5)  # a camera's numbers: ticks, ticks at the clip's end, log, px, px
 NUMBERS = 5

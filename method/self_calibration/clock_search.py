@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings, least_change, reach_ticks
 from spike4dgs.method.self_calibration.patches import CAP, Patches, Rays, Viewer, moment, rays, strongest, window_image
-
-Float64 = NDArray[np.float64]
 
 FAR_COST = 2.0  # of a pair whose offset was not tried, both ways: that of a pair of images that have nothing in common
 MOST_ROUNDS = 20  # of moving each camera in turn; three are usual

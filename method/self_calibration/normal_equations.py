@@ -14,9 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from spike4dgs.benchmark.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)

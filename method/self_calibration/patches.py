@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64, Int64
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -32,8 +32,6 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.training_views.pinholes import Lens, lenses_of
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +142,6 @@ def look_up(stack: Float64, uv: Float64) -> Float64:
     bottom = (1 - a) * flat[..., at + width] + a * flat[..., at + width + 1]
     return np.where(inside, (1 - b) * top + b * bottom, np.nan)
 
-
-Int64 = NDArray[np.int64]
 
 STRIDE_PX = 2.0  # between a patch's points: after a blur of 1 px their noise is nearly independent
 _GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)

@@ -15,13 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64, Int64
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.starts.matched_poses import Seen, read_matches
 from spike4dgs.method.starts.structure_from_motion import FeatureSettings, find_features
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

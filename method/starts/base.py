@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.settings import Settings
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.msdi.pose import LEAST_POINTS, solve_pose
 from spike4dgs.method.starts.structure_from_motion import (
@@ -32,8 +33,6 @@ from spike4dgs.method.starts.structure_from_motion import (
 if TYPE_CHECKING:
     import pycolmap
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Pose = tuple[Float64, Float64]  # world to camera, R [3, 3] and t [3]
 
 

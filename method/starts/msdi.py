@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
@@ -44,9 +45,6 @@ from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
 from spike4dgs.method.starts.rig import Cloud, CloudSettings, PointSettings, fill, filled, matched, thin, window_means
 from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

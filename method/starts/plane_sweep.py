@@ -15,13 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64, Mask
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.kernels.threads import get_threads
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from spike4dgs.benchmark.arrays import Float32, Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -27,7 +28,6 @@ from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.plane_sweep import (
     DepthMap,
-    Mask,
     SweepSettings,
     agreed,
     find_range,
@@ -38,8 +38,6 @@ from spike4dgs.method.starts.plane_sweep import (
 )
 from spike4dgs.method.training_views.changes import COUNTS, changing, without_specks
 from spike4dgs.method.training_views.pinholes import nearest_pixels, seen_pixels, undistorted
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -29,8 +30,6 @@ from spike4dgs.method.training_views.pinholes import undistorted
 
 if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
     import pycolmap
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

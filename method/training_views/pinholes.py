@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.cameras import Camera, border, check_lens
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.benchmark.scene.lens import Distortion, distort, inside, nearest, resample, undistort
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
-Float64 = NDArray[np.float64]
 M = TypeVar("M")
 _MARGIN_PX = 2  # around the camera's field of view: cubic interpolation reaches so far
 

@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.cameras import Camera, Float64, look_at
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
 
 Path = Callable[[float], Camera]
 PathName = Literal["orbit", "rig", "still"]

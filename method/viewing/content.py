@@ -10,10 +10,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32, UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.models.saved_model import SavedModel
 

@@ -25,7 +25,6 @@ from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.splat.types import ALPHA_MIN
 
-Float32 = NDArray[np.float32]
 FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),

@@ -8,10 +8,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.reports.video import Write, check_video, video_writer
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb, write_png
+from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.untrusted import MAX_SIDE
 from spike4dgs.method.models.saved_model import SavedModel
 from spike4dgs.method.viewing import camera_paths

@@ -15,12 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.untrusted import Expected, read_npz
 
-Float32 = NDArray[np.float32]
 _AGAIN = "delete it and run the same command again"
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.metrics.flip import flip
 from spike4dgs.benchmark.metrics.held_out_spikes import record_around, response_of, view_spikes
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
@@ -21,7 +22,6 @@ from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network, predict
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, empty_trunk, make_network
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.scene.images import UInt8
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.studies.speed.timing import show_table, time_ms

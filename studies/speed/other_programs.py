@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.baselines.images.tfstp import TfstpSettings, tfstp_image
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32
 from spike4dgs.studies.speed.rows import OURS, MakeImage, Row, measured, timed_stream
 from spike4dgs.studies.speed.timing import module_of, time_ms
 

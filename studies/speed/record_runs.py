@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.generators.recorder.capture import DRAIN, TRIGGERED, capture
 from spike4dgs.generators.recorder.checks import find_cameras
@@ -21,7 +22,7 @@ from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera
 from spike4dgs.generators.recorder.frames.clip import Clip
-from spike4dgs.generators.recorder.frames.layouts import PLAIN, UInt8
+from spike4dgs.generators.recorder.frames.layouts import PLAIN
 from spike4dgs.generators.recorder.resources import buffer_seconds, real_time
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.sync import Rate

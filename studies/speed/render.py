@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.images import Float32
 from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat.reference import composite_patch, project

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.metrics.image_pair import ImagePair, check_images
 from spike4dgs.benchmark.metrics.measure import mean
@@ -18,7 +19,7 @@ from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.studies.speed.streams import fired_stream
 from spike4dgs.studies.speed.timing import time_ms
 

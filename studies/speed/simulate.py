@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Int32, UInt8
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
-from spike4dgs.benchmark.spikes.stream import UInt8, count_bits, pack
+from spike4dgs.benchmark.spikes.stream import count_bits, pack
 from spike4dgs.generators.sensor import model as camera
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
-from spike4dgs.generators.sensor.model import Float32, Int32, Keys, Sensor, random_charge
+from spike4dgs.generators.sensor.model import Keys, Sensor, random_charge
 from spike4dgs.generators.sensor.reference import fire, tick_means
 from spike4dgs.studies.speed.timing import module_of, show_table, time_ms
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from spike4dgs.baselines.images.tfi import tfi_stack
 from spike4dgs.baselines.images.tfp import TfpSettings, count_stack, tfp_stack
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32
 from spike4dgs.studies.speed.decode import unpack_plainly
 from spike4dgs.studies.speed.streams import fired_stream
 from spike4dgs.studies.speed.timing import show_table, time_ms

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.error_map import show_error, show_error_scale
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.method.images.base import Float32, ImageMaker
+from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.studies.speed.rows import Row, held_out, middle_target
 
 if TYPE_CHECKING:

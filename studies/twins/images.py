@@ -12,10 +12,10 @@ import numpy as np
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_stack
 from spike4dgs.baselines.images.tfp import HALF_WINDOW, tfp_image, tfp_stack
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.method.images.base import Float32
 from spike4dgs.studies.speed.rows import held_out
 from spike4dgs.studies.speed.stacks import tfi_plainly, tfp_plainly
 from spike4dgs.studies.speed.streams import fired_stream

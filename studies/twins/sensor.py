@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.spikes.stream import count_bits
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
-from spike4dgs.generators.sensor.model import Float32, Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.studies.speed.simulate import exact_counts, pattern, simulate_numpy
 from spike4dgs.studies.speed.timing import by_turns_ms
 from spike4dgs.studies.speed_error.measurement import (

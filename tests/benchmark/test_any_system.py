@@ -52,7 +52,7 @@ for room in ("benchmark", "method", "baselines", "generators", "leaderboard", "s
 import numpy as np
 from spike4dgs.baselines import make_image
 from spike4dgs.benchmark.environment import available_cores, cpu_name, environment, peak_memory_mb
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.splat.kernels.threads import get_threads
 

@@ -8,7 +8,7 @@ import pytest
 from submitters import lost, make_results, same_boards, submit_under_fire
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.locks import locked
+from spike4dgs.benchmark.files import locked
 from spike4dgs.leaderboard import entry
 
 

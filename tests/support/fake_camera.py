@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.frames.layouts import Layout, make_layout
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion
 
-UInt8 = NDArray[np.uint8]
 WIDTH, HEIGHT, FPS = 24, 10, 20000
 
 

@@ -17,13 +17,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.variants import PUBLIC_VARIANT, is_reserved
 from spike4dgs.method.images.windows import HALF_WINDOW, WINDOW, window
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import Float32, ImageMaker, learned_from
+from spike4dgs.method.images.base import ImageMaker, learned_from
 from spike4dgs.method.images.windows import WINDOW, window
 from spike4dgs.method.models.network_weights import WeightKind
 

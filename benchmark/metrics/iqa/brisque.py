@@ -15,11 +15,10 @@ from functools import cache
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64, UInt8
 from spike4dgs.benchmark.metrics.iqa.natural_scene_statistics import (
     VALUE,
     WINDOW,
-    Float64,
-    UInt8,
     check_image,
     degenerate,
     fit_asymmetric,

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.images import UInt8
 from spike4dgs.benchmark.weights import METAIQA, find_weights, load_into, read_state
 
 if TYPE_CHECKING:

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.spikes.bits import kernel
 
@@ -40,9 +41,6 @@ def load_parameters(metric: str) -> dict[str, Float64]:
             if name.startswith(f"{metric}_")
         }
 
-
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 WINDOW = 7  # pixels; the side of the Gaussian window w ...
 WINDOW_SIGMA = WINDOW / 6  # ... which ends at three standard deviations

@@ -25,15 +25,13 @@ import numpy as np
 import usb.backend
 import usb.core
 import usb.util
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import DUPLICATE, HIGH_SPEED, MISSING, EmulatedCamera
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, UNPLUGGED
 from spike4dgs.generators.recorder.rig_profile import CameraProfile
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, Completion
-
-UInt8 = NDArray[np.uint8]
 
 _ERRNO = {STALL: errno.EPIPE, OVERFLOW: errno.EOVERFLOW, UNPLUGGED: errno.ENODEV}
 _SPEED_HIGH, _SPEED_SUPER = 3, 4  # enum libusb_speed

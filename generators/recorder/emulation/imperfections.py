@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.camera_state import Clock
-from spike4dgs.benchmark.scene.cameras import Camera, Float64
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.lens import make_distortion
 from spike4dgs.generators.recorder.emulation.camera import LOST, Fault
 from spike4dgs.generators.recorder.frames.layouts import make_layout

@@ -13,12 +13,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float64, UInt8
 from spike4dgs.benchmark.scene.camera_state import Clock
-from spike4dgs.benchmark.scene.cameras import Float64
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.benchmark.spikes.sensor_model import charge_after_spike
 from spike4dgs.generators.recorder.emulation.imperfections import BadPixels, Pixels, WorseCamera, random
-from spike4dgs.generators.recorder.frames.layouts import UInt8
 
 DWELL_TICKS = 100.0  # mean time that a flickering pixel stays in one of its two states: 5 ms at 20 kHz
 _MARGIN = 1e-6  # ticks

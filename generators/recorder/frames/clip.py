@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
-
-UInt8 = NDArray[np.uint8]
 
 FRAME_TAGS, ARRIVAL_TIMES = "frame tags", "arrival times"
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, Gap
 from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout
 from spike4dgs.generators.recorder.frames.ring import Block, Ring
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
-
-UInt8 = NDArray[np.uint8]
 
 
 class Cutter:

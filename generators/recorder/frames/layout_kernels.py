@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.benchmark.spikes.bits import kernel
-
-UInt8 = NDArray[np.uint8]
-Int64 = NDArray[np.int64]
 
 TORN = -1  # in place of a counter: the tags of a frame disagree
 STEP, MIX = 257, 40503  # of the tags of `tagged-rows`

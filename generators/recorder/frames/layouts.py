@@ -34,6 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import rows
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
@@ -41,8 +42,6 @@ from spike4dgs.generators.recorder.frames.layout_kernels import (
     LINE_BITS,
     MIX,
     STEP,
-    Int64,
-    UInt8,
     check_lines,
     count_tagged,
     find_lines,

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.spikes.bits import kernel, rows
-
-UInt8 = NDArray[np.uint8]
 
 
 def orient(packed: UInt8, width: int, height: int, flip: bool, mirror: bool) -> UInt8:

@@ -13,9 +13,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-UInt8 = NDArray[np.uint8]
+from spike4dgs.benchmark.arrays import UInt8
 
 _SPARE = -1
 

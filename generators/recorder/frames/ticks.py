@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.generators.recorder.frames.gaps import INTERRUPTED, OVERFLOW, TORN_FRAME, Gap, merged
-from spike4dgs.generators.recorder.frames.layouts import COUNTER, Int64, Layout, UInt8
+from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout
 
 _NOTHING = np.empty(0, np.uint8)
 

@@ -11,12 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _MOST = 1000  # corners each way, and metres of a square
 _FEWEST = 3  # corners in a row that the detector needs

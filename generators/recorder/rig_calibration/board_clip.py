@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.metrics.pose_error import Sim3
@@ -26,7 +27,7 @@ from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.benchmark.untrusted import MAX_SIDE
-from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64
+from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 

@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.generators.recorder.rig_calibration.board import Board, Float32, Float64, find_corners
+from spike4dgs.generators.recorder.rig_calibration.board import Board, find_corners
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Detections
 
 

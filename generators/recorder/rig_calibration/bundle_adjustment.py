@@ -12,12 +12,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.generators.recorder.rig_calibration.board import Float64
+from spike4dgs.benchmark.arrays import Float64, Int64, Mask
 
-Int64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 _MOST_STEPS = 60
 _CONVERGED = 1e-9  # relative decrease of the sum of squares of a last step
 _FINEST_PX = 1e-3  # the accuracy of corners is never better

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.generators.recorder.rig_calibration.board import Float64
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Detections, Rig
 
 FEWEST_VIEWS = 4  # of the board for each camera: three tilts determine a focal length, one is to spare

@@ -13,15 +13,12 @@ import time
 from collections import deque
 from typing import Any
 
-import numpy as np
 import usb.core
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, OK, SHORT, Completion
-
-UInt8 = NDArray[np.uint8]
 
 
 class _Transfer(c.Structure):

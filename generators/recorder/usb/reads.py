@@ -10,11 +10,9 @@ from typing import Protocol
 
 import numpy as np
 import usb.core
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
-
-UInt8 = NDArray[np.uint8]
 
 OK, SHORT, CANCELLED = "ok", SHORT_READ, "cancelled"
 # After these a camera sends no usable data; each is the reason of the gap that follows.

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics import flip as module
 from spike4dgs.benchmark.metrics.flip import flip
-
-UInt8 = NDArray[np.uint8]
 
 
 def package(truth: UInt8, prediction: UInt8) -> float:

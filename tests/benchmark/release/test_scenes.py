@@ -369,7 +369,7 @@ def tree_of_parts(root: Path) -> dict[str, bytes]:
 
 
 def test_two_downloads_do_not_share_a_folder(release_folder: Path, tmp_path: Path) -> None:
-    from spike4dgs.benchmark.locks import locked
+    from spike4dgs.benchmark.files import locked
 
     with locked(tmp_path / ".download.lock", tmp_path, "free"), pytest.raises(UserError, match="a run in progress"):
         fetch(str(release_folder), tmp_path)

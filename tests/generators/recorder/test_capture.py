@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from fake_camera import FakeCamera, frames_of, layout_of, rig, rig_of
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.capture import STATES, capture
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, Clip
 from spike4dgs.generators.recorder.frames.cutting import agree
-from spike4dgs.generators.recorder.frames.layouts import COUNTER, UInt8
+from spike4dgs.generators.recorder.frames.layouts import COUNTER
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sync import Rate
 from spike4dgs.generators.recorder.usb.reads import OVERFLOW, SHORT, STALL, TIME_OUT, UNPLUGGED

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from spike4dgs.leaderboard.page.draws import Float64
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.leaderboard.page.intervals import GRID, LEVEL, MOST_UNITS, compare, resampled_means, widened_values
 
 

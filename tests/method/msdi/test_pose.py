@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.method.msdi import Estimate
 from spike4dgs.method.msdi.pose import PnpSettings, focal_from_points, poses_of, solve_poses
 
-Float64 = NDArray[np.float64]
 WORLD = ToyWorld(width=64, height=40)
 K = np.stack([c.K for c in WORLD.cameras])
 _BACK = np.linalg.inv(WORLD.cameras[0].w2c)

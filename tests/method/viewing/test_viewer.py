@@ -15,9 +15,10 @@ from devtools import HEIGHT, WIDTH, Page, browser, wait_for
 from saved_models import DURATION_US, WORLD, model, provenance
 from small_scenes import array_cameras
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import ERROR_MAX, error_colors
-from spike4dgs.benchmark.scene.images import UInt8, encode_srgb
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.cli import main
 from spike4dgs.method.models.saved_model import SavedModel
 from spike4dgs.method.viewing.camera_paths import fixed

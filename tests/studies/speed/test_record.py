@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder import disk as disk
 from spike4dgs.generators.recorder.clip_files import StreamFiles
-from spike4dgs.generators.recorder.frames.layouts import UInt8
 from spike4dgs.studies.speed import record_runs as speed_runs
 from spike4dgs.studies.speed.record import COLUMNS, record
 from spike4dgs.studies.speed.record_disk import COLUMNS as DISK_COLUMNS

@@ -12,6 +12,7 @@ import pytest
 from emulated_rig import BLOCK, N, emulate, profile_of
 from recorder_rig import FRAME, HEIGHT, TICKS, WIDTH, check_identical, check_recording, finish, record, source_scene
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.capture import capture
@@ -19,7 +20,7 @@ from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.emulation import backend as emulator
 from spike4dgs.generators.recorder.emulation.backend import EmulatedReads
-from spike4dgs.generators.recorder.emulation.camera import Fault, UInt8
+from spike4dgs.generators.recorder.emulation.camera import Fault
 from spike4dgs.generators.recorder.frames.clip import CameraClip
 from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.usb.reads import Completion

@@ -8,9 +8,10 @@ import time
 import numpy as np
 import pytest
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.generators.recorder.frames.cutting import Cutter
 from spike4dgs.generators.recorder.frames.delivery import Delivery
-from spike4dgs.generators.recorder.frames.layouts import UInt8, make_layout
+from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.frames.ring import Ring
 
 LAYOUT = make_layout("plain", 16, 8)  # 16 bytes a frame
