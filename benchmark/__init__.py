@@ -29,7 +29,7 @@ else:
             "method": ("Budget", "FitRequest", "Method", "Model", "Recipe", "find_methods", "get_method"),
             "metrics.measure": ("score_image",),
             "metrics.table": ("METRICS",),
-            "runs.dataframe": ("records_to_dataframe",),
+            "runs.results": ("records_to_dataframe",),
             "runs.record": ("read_record",),
             "runs.score": ("score_predictions",),
             "scene.cameras": ("Camera",),

@@ -1,7 +1,5 @@
 """croissant.json: the scene described for data catalogues and loaders (MLCommons Croissant 1.0, JSON-LD).
 
-croissant.json: the scene described for data catalogues and loaders (MLCommons Croissant 1.0, JSON-LD).
-
 A function of the scene alone: it holds no time of day and nothing else that varies between two runs. Therefore it
 also lacks `datePublished` and `url`, which whoever publishes a scene knows.
 """

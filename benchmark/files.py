@@ -1,7 +1,5 @@
 """Files that are whole or absent: atomic writes, strict JSON, hashes, locks.
 
-Files that are whole or absent: atomic writes, strict JSON, hashes.
-
 A killed process leaves at most a `*.part` file behind, never a half-written result under its final name.
 """
 

@@ -1,7 +1,5 @@
 """From images to values: all metrics of an image, and a scene's value of each.
 
-From images to values: all metrics of an image, and a scene's value of each.
-
 A scene's value is the mean of the per-image values; squared errors are never pooled over images. Images for which the
 dataset defines no value (no moving region, no earlier target) are not part of the mean: they are the same for all
 methods. A prediction that a metric refuses (a black image, say) takes the scene's value away, so that no method gains

@@ -1,7 +1,5 @@
 """A camera's response to light, estimated from recordings that any owner can make: under uniform light, in the dark.
 
-A camera's response to light, estimated from recordings that any owner can make: under uniform light, in the dark.
-
 A pixel's rate is (spikes - 1) / (ticks between the first and the last), which does not depend on the charge before the
 first spike and after the last: over T ticks it is wrong by about 1 / T, where a count is by 1 / (rate T). Then
 

@@ -1,7 +1,5 @@
 """Counted recordings: all that a calibration reads of a recording of steady light or of darkness, in fewer bytes.
 
-Counted recordings: all that a calibration reads of a recording of steady light or of darkness, in fewer bytes.
-
 A pixel's rate needs the ticks of its first and last spike and their number; a flickering pixel shows in its counts in
 windows of WINDOW_TICKS. Estimates from a counted recording equal those from the raw one to the last bit. The file is an
 .npz of the arrays below. It holds no single spike: what emulates an array needs the raw recording.

@@ -1,7 +1,5 @@
 """The streams of a recording: files that grow as `.part` files at their true ticks during the capture.
 
-The streams of a recording: files that grow as `.part` files at their true ticks during the capture.
-
 Ticks that were never written are zeros, and listed as gaps.
 """
 

@@ -1,7 +1,5 @@
 """The description of a recording: scene.json or stream.json, and the manifest.
 
-The description of a recording: scene.json or stream.json, and the manifest.
-
 With a calibrated rig the folder is a scene, `spike4dgs-scene/1`; without poses it is a folder of streams with its
 `stream.json`, which `inspect` and `calibrate-rig` read. The description and the manifest are written last, so a folder
 without them is an unfinished recording.

@@ -1,7 +1,5 @@
 """Files that grow as fast as the disk allows: past the page cache where the system supports it (`O_DIRECT`).
 
-Files that grow as fast as the disk allows: past the page cache where the system supports it (`O_DIRECT`).
-
 A cache that is filled faster than the disk empties it blocks every writer for long, at unpredictable times. Here bytes
 are collected in a few aligned buffers, and a thread for each file writes whole buffers to the disk: the processor
 copies each byte once, and the amount of waiting data is known (`Buffers.waiting`). Where a file system does not support

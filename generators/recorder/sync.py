@@ -1,7 +1,5 @@
 """The synchrony of a capture's cameras, from the arrival times of their data.
 
-The synchrony of a capture's cameras, from the arrival times of their data.
-
 For each camera a line is fitted to (ticks complete, time of arrival). Its slope against the nominal rate is the drift
 of the camera's clock against the computer's, its height the time of tick 0. Operating system and bus can only delay an
 arrival, often by milliseconds, so the fit uses medians (Theil and Sen): a third of the reads may be late without moving

@@ -1,7 +1,5 @@
 """Scores of MSDI on data that it was not trained on: images, points, confidence and poses, against the truth.
 
-Scores of MSDI on data that it was not trained on: images, points, confidence and poses, against the truth.
-
 Names and units of `Scores.measured`:
 
 - `psnr_db`, `psnr_dynamic_db`: of the images, mean over views; `raw_...`: of those without knowledge of the sensors;

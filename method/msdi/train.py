@@ -1,7 +1,5 @@
 """Train MSDI on training bursts: `train-msdi`.
 
-Train MSDI on training bursts: `train-msdi`.
-
 Loss: L1 of the images in radiance, which trains extractor and generator, and DUSt3R's confidence-weighted regression of
 points (`losses`), which trains everything behind them. Each step has a fixed number of views: few samples of many
 views, or many of few.

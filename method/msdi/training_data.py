@@ -1,7 +1,5 @@
 """Training batches of MSDI: windows of spikes with their images, points and cameras, drawn from bursts.
 
-Training batches of MSDI: windows of spikes with their images, points and cameras, drawn from bursts.
-
 Spikes made on the fly from a burst's images: a window of the simulated cameras.
 
 The model is that of `benchmark.spikes.sensor_model`; a pixel's charge before the window is uniform. Charge is float64

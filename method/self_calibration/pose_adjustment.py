@@ -1,7 +1,5 @@
 """Bundle adjustment of an array that starts from given poses and stays near them.
 
-Bundle adjustment of an array that starts from given poses and stays near them.
-
 Unknown are a small turn and shift of every camera, and the points. The given poses are knowledge, with standard
 deviations: they hold the frame and the scale, which no image tells, and what a narrow array tells badly. Observations
 count by Cauchy's weights, because some matches are wrong. Points are eliminated from the normal equations.

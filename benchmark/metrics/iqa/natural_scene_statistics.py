@@ -1,7 +1,5 @@
 """The statistics that BRISQUE and NIQE share: locally normalised brightness, and distributions fitted to it.
 
-The statistics that BRISQUE and NIQE share: locally normalised brightness, and distributions fitted to it.
-
 A natural image, after each pixel loses its neighbourhood's mean and is divided by its neighbourhood's contrast
 ("mean subtracted, contrast normalised": MSCN), has nearly Gaussian values, and the products of neighbours follow an
 asymmetric distribution. Blur, noise and compression bend these laws; the shapes and widths of the fits measure that.

@@ -1,7 +1,5 @@
 """Delivery of frames to the sink of continuous mode, by a thread of its own.
 
-Delivery of frames to the sink of continuous mode, by a thread of its own.
-
 A sink may wait for long, for a disk that stalls. Only this thread waits then: reads continue into the rings, and the
 capturing thread still reacts to Ctrl-C and reports rates.
 """

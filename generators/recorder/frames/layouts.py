@@ -1,7 +1,5 @@
 """Frame layouts: the format of a camera's frames on the wire, and their conversion to packed ticks.
 
-Frame layouts: the format of a camera's frames on the wire, and their conversion to packed ticks.
-
 | name | frame | torn frames are detected by | frames are counted by |
 |---|---|---|---|
 | `plain` | the packed tick, ceil(W H / 8) bytes (400x250: 12,500) | nothing | nothing |

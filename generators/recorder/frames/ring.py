@@ -1,7 +1,5 @@
 """The memory for one camera's reads: allocated before the capture starts, and always available to the next read.
 
-The memory for one camera's reads: allocated before the capture starts, and always available to the next read.
-
 Reads take slots in turn. If the consumer has not released one in time, the read goes to a spare buffer whose bytes are
 dropped: the USB side continues, and the loss is known to the byte.
 """

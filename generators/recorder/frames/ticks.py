@@ -1,7 +1,5 @@
 """Conversion of a camera's bytes to frames with their true ticks, across losses of known and unknown size.
 
-Conversion of a camera's bytes to frames with their true ticks, across losses of known and unknown size.
-
 A tick is never guessed. Where the layout has a counter, a frame's tick follows from it, and after any loss the next
 whole frame is searched byte by byte. Without a counter, ticks follow from the number of bytes, and a loss of unknown
 size ends the camera's recording: everything after it is a gap, because its ticks cannot be known. A loss that neither
