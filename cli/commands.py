@@ -28,7 +28,7 @@ COMMANDS: dict[str, Command] = {
         "worlds",
     ),
     "calibrate": Command(
-        "spike4dgs.generators.sensor.calibration:calibrate",
+        "spike4dgs.cli.calibrate:calibrate",
         "estimate gain and dark maps from flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
@@ -48,17 +48,17 @@ COMMANDS: dict[str, Command] = {
         "calibrate-rig captures/board --columns 8 --rows 5 --square-m 0.04 --out rig",
     ),
     "train-spk2img": Command(
-        "spike4dgs.baselines.images.spk2img.train:train_spk2img",
+        "spike4dgs.cli.train_spk2img:train_spk2img",
         "train the network of the spk2img images on training variants of the worlds",
         "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
     ),
     "make-msdi-data": Command(
-        "spike4dgs.generators.msdi_data.make_msdi_data:make_msdi_data",
+        "spike4dgs.cli.make_msdi_data:make_msdi_data",
         "render training data of MSDI: many variants of the worlds, seen by many rigs",
         "make-msdi-data --variants 40 --out data/msdi",
     ),
     "train-msdi": Command(
-        "spike4dgs.method.msdi.train:train_msdi",
+        "spike4dgs.cli.train_msdi:train_msdi",
         "train the network that estimates points, poses and images from spikes",
         "train-msdi --data data/msdi --out runs/msdi",
     ),

@@ -26,3 +26,19 @@ class Renderers:
 
 
 RENDERERS = Renderers()
+
+
+@dataclass(frozen=True)
+class Compute:
+    """What computes, from which random numbers.
+
+    Args:
+        device: auto, cpu or cuda.
+        seed: Seed of everything random.
+    """
+
+    device: str = "auto"
+    seed: int = 0
+
+
+COMPUTE = Compute()

@@ -1,4 +1,4 @@
-"""`make-msdi-data`: training bursts of many variants of the worlds, seen by many rigs, at low resolution.
+"""Training bursts of many variants of the worlds, seen by many rigs, at low resolution.
 
 The format of the shards is in `benchmark.scene.bursts`. A shard is a function of its settings alone.
 """
@@ -6,15 +6,15 @@ The format of the shards is in `benchmark.scene.bursts`. A shard is a function o
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.runs.executors import executor
 from spike4dgs.benchmark.scene.training_bursts import (
     REACH,
     Arrays,
@@ -40,14 +40,23 @@ _LEAST_SEEN = 0.5  # least share of a camera's pixels with a surface
 
 @dataclass(frozen=True)
 class MakeBursts:
-    """Renders the shard of a (world, variant); can be sent to worker processes."""
+    """Renders the shard of a (world, variant); can be sent to worker processes.
 
-    rigs: int
-    instants: int  # of each rig
-    width: int
-    height: int
-    spp: int
-    seed: int
+    Args:
+        rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
+        instants: Instants of each rig.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
+        spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.
+        seed: Seed of all random numbers.
+    """
+
+    rigs: int = 6
+    instants: int = 3
+    width: int = 104
+    height: int = 64
+    spp: int = 32
+    seed: int = 0
 
     def facts(self, world: str, variant: int) -> BurstFacts:
         """Return the metadata of a shard. A hidden one needs fewer rigs: it is scored, not used for training."""
@@ -95,64 +104,29 @@ def _instants(count: int, rng: np.random.Generator) -> list[int]:
     return [int(rng.integers(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
-def make_msdi_data(
-    worlds: Positional[tuple[str, ...]] = (),
-    *,
-    out: Path = Path("data/msdi"),
-    variants: int = 40,
-    rigs: int = 6,
-    instants: int = 3,
-    width: int = 104,
-    height: int = 64,
-    spp: int = 32,
-    seed: int = 0,
-    workers: int = 1,
-    scheduler: str | None = None,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-) -> int:
-    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
+def make_shards(
+    out: Path, worlds: Iterable[str], variants: int, make: MakeBursts, workers: int = 1, scheduler: str | None = None
+) -> None:
+    """Render the shards OUT/WORLD-VARIANT.safetensors that are absent: training variants, and the hidden ones.
 
-    Existing shards are kept: a killed run resumes, and a larger --variants adds shards. Equal arguments give equal
-    bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
-
-    Args:
-        worlds: Names of worlds; all, if none is named.
-        out: Folder for the shards.
-        variants: Training variants of each world.
-        rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
-        instants: Instants of each rig.
-        width: Width of the images in pixels.
-        height: Height of the images in pixels.
-        spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.
-        seed: Seed of all random numbers.
-        workers: Processes that render; one uses all cores.
-        scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
-        device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
+    Raises UserError where a shard was made with other settings, and for impossible numbers.
     """
-    from spike4dgs.benchmark.runs.executors import executor
-    from spike4dgs.generators.rendering.mitsuba_variant import choose_device
-    from spike4dgs.generators.worlds import WORLDS
-
-    if wrong := [w for w in worlds if w not in WORLDS]:
-        raise problem("worlds", f"some of {', '.join(WORLDS)}", ", ".join(wrong), "correct the names")
-    if min(rigs, instants) < 1 or variants < 0 or min(width, height) < 16:
-        found = f"{variants} variants, {rigs} rigs, {instants} instants, {width}x{height}"
+    if min(make.rigs, make.instants) < 1 or variants < 0 or min(make.width, make.height) < 16:
+        found = f"{variants} variants, {make.rigs} rigs, {make.instants} instants, {make.width}x{make.height}"
         raise problem("make-msdi-data", "counts from 1 up and at least 16x16 pixels", found, "correct them")
     if FIRST_TRAINING_VARIANT + variants > FIRST_SEASON_VARIANT:
         most = FIRST_SEASON_VARIANT - FIRST_TRAINING_VARIANT
         fix = f"variants from {FIRST_SEASON_VARIANT} on are kept for hidden seasons"
         raise problem("--variants", f"at most {most}", str(variants), fix)
-    if spp < 1 or spp & (spp - 1):
-        raise problem("--spp", "a power of two", str(spp), "give 16, 32, 64, ...")
-    choose_device(device)
-    make = MakeBursts(rigs, instants, width, height, spp, seed)
+    if make.spp < 1 or make.spp & (make.spp - 1):
+        raise problem("--spp", "a power of two", str(make.spp), "give 16, 32, 64, ...")
     numbers = [*HIDDEN_VARIANTS, *range(FIRST_TRAINING_VARIANT, FIRST_TRAINING_VARIANT + variants)]
-    shards = [(world, variant) for variant in numbers for world in dict.fromkeys(worlds) or WORLDS]
+    names = list(dict.fromkeys(worlds))
+    shards = [(world, variant) for variant in numbers for world in names]
     todo = [shard for shard in shards if not _is_done(out, make.facts(*shard))]
     print(f"{len(shards)} shards, {len(shards) - len(todo)} of them exist", flush=True)
     with executor(workers, scheduler) as run:
         _write_all(run(make, todo), len(todo), out)
-    return 0
 
 
 def _write_all(made: Iterator[tuple[BurstFacts, Arrays]], count: int, out: Path) -> None:

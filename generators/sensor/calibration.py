@@ -1,13 +1,8 @@
-"""Gain and dark maps: drawn for simulated cameras, and estimated from flat-field and dark recordings.
-
-Fixed-pattern maps of the simulated cameras: gain and dark rate of every pixel.
+"""Fixed-pattern maps of the simulated cameras, gain and dark rate of every pixel, and their calibration recordings.
 
 The gain is a smooth shading times independent pixels; the dark rate is log-normal with a few hot pixels. The constants
 are those of `benchmark.spikes.sensor_model`. The outliers along the edges of the real camera's chip are not modelled.
 A camera keeps its maps: they depend on the seed, the camera and the resolution, not on the world.
-
-`calibrate` estimates the maps of a scene's cameras (`benchmark.scene.calibration`) and, where the truth is known, their
-errors.
 """
 
 from __future__ import annotations
@@ -16,17 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float32
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.benchmark.untrusted import Expected, read_npz
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 
@@ -79,62 +69,3 @@ def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Seq
         with SpikeWriter(folder / name / f"{camera.id}.dat", camera.width, camera.height) as writer:
             for packed in simulate(keys, [0, n_ticks], n_ticks, same, charge):
                 writer.write(packed)
-
-
-def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) -> int:
-    """Estimate gain and dark maps of a scene's cameras from its flat-field and dark recordings: OUT/CAM.npz and .png.
-
-    Where the scene holds the true maps (truth/), the table lists the errors of the estimates.
-
-    Args:
-        scene: Scene folder with calibration/flat and calibration/dark.
-        out: Folder for the maps and their images.
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not used
-    table = Table(
-        "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
-    )
-    for camera in opened.cameras.values():
-        recordings = opened.recordings(camera.id)
-        if recordings is None:
-            fix = "make a scene with calibration/flat and calibration/dark"
-            raise problem(scene / "scene.json", "calibration recordings", f"none of {camera.id}", fix)
-        found = estimate(recordings)
-        write_maps(out / f"{camera.id}.npz", {"gain": found.gain, "dark": found.dark})
-        _plot(found, out / f"{camera.id}.png", camera.id)
-        level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
-        row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
-        table.add_row(*row, *(f"{e:.3f}" if e is not None else "-" for e in truth_errors(opened, camera, found)))
-    Console(width=120).print(table)
-    print(f"maps and images: {out}")
-    return 0
-
-
-def truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[float | None, float | None]:
-    """Return the RMS errors in percent of gain and dark map, relative to the truth; None where the truth is unknown."""
-    path = f"truth/{camera.id}.npz"
-    if path not in scene.manifest.files:
-        return None, None
-    shapes = dict.fromkeys(("gain", "dark"), Expected("fiu", (camera.height, camera.width)))
-    truth = read_npz(scene.manifest.path(path), "the true maps", shapes, "make the scene again", optional=True)
-    pairs = [(getattr(found, name), truth.get(name)) for name in shapes]
-    errors = [None if t is None else 100 * float(np.sqrt(np.mean((a / t - 1) ** 2))) for a, t in pairs]
-    return errors[0], errors[1]
-
-
-def _plot(found: Calibration, path: Path, title: str) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for axes, image, name, limits in (
-        (left, found.gain, "gain", (0.8, 1.2)),
-        (right, 1000 * found.dark, "dark rate, spikes per 1000 ticks", (0, 20)),
-    ):
-        figure.colorbar(axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap="viridis"), ax=axes)
-        axes.set(title=f"{title}: {name}", xticks=[], yticks=[])
-    with atomic_path(path) as part:
-        figure.savefig(part, dpi=80)

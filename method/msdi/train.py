@@ -1,4 +1,4 @@
-"""Train MSDI on training bursts: `train-msdi`.
+"""Train MSDI on training bursts.
 
 Loss: L1 of the images in radiance, which trains extractor and generator, and DUSt3R's confidence-weighted regression of
 points (`losses`), which trains everything behind them. Each step has a fixed number of views: few samples of many
@@ -20,19 +20,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.environment import choose_device, device_type
+from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_file, sha256_json, write_json, write_text
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile, open_folder
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
 from spike4dgs.method.msdi.checkpoints import transfer
-from spike4dgs.method.msdi.config import CONFIGS, MsdiConfig
+from spike4dgs.method.msdi.config import MsdiConfig
 from spike4dgs.method.msdi.evaluate import Scores, evaluate
 from spike4dgs.method.msdi.inputs import Sensors
-from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings, image_loss, point_loss
+from spike4dgs.method.msdi.losses import TrainingSettings, image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.records import Curve, model_card, plot_calibration, plot_curves
 from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
@@ -127,40 +127,8 @@ def _ahead(make: Callable[[int], Batch], steps: int) -> Callable[[int], Batch]:
     return take
 
 
-def train_msdi(
-    *,
-    data: Path = Path("data/msdi"),
-    out: Path = Path("runs/msdi"),
-    config: str = "small",
-    start: Path | None = None,
-    steps: int = 20_000,
-    views: int = 8,
-    rate: float = PUBLISHED["lr_points"],
-    device: str = "auto",
-    seed: int = 0,
-) -> int:
-    """Train MSDI on bursts of `make-msdi-data`. The same command continues a killed run where it stopped.
-
-    OUT/msdi-CONFIG.safetensors can be used at any time: set SPIKE4DGS_MSDI to its path. OUT/losses.csv, scores.csv and
-    curves.png show the course, calibration.png how well the confidence is calibrated, README.md is the model card.
-    Shards added to DATA are used from the next start on.
-
-    Args:
-        data: Folder of shards; those of the hidden variants are only scored.
-        out: Folder for all output.
-        config: small, or paper (a GPU's work).
-        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
-        steps: Steps.
-        views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
-        rate: Adam's learning rate, after the warm-up, of the layers that make points.
-        device: auto, cpu or cuda.
-        seed: Seed of the first weights and of all random choices.
-    """
-    if config not in CONFIGS:
-        raise problem("--config", f"one of {', '.join(CONFIGS)}", repr(config), "correct the name")
-    if steps < 1 or views < 2 or not rate > 0:
-        found = f"{steps}, {views} and {rate}"
-        raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
+def training_shards(data: Path) -> tuple[list[BurstFile], list[BurstFile]]:
+    """Return the shards of a folder to train on, and the hidden ones. Raises UserError for variants kept for tests."""
     files = open_folder(data)
     learned, hidden = ([f for f in files if f.facts.hidden is h] for h in (False, True))
     allowed = range(FIRST_TRAINING_VARIANT, FIRST_SEASON_VARIANT)
@@ -169,15 +137,7 @@ def train_msdi(
         raise problem(data, expected, ", ".join(wrong), "remove them: they are kept for tests")
     if not learned:
         raise problem(data, "shards to train on", "hidden variants only", "make more with `spike4dgs make-msdi-data`")
-    settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
-    training = Training(Bursts(learned), CONFIGS[config], settings, choose_device(device, rasterizes=False), seed)
-    if start:
-        start_from(training.network, start)
-    key = checkpoint_key(settings, config, seed, sha256_file(start) if start else None)
-    size = sum(p.numel() for p in training.network.parameters())
-    print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
-    _Run(training, hidden, key, out).run()
-    return 0
+    return learned, hidden
 
 
 def checkpoint_key(settings: TrainingSettings, config: str, seed: int, start_sha256: str | None) -> str:
@@ -202,8 +162,8 @@ def start_from(network: Msdi, path: Path) -> None:
         transfer(network, state, path)
 
 
-class _Run:
-    """A training with its files."""
+class Run:
+    """A training with its files in the folder `out`, continued from its checkpoint."""
 
     def __init__(self, training: Training, hidden: list[BurstFile], key: str, out: Path) -> None:
         self.training, self.key, self.out = training, key, out

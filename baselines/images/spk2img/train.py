@@ -1,4 +1,4 @@
-"""Train Spk2ImgNet on scene folders: `train-spk2img`.
+"""Train Spk2ImgNet on scenes.
 
 Loss: L1(truth, rate / gain), and the published small weight on the four branches' own estimates. The publication has
 ground truth at the middles of all five blocks; a scene has it every 20 ticks, that is at the middle of the middle block
@@ -18,11 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.baselines.images.spk2img.data import Batch, Example, draw, open_for_training, read_examples
+from spike4dgs.baselines.images.spk2img.data import Batch, Example, draw
 from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, reconstruct
 from spike4dgs.baselines.images.spk2img.network import BLOCK_STARTS, MIDDLE, Reconstruction, Spk2ImgNet
-from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -116,51 +114,8 @@ def score(network: Spk2ImgNet, scene: Scene) -> float:
     return float(np.mean([v for v in values if v is not None]))
 
 
-def train_spk2img(
-    *,
-    scenes: tuple[Path, ...],
-    hidden: tuple[Path, ...] = (),
-    out: Path = Path("runs/spk2img"),
-    width: int = 8,
-    steps: int = 20_000,
-    device: str = "auto",
-    seed: int = 0,
-    allow_gaps: bool = False,
-) -> int:
-    """Train Spk2ImgNet on training variants of the worlds. A killed run goes on where it was with the same command.
-
-    OUT/spk2img-WIDTH.safetensors can be used at any time: set SPIKE4DGS_SPK2IMG to its path. The public benchmark's
-    scenes, variant 0, are refused.
-
-    Args:
-        scenes: Scene folders to train on.
-        hidden: Scene folders that are only scored, while training and at its end.
-        out: Folder for the weights and the checkpoint.
-        width: Channels; 64 is the publication's (a GPU's work), 8 the shipped weights'.
-        steps: Steps of 8 patches of 48x48 pixels (smaller ones where images are smaller).
-        device: auto, cpu or cuda.
-        seed: Seed of the first weights and of the patches.
-        allow_gaps: Accept recordings with gaps; images whose spikes lack ticks are not trained on.
-    """
-    if width < 1 or steps < 1:
-        raise problem("--width and --steps", "numbers from 1 up", f"{width}, {steps}", "correct them")
-    opened, kept = ([open_for_training(s, allow_gaps) for s in folders] for folders in (scenes, hidden))
-    if both := {s.revision for s in opened} & {s.revision for s in kept}:
-        found = ", ".join(s.id for s in kept if s.revision in both)
-        raise problem("--hidden", "scenes that are not trained on", found, "name them once")
-    examples = [example for scene in opened for example in read_examples(scene)]
-    if not examples:
-        raise problem("--scenes", "scene folders", "none", "make some with `spike4dgs make-dataset --variant 1`")
-    shortest = min(min(example.rate.shape) for example in examples)
-    settings = TrainingSettings(width=width, steps=steps, patch=min(TrainingSettings.patch, shortest))
-    training = Training(examples, settings, choose_device(device, rasterizes=False), seed)
-    names = tuple(sorted(f"{s.id}@{s.revision[:16]}" for s in opened))
-    print(f"{len(examples)} images of {len(opened)} scenes, width {width}, {training.device}", flush=True)
-    _run(training, kept, names, out)
-    return 0
-
-
-def _run(training: Training, hidden: Sequence[Scene], names: tuple[str, ...], out: Path) -> None:
+def run(training: Training, hidden: Sequence[Scene], names: tuple[str, ...], out: Path) -> None:
+    """Train to the last step, from the checkpoint in `out` if there is one; `names`: of what it is trained on."""
     settings = training.settings
     facts = asdict(settings)
     facts["rate"] = facts.pop("lr")  # its name in the keys of checkpoints that earlier versions wrote

@@ -17,12 +17,14 @@ from spike4dgs.baselines.images.spk2img import maker
 from spike4dgs.baselines.images.spk2img.data import Example, draw, open_for_training, read_examples
 from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network, reconstruct
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
-from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of, train_spk2img
+from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.cli.options import Compute
+from spike4dgs.cli.train_spk2img import train_spk2img
 from spike4dgs.method.images.windows import window
 
 
@@ -178,7 +180,7 @@ def test_command_to_weights_to_images(
 ) -> None:
     one, two = write_small_scene(tmp_path / "one", seed=1), write_small_scene(tmp_path / "two", seed=2)
     out = tmp_path / "out"
-    arguments = {"scenes": (one,), "hidden": (two,), "out": out, "width": 2, "steps": 2, "device": "cpu"}
+    arguments = {"scenes": (one,), "hidden": (two,), "out": out, "width": 2, "steps": 2, "compute": Compute("cpu")}
     assert train_spk2img(**arguments) == 0
     assert "step 2/2, loss" in capsys.readouterr().out
     path = out / "spk2img-2.safetensors"

@@ -16,8 +16,8 @@ from spike4dgs.benchmark.scene.training_bursts import (
     write_bursts,
 )
 from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT, HIDDEN_VARIANTS
-from spike4dgs.generators.msdi_data import make_msdi_data as msdi_data
-from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_msdi_data
+from spike4dgs.cli.make_msdi_data import make_msdi_data
+from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
@@ -87,7 +87,7 @@ def test_the_command_keeps_existing_shards(
         made.append(chunk)
         return self.facts(*chunk), {"still": np.zeros(3, np.float16)}
 
-    monkeypatch.setattr(msdi_data.MakeBursts, "__call__", fake)
+    monkeypatch.setattr(MakeBursts, "__call__", fake)
     assert make_msdi_data(("car", "bird"), out=tmp_path, variants=1) == 0
     hidden = [(w, v) for v in HIDDEN_VARIANTS for w in ("car", "bird")]
     assert made == [*hidden, ("car", 13), ("bird", 13)]
@@ -97,7 +97,7 @@ def test_the_command_keeps_existing_shards(
     assert make_msdi_data(("car",), out=tmp_path, variants=2) == 0
     assert made == [("car", 11), ("car", 14)]
     with pytest.raises(UserError, match="choose another --out"):
-        make_msdi_data(("car",), out=tmp_path, variants=1, spp=64)
+        make_msdi_data(("car",), out=tmp_path, variants=1, bursts=MakeBursts(spp=64))
 
 
 def test_no_variant_that_is_kept_for_tests_is_ever_made() -> None:
@@ -109,9 +109,9 @@ def test_no_variant_that_is_kept_for_tests_is_ever_made() -> None:
     ("arguments", "message"),
     [
         ({"worlds": ("cart",)}, "expected some of jaywalk, .* found cart"),
-        ({"rigs": 0}, "expected counts from 1 up"),
+        ({"bursts": MakeBursts(rigs=0)}, "expected counts from 1 up"),
         ({"variants": 8988}, "--variants: expected at most 8987, found 8988; variants from 9000 on are kept"),
-        ({"spp": 12}, "--spp: expected a power of two, found 12"),
+        ({"bursts": MakeBursts(spp=12)}, "--spp: expected a power of two, found 12"),
     ],
 )
 def test_wrong_arguments_are_named(tmp_path: Path, arguments: dict[str, object], message: str) -> None:

@@ -14,6 +14,7 @@ from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
+from spike4dgs.cli.calibrate import calibrate
 from spike4dgs.generators.sensor import calibration as calibration
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
 from spike4dgs.generators.sensor.model import Sensor
@@ -100,7 +101,7 @@ FACTS = {
 
 def test_the_command_writes_maps_and_images_and_scores_them(tmp_path, capsys):
     scene = scene_with_recordings(tmp_path / "scene", FACTS)
-    assert calibration.calibrate(scene, out=tmp_path / "out") == 0
+    assert calibrate(scene, out=tmp_path / "out") == 0
     lines = {line.split()[1]: line.split() for line in capsys.readouterr().out.splitlines() if "cam_" in line}
     assert set(lines) == {"cam_00", "cam_01", "cam_02", "cam_03"}
     for camera, cells in lines.items():
@@ -136,7 +137,7 @@ def test_methods_get_a_calibration_of_every_training_camera_or_none(tmp_path, sm
 
 def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
     with pytest.raises(UserError, match="calibration recordings, found none of cam_00"):
-        calibration.calibrate(small_scene, out=tmp_path / "out")
+        calibrate(small_scene, out=tmp_path / "out")
     scene = scene_with_recordings(tmp_path / "other", FACTS | {"dark_ticks": 77})
     with pytest.raises(UserError, match="77 ticks"):
-        calibration.calibrate(scene, out=tmp_path / "out")
+        calibrate(scene, out=tmp_path / "out")

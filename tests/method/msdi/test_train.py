@@ -13,6 +13,8 @@ from toy_bursts import write_toy_shard
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.training_bursts import open_folder
+from spike4dgs.cli.options import Compute
+from spike4dgs.cli.train_msdi import train_msdi
 from spike4dgs.method.msdi import TINY, Estimate, Msdi
 from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.inputs import Sensors
@@ -23,7 +25,6 @@ from spike4dgs.method.msdi.train import (
     TrainingSettings,
     checkpoint_key,
     start_from,
-    train_msdi,
 )
 from spike4dgs.method.msdi.training_data import Batch, Bursts
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
@@ -189,7 +190,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     folder, out = tmp_path / "data", tmp_path / "out"
     for variant in (10, 13, 14):
         write_toy_shard(folder, variant)
-    arguments = {"data": folder, "out": out, "config": "tiny", "steps": 3, "views": 4, "device": "cpu"}
+    arguments = {"data": folder, "out": out, "config": "tiny", "steps": 3, "views": 4, "compute": Compute("cpu")}
     assert train_msdi(**arguments) == 0  # type: ignore[arg-type]
     printed = capsys.readouterr().out
     assert "4 bursts, tiny" in printed and "step 3/3, L1" in printed

@@ -1,0 +1,40 @@
+"""`make-msdi-data`: training bursts of many variants of the worlds, seen by many rigs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.cli.options import RENDERERS, Renderers
+from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_shards
+from spike4dgs.generators.rendering.mitsuba_variant import choose_device
+from spike4dgs.generators.worlds import WORLDS
+
+DEFAULTS = MakeBursts()
+
+
+def make_msdi_data(
+    worlds: Positional[tuple[str, ...]] = (),
+    *,
+    out: Path = Path("data/msdi"),
+    variants: int = 40,
+    bursts: OmitArgPrefixes[MakeBursts] = DEFAULTS,
+    renderers: OmitArgPrefixes[Renderers] = RENDERERS,
+) -> int:
+    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
+
+    Existing shards are kept: a killed run resumes, and a larger --variants adds shards. Equal arguments give equal
+    bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
+
+    Args:
+        worlds: Names of worlds; all, if none is named.
+        out: Folder for the shards.
+        variants: Training variants of each world.
+    """
+    if wrong := [w for w in worlds if w not in WORLDS]:
+        raise problem("worlds", f"some of {', '.join(WORLDS)}", ", ".join(wrong), "correct the names")
+    choose_device(renderers.device)
+    make_shards(out, worlds or WORLDS, variants, bursts, renderers.workers, renderers.scheduler)
+    return 0

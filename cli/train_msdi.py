@@ -1,0 +1,60 @@
+"""`train-msdi`: train the network that estimates points, poses and images from spikes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import OmitArgPrefixes
+
+from spike4dgs.benchmark.environment import choose_device
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.cli.options import COMPUTE, Compute
+from spike4dgs.method.msdi.config import CONFIGS
+from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings
+from spike4dgs.method.msdi.train import Run, Training, checkpoint_key, start_from, training_shards
+from spike4dgs.method.msdi.training_data import Bursts
+
+
+def train_msdi(
+    *,
+    data: Path = Path("data/msdi"),
+    out: Path = Path("runs/msdi"),
+    config: str = "small",
+    start: Path | None = None,
+    steps: int = 20_000,
+    views: int = 8,
+    rate: float = PUBLISHED["lr_points"],
+    compute: OmitArgPrefixes[Compute] = COMPUTE,
+) -> int:
+    """Train MSDI on bursts of `make-msdi-data`. The same command continues a killed run where it stopped.
+
+    OUT/msdi-CONFIG.safetensors can be used at any time: set SPIKE4DGS_MSDI to its path. OUT/losses.csv, scores.csv and
+    curves.png show the course, calibration.png how well the confidence is calibrated, README.md is the model card.
+    Shards added to DATA are used from the next start on.
+
+    Args:
+        data: Folder of shards; those of the hidden variants are only scored.
+        out: Folder for all output.
+        config: small, or paper (a GPU's work).
+        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
+        steps: Steps.
+        views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
+        rate: Adam's learning rate, after the warm-up, of the layers that make points.
+    """
+    if config not in CONFIGS:
+        raise problem("--config", f"one of {', '.join(CONFIGS)}", repr(config), "correct the name")
+    if steps < 1 or views < 2 or not rate > 0:
+        found = f"{steps}, {views} and {rate}"
+        raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
+    learned, hidden = training_shards(data)
+    settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
+    device = choose_device(compute.device, rasterizes=False)
+    training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
+    if start:
+        start_from(training.network, start)
+    key = checkpoint_key(settings, config, compute.seed, sha256_file(start) if start else None)
+    size = sum(p.numel() for p in training.network.parameters())
+    print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
+    Run(training, hidden, key, out).run()
+    return 0
