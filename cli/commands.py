@@ -33,17 +33,17 @@ COMMANDS: dict[str, Command] = {
         "calibrate data/car-0-small",
     ),
     "record": Command(
-        "spike4dgs.generators.recorder.record:record",
+        "spike4dgs.cli.record:record",
         "record the cameras of an array over USB, or emulated ones, as a scene folder",
         "record rig.toml --seconds 0.5 --out captures/first",
     ),
     "board-clip": Command(
-        "spike4dgs.generators.recorder.rig_calibration.board_clip:board_clip",
+        "spike4dgs.cli.board_clip:board_clip",
         "simulate a chessboard that moves in front of an array, to record and calibrate with",
         "board-clip --out runs/board --seconds 1",
     ),
     "calibrate-rig": Command(
-        "spike4dgs.generators.recorder.rig_calibration.calibrate_rig:calibrate_rig",
+        "spike4dgs.cli.calibrate_rig:calibrate_rig",
         "find an array's intrinsics and poses from clips of a moving chessboard",
         "calibrate-rig captures/board --columns 8 --rows 5 --square-m 0.04 --out rig",
     ),
@@ -82,7 +82,7 @@ COMMANDS: dict[str, Command] = {
         "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
         "fault-table data/turntable-0-small --out runs/faults",
         needs=(
-            "spike4dgs.generators.recorder.record:record",
+            "spike4dgs.cli.record:record",
             "spike4dgs.generators.recorder.emulation.imperfections:Imperfections",
         ),
     ),

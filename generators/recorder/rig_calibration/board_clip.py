@@ -21,12 +21,10 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.metrics.pose_error import Sim3
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes, look_at
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.benchmark.untrusted import MAX_SIDE
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
@@ -34,7 +32,6 @@ from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 RATE_HZ = 20000
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
-_MOST_SECONDS = 3600
 _POSES = 500  # samples of the motion from which its speed is computed
 DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of view is the horizontal one
 _PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
@@ -247,43 +244,3 @@ class _Keys(Sequence[Float32]):
 
     def __getitem__(self, k: Any) -> Any:
         return render_board(self.camera, self.board, *self.poses[k])
-
-
-def board_clip(
-    *,
-    out: Path = Path("runs/board"),
-    seconds: float = 1.0,
-    width: int = 400,
-    height: int = 250,
-    columns: int = 8,
-    rows: int = 5,
-    square_m: float = 0.04,
-    seed: int = 0,
-    like: Path | None = None,
-) -> int:
-    """Simulate a chessboard that moves in front of an array of cameras: a scene for `record --emulate`.
-
-    Args:
-        out: Folder of the scene.
-        seconds: Length of the clip; the board makes the same motion in any length, so a longer clip is slower.
-        width: Pixels per row of the cameras.
-        height: Rows of the cameras.
-        columns: Inner corners of the board from left to right.
-        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres.
-        seed: Seed of the array's mounting errors and of the sensors.
-        like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
-    """
-    if not 0.5 < seconds * RATE_HZ <= _MOST_SECONDS * RATE_HZ:
-        expected = f"from {1 / RATE_HZ:g}, one tick, to {_MOST_SECONDS}"
-        raise problem("--seconds", expected, f"{seconds:g}", "ask for another length")
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        found = f"{width}, {height}"
-        raise problem("--width and --height", f"whole numbers from 1 to {MAX_SIDE}", found, "correct them")
-    n_ticks = round(seconds * RATE_HZ)
-    cameras, distance_m = array(width, height, seed), DISTANCE_M
-    if like is not None:
-        cameras, distance_m = in_front(tuple(open_scene(like).cameras.values()))
-    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(distance_m), n_ticks, seed)
-    print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")
-    return 0

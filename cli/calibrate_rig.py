@@ -1,10 +1,9 @@
-"""`calibrate-rig`: intrinsics and pose of every camera, from clips of a chessboard that moves in front of the array."""
+"""`calibrate-rig` of the command line."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,11 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json, write_text
-from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
-from spike4dgs.benchmark.scene.cameras import Camera, array_axes
-from spike4dgs.benchmark.scene.lens import make_distortion
+from spike4dgs.generators.recorder.rig_calibration.array_calibration import (
+    ArrayCalibration,
+    calibrate_array,
+    differences,
+)
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
     BoardRecording,
@@ -26,91 +27,8 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
     make_image,
     open_recording,
 )
-from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
-    Adjusted,
-    Detections,
-    Freedom,
-    Rig,
-    adjust,
-    rms_px,
-    trimmed,
-)
-from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_rig
+from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Freedom
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
-
-WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # limits of reprojection error and of rejected corners; beyond, the fit has failed
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayCalibration:
-    """The result of `calibrate_array`. Cameras are in the array's own frame, see `levelled`."""
-
-    cameras: tuple[Camera, ...]
-    adjusted: Adjusted
-    detections: Detections
-    reference: int
-    reprojection_px: float  # root mean square over the used corners
-    per_camera_px: tuple[float, ...]
-
-    @property
-    def corners(self) -> tuple[int, int]:
-        """Return the number of used corners, and of those left out."""
-        return int(self.detections.used.sum()), int((~self.detections.used).sum())
-
-
-def calibrate_array(
-    detections: Detections, board: Board, names: Sequence[str], size: tuple[int, int], freedom: Freedom
-) -> ArrayCalibration:
-    """Return intrinsics and poses from detections; corners that do not fit are left out. `size`: width, height.
-
-    Raises UserError where a camera has too few detections, or where no array of pinholes explains them.
-    """
-    points = board.corners
-    initial, reference = estimate_rig(detections, points, names, size)
-    rough = adjust(initial, detections, points, reference, freedom)
-    used = trimmed(rough.rig, detections, points)
-    found = adjust(rough.rig, used, points, reference, freedom)
-    error = rms_px(found.rig, used, points)
-    left_out = float(np.mean(~used.used))
-    if not (error < WORST_PX and left_out < MOST_LEFT_OUT):
-        expected = (
-            f"a reprojection error below {WORST_PX:g} px, and at least {1 - MOST_LEFT_OUT:.0%} of the corners in it"
-        )
-        fix = "check that all cameras share one clock and one orientation (`rows`, `mirrored`), and --columns, --rows"
-        raise problem("array", expected, f"{error:.2f} px with {1 - left_out:.0%} of them", fix)
-    each = tuple(rms_px(found.rig, used.of(used.camera == c), points) for c in range(len(names)))
-    return ArrayCalibration(levelled(found.rig, names, size), found, used, reference, error, each)
-
-
-def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Camera, ...]:
-    """Return the cameras in the array's own frame: z up, y the viewing direction, x to its right; all as means.
-
-    The origin is the mean position of the board: about the point that the array looks at.
-    """
-    lenses = [()] * len(names) if rig.lens is None else [make_distortion(k.tolist()) for k in rig.lens]
-    cameras = [
-        Camera(name, *size, float(f), float(f), float(m[0]), float(m[1]), R, t, lens)
-        for name, f, m, R, t, lens in zip(names, rig.focal, rig.principal, rig.R, rig.t, lenses, strict=True)
-    ]
-    W = array_axes(cameras)
-    frame = Sim3(1.0, W, -W @ rig.board_t.mean(axis=0))
-    return tuple(map(frame.camera, cameras))
-
-
-def differences(found: Sequence[Camera], stated: Mapping[str, Camera]) -> dict[str, float] | None:
-    """Return the errors against the cameras that a clip states, after the best similarity; None where it has none."""
-    known = [stated[c.id] for c in found if c.id in stated]
-    if len(known) < max(len(found), 2):
-        return None
-    errors, scale = pose_errors(found, known).summary(), align_cameras(found, known).scale
-    names = ("rotation_deg", "rotation_max_deg", "translation_m", "translation_max_m")
-    focal = [abs(a.fx / b.fx - 1) for a, b in zip(found, known, strict=True)]
-    principal = [np.hypot(a.cx - b.cx, a.cy - b.cy) for a, b in zip(found, known, strict=True)]
-    return {name: errors[name] for name in names} | {
-        "scale": abs(1 / scale - 1),
-        "focal_max": max(focal),
-        "principal_point_max_px": float(max(principal)),
-    }
 
 
 def calibrate_rig(

@@ -1,0 +1,60 @@
+"""`board-clip` of the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.untrusted import MAX_SIDE
+from spike4dgs.generators.recorder.rig_calibration.board import Board
+from spike4dgs.generators.recorder.rig_calibration.board_clip import (
+    DISTANCE_M,
+    RATE_HZ,
+    BoardMotion,
+    array,
+    in_front,
+    write_board_clip,
+)
+
+_MOST_SECONDS = 3600
+
+
+def board_clip(
+    *,
+    out: Path = Path("runs/board"),
+    seconds: float = 1.0,
+    width: int = 400,
+    height: int = 250,
+    columns: int = 8,
+    rows: int = 5,
+    square_m: float = 0.04,
+    seed: int = 0,
+    like: Path | None = None,
+) -> int:
+    """Simulate a chessboard that moves in front of an array of cameras: a scene for `record --emulate`.
+
+    Args:
+        out: Folder of the scene.
+        seconds: Length of the clip; the board makes the same motion in any length, so a longer clip is slower.
+        width: Pixels per row of the cameras.
+        height: Rows of the cameras.
+        columns: Inner corners of the board from left to right.
+        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
+        square_m: Side of a square in metres.
+        seed: Seed of the array's mounting errors and of the sensors.
+        like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
+    """
+    if not 0.5 < seconds * RATE_HZ <= _MOST_SECONDS * RATE_HZ:
+        expected = f"from {1 / RATE_HZ:g}, one tick, to {_MOST_SECONDS}"
+        raise problem("--seconds", expected, f"{seconds:g}", "ask for another length")
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        found = f"{width}, {height}"
+        raise problem("--width and --height", f"whole numbers from 1 to {MAX_SIDE}", found, "correct them")
+    n_ticks = round(seconds * RATE_HZ)
+    cameras, distance_m = array(width, height, seed), DISTANCE_M
+    if like is not None:
+        cameras, distance_m = in_front(tuple(open_scene(like).cameras.values()))
+    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(distance_m), n_ticks, seed)
+    print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")
+    return 0
