@@ -221,10 +221,17 @@ def fit_gaussians(
     scale = job.extent.scale
     trainer = Trainer(job.training_images, first, motion, loss, settings, density, scale=scale, seed=request.seed)
     trainer.run(request.progress, request.checkpoint, job.key)
-    cameras = with_lenses(job.scene, trainer.poses.cameras(start.cameras))
-    duration_us, device = job.scene.duration_us, request.device
-    found = (trainer.pieces(), trainer.background, motion, duration_us, device, spec)
-    return FittedModel(*found, cameras, settings.pixel_filter, trainer.supervision.estimates())
+    return FittedModel(
+        pieces=trainer.pieces(),
+        background=trainer.background,
+        motion=motion,
+        duration_us=job.scene.duration_us,
+        device=request.device,
+        spec=spec,
+        cameras=with_lenses(job.scene, trainer.poses.cameras(start.cameras)),
+        pixel_filter=settings.pixel_filter,
+        estimates=trainer.supervision.estimates(),
+    )
 
 
 def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
