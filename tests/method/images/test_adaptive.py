@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.baselines.images.reference import slow_adaptive
+from spike4dgs.baselines.images.reference import slow_adaptive, slow_intervals
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.adaptive import AdaptiveSettings, adaptive_image, half_windows, spike_times
+from spike4dgs.method.images.intervals import IntervalSettings, intervals
 
 
 def stream_of(spikes, bottom_up=True):
@@ -103,3 +104,110 @@ def test_the_last_window_covers_the_clip_from_anywhere():
     for n in (1, 2, 3, 400, 2000, 100_000):
         assert half_windows(n)[-1] >= n * (1 - 1e-9)
         assert half_windows(n)[0] == 2
+
+
+def sweeping(n, height, width, px_per_tick, seed=0):
+    """Rates [n, H, W] of a smooth texture that moves to the right, between 0.1 and 0.9 spikes per tick."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(0.05, 0.25, (4, 2)), rng.uniform(0, 2 * np.pi, 4)
+    t, y, x = np.mgrid[:n, :height, :width]
+    u = x - px_per_tick * (t + 0.5)
+    total = sum(np.sin(2 * np.pi * (a * u + b * y) + p) for (a, b), p in zip(*waves, strict=True))
+    return 0.5 + 0.1 * total
+
+
+@settings(max_examples=30, deadline=None)
+@example(105, False, 9.7, 30.0, 105)  # two spikes that are equally near
+@given(
+    st.integers(30, 120),
+    st.booleans(),
+    st.sampled_from([4.0, 5.0, 9.7, 25.3]),
+    st.sampled_from([10.0, 30.0, 80.0]),
+    st.integers(0, 2**31),
+)
+def test_rates_and_spans_are_those_of_the_definition(n, bottom_up, half, still, seed):
+    rng = np.random.default_rng(seed)
+    rates = rng.random((n, 4, 5)) ** 3 * rng.uniform(0, 1.2, (4, 5))
+    spikes, tick = fire(rates, rng.random((4, 5))), int(rng.integers(n))
+    s = IntervalSettings(half=half, still=still)
+    rate, spans = intervals(stream_of(spikes, bottom_up), tick, s)
+    slow_rate, slow_spans = slow_intervals(spikes, tick, s)
+    np.testing.assert_allclose(rate, slow_rate, rtol=1e-6)
+    np.testing.assert_allclose(spans, slow_spans, rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"half": 1.9}, {"half": -6.0}, {"still": 0.0}, {"shortest": 7.0}, {"growth": 1.0}])
+def test_settings_without_a_meaning_are_refused(wrong):
+    with pytest.raises(UserError, match="correct the settings"):
+        IntervalSettings(**wrong)
+
+
+def test_constant_light_keeps_the_long_windows_of_adaptive():
+    spikes = fire(np.full((200, 6, 7), 0.3) * np.linspace(0.2, 2, 42).reshape(6, 7), np.full((6, 7), 0.4))
+    rate, spans = intervals(stream_of(spikes), 100)
+    np.testing.assert_array_equal(rate, adaptive_image(stream_of(spikes), 100))
+    half = IntervalSettings().half
+    assert (spans[0] == -half).all() and (spans[1] == half).all()
+
+
+def errors(n=160, half=10.0, seed=0):
+    """Of pixels of moving light that change: rate minus the exact mean over its span, rate, and length of the span."""
+    rng = np.random.default_rng(seed)
+    rates = sweeping(n, 24, 40, 0.1, seed)
+    gathered = np.concatenate([np.zeros((1, 24, 40)), np.cumsum(rates, axis=0)])  # by the start of each tick
+    stream = stream_of(fire(rates, rng.random((24, 40))))
+    found = []
+    for tick in range(30, n - 30, 7):
+        rate, (first, last) = intervals(stream, tick, IntervalSettings(half=half))
+        y, x = np.nonzero((first != -half) | (last != half))
+        a, b = tick + first[y, x], tick + last[y, x]
+
+        def by(t, y=y, x=x):  # light gathered by an instant, in the middle of a tick
+            k = np.floor(t).astype(int)
+            return gathered[k, y, x] + (t - k) * rates[k, y, x]
+
+        found.append((rate[y, x] - (by(b) - by(a)) / (b - a), rate[y, x], b - a))
+    return (np.concatenate(column) for column in zip(*found, strict=True))
+
+
+def test_moving_light_is_measured_without_bias_and_as_precisely_as_said():
+    """sqrt(2 / 12) / length of the rate is the standard error that half a tick at either end makes: within 1.5."""
+    error, rate, length = errors()
+    implied = np.sqrt(1 / 6) * rate / length
+    assert len(error) > 3000, "a test of nothing"
+    assert 1 / 1.5 < np.sqrt(np.mean((error / implied) ** 2)) < 1.5
+    assert abs(error).max() < (rate / length * 1.0001).max(), "never more than half a tick at both ends"
+    assert abs(error.mean()) < 0.1 * implied.mean()
+
+
+def test_a_longer_span_is_more_precise():
+    error, rate, length = errors(half=30.0)
+    relative, long = abs(error) / rate, length > 20
+    assert min(long.sum(), (length < 10).sum()) > 300, "a test of nothing"
+    assert relative[long].mean() < relative[length < 10].mean() / 2.5
+
+
+def test_the_sooner_light_changes_the_shorter_the_span():
+    n = 400
+    rates = np.full((n, 20, 40), 0.6)  # still; and from the middle on, faster and faster to the right
+    rates[:, :, 20:] = np.stack([sweeping(n, 20, 20, v)[:, :, 10] for v in np.linspace(0.02, 0.5, 20)], axis=2)
+    _, (first, last) = intervals(stream_of(fire(rates, np.random.default_rng(0).random((20, 40)))), 200)
+    length = np.median(last - first, axis=0)
+    half = IntervalSettings().half
+    assert (first[:, :18] == -half).all() and (last[:, :18] == half).all(), "constant light has no span of its own"
+    assert length[35:].mean() < 0.7 * length[22:26].mean()
+    assert (last - first)[:, 21:].max() < 2 * half + 2 / rates.min(), "as long as half, to the nearest spikes"
+
+
+def test_the_maker_gives_images_and_spans():
+    spikes = fire(sweeping(80, 12, 16, 0.2), np.random.default_rng(1).random((12, 16)))
+    maker, stream = IMAGES["intervals"], stream_of(spikes)
+    images, spans = maker.with_spans(stream, [20, 40], 0.5)
+    rate, span = intervals(stream, 40)
+    np.testing.assert_allclose(images[1], rate / 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(spans[1], span)
+    assert IMAGES["adaptive"].with_spans(stream, [20], 0.5)[1] is None, "an instant"
+
+
+def test_its_windows_are_those_of_adaptive():
+    assert IntervalSettings().shortest == AdaptiveSettings().shortest

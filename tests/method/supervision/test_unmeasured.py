@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,7 @@ from toy_world import ToyWorld
 from spike4dgs.baselines.spike_render import SpikeRender
 from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.method.supervision.base import Sample
+from spike4dgs.method.supervision.base import Sample, difference
 from spike4dgs.method.supervision.spike import SpikeRate
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, recorded
 from spike4dgs.method.supervision.spss import SpikeVariation
@@ -58,3 +59,19 @@ def test_a_cameras_gain_is_part_of_its_response():
     plain, own = (SpikeCameras(s).rate(image, (0, 1)) for s in (SCENE, scene))
     assert torch.equal(own[0], plain[0])
     torch.testing.assert_close(own[1], 1.1 * plain[1])
+
+
+def test_unknown_pixels_have_no_gradient_and_known_ones_have_theirs() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(2, 24, 30, generator=generator)
+    rendered = torch.rand(2, 24, 30, generator=generator).requires_grad_(True)
+    unknown = torch.zeros(2, 24, 30, dtype=torch.bool)
+    unknown[:, :, 22:] = True
+    difference(rendered, image.masked_fill(unknown, math.nan), 0.2).backward()
+    part = rendered.grad.clone()
+    assert (part[unknown] == 0).all() and (part[~unknown] != 0).all()
+    rendered.grad = None
+    difference(rendered, image, 0.2).backward()
+    far = torch.zeros_like(unknown)
+    far[:, :, : 22 - 11] = True  # further than SSIM's window from what is unknown
+    torch.testing.assert_close(part[far], rendered.grad[far])
