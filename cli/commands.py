@@ -14,6 +14,13 @@ from spike4dgs.cli.measurements import MEASUREMENTS
 MOVED = {
     "run-benchmark --oracle": "report oracle-ladder",
     "run-benchmark --oracle-samples": "report oracle-ladder",
+    "speed splat": "report speed-error --only splat-torch",
+    "speed ssim": "report speed-error --only ssim",
+    "speed simulate": "report speed-error --only sensor sensor-spikezoo",
+    "speed decode": "report speed-error --only decoding",
+    "speed metrics": "report speed-error --only scale-metrics flip",
+    "speed tfi": "report speed-error --only stacks",
+    "speed tfp": "report speed-error --only stacks",
 }
 
 COMMANDS: dict[str, Command] = {
@@ -78,13 +85,9 @@ COMMANDS: dict[str, Command] = {
         "fit captures/turntable --out runs/turntable",
     ),
     "fault-table": Command(
-        "spike4dgs.studies.faults:make_fault_table",
+        "spike4dgs.cli.fault_table:fault_table",
         "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
         "fault-table data/turntable-0-small --out runs/faults",
-        needs=(
-            "spike4dgs.cli.record:record",
-            "spike4dgs.generators.recorder.emulation.imperfections:Imperfections",
-        ),
     ),
     "score": Command(
         "spike4dgs.cli.score:score",

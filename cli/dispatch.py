@@ -62,8 +62,7 @@ def _dispatch(arguments: list[str]) -> int:
         elif name not in COMMANDS:
             return _verbs(name, rest, verbs)
     for old in (name, *(f"{name} {word}" for word in rest)):
-        if old in MOVED:
-            raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
+        _check_moved(old)
     command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
 
     import tyro
@@ -73,6 +72,11 @@ def _dispatch(arguments: list[str]) -> int:
         tyro.cli(_bounded(function), args=rest, prog=f"spike4dgs {name}", description=_description(function, command))
         or 0
     )
+
+
+def _check_moved(old: str) -> None:
+    if old in MOVED:
+        raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
 
 
 def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
@@ -122,6 +126,7 @@ def _speed(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview("spike4dgs speed", SPEED))
         return 0
+    _check_moved(f"speed {arguments[0]}")
     for option, text in zip(arguments, arguments[1:], strict=False):
         with contextlib.suppress(ValueError):
             if not abs(float(text)) <= _MOST:

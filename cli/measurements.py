@@ -9,16 +9,9 @@ from spike4dgs.cli.command import Command
 
 MEASUREMENTS: dict[str, Command] = {
     "report speed-error": Command(
-        "spike4dgs.studies.speed_error.command:make_speed_error",
+        "spike4dgs.studies.speed_error.command:speed_error",
         "measure every approximation beside its exact twin, and write one page",
         "report speed-error --quick --out runs/speed-error",
-        needs=(
-            "spike4dgs.generators.make_dataset:make_dataset",
-            "spike4dgs.studies.twins.method_table:measurements",
-            "spike4dgs.studies.twins.baselines_table:measurements",
-            "spike4dgs.studies.twins.generators_table:measurements",
-            "spike4dgs.studies.twins.streams:measurements",
-        ),
     ),
     "report hard-cases": Command(
         "spike4dgs.benchmark.reports.hard_cases.command:make_hard_cases",
@@ -31,18 +24,23 @@ MEASUREMENTS: dict[str, Command] = {
             "spike4dgs.baselines.hard_cases.table:hard_cases",
         ),
     ),
+    "report oracle-ladder": Command(
+        "spike4dgs.studies.oracle_ladder:oracle_ladder",
+        "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
+        "report oracle-ladder data/car-0-small --out runs/oracle",
+    ),
     "spike-agreement": Command(
         "spike4dgs.studies.spike_agreement:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
         "spike-agreement runs/small --data data --out runs/spike-agreement",
     ),
     "tradeoff": Command(
-        "spike4dgs.studies.tradeoff:tradeoff",
+        "spike4dgs.studies.rendering:tradeoff",
         "report render time against error for several settings",
         "tradeoff car --profile paper",
     ),
     "spacing": Command(
-        "spike4dgs.studies.spacing:spacing",
+        "spike4dgs.studies.rendering:spacing",
         "report key-frame spacing against error and render time",
         "spacing --help",
     ),
@@ -51,33 +49,18 @@ MEASUREMENTS: dict[str, Command] = {
 SPEED_SUMMARY = "measure the speed of a part beside a plain one"
 # Speed measurements take the rest of the command line as a list of strings.
 SPEED: dict[str, Command] = {
-    "splat": Command(
-        "spike4dgs.studies.speed.splat:splat",
-        "render and differentiate Gaussians, beside a torch reference",
-        "speed splat",
-    ),
-    "ssim": Command("spike4dgs.studies.speed.splat:ssim", "SSIM and its gradient, beside torch", "speed ssim"),
     "render": Command(
-        "spike4dgs.studies.speed.render:render",
+        "spike4dgs.studies.saved_models:render",
         "render images of saved models, side by side",
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
-    "simulate": Command(
-        "spike4dgs.studies.speed.simulate:simulate", "integrate-and-fire simulation, beside numpy", "speed simulate"
-    ),
     "record": Command(
-        "spike4dgs.studies.speed.record:record",
+        "spike4dgs.studies.recorder:record",
         "record emulated cameras into memory and to disk, queued beside single reads",
         "speed record",
     ),
-    "decode": Command(
-        "spike4dgs.studies.speed.decode:decode", "decode windows of packed spikes, beside numpy", "speed decode"
-    ),
-    "metrics": Command("spike4dgs.studies.speed.metrics:metrics", "every metric for one image", "speed metrics"),
-    "tfi": Command("spike4dgs.studies.speed.stacks:tfi", "images from spike intervals, whole stack", "speed tfi"),
-    "tfp": Command("spike4dgs.studies.speed.stacks:tfp", "images from spike counts, whole stack", "speed tfp"),
     "images": Command(
-        "spike4dgs.studies.speed.images:images",
+        "spike4dgs.studies.images:images",
         "time and quality of each way from spikes to an image, beside the paper's Table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),

@@ -137,7 +137,7 @@ def run_benchmark(
 
 def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, out: Path) -> int:
     """Make table 6, which compares images from spikes and fits no method."""
-    from spike4dgs.studies.speed.images import images
+    from spike4dgs.studies.images import images
 
     worlds = [world for number in (1, 2) for world in published(number).worlds]
     data, profile = choice.data, choice.profile

@@ -6,15 +6,12 @@ alone, its recordings under uniform light and in the dark included; the scene's 
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-from tyro.conf import Positional
 
 from spike4dgs.benchmark.environment import command_line, environment, harness
 from spike4dgs.benchmark.errors import UserError, problem
@@ -23,12 +20,14 @@ from spike4dgs.benchmark.metrics.measure import score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.cli.fit import PREDICTIONS, fit
+from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
+from spike4dgs.generators.recorder.record import record
+from spike4dgs.studies.kit.timing import markdown, write_csv
 
 FLAT_RADIANCE = 0.7  # of the emulated uniform light
 _EXACT = "none"
 METRICS = ("psnr", "psnr_dynamic")
-Recorder = Callable[..., int]  # `spike4dgs record`
+Fit = Callable[..., int]  # `spike4dgs fit`, which writes OUT/predictions
 
 
 @dataclass(frozen=True)
@@ -84,49 +83,34 @@ class Outcome:
     error: str = ""
 
 
-def make_fault_table(record: Recorder, imperfections: Callable[..., Any]) -> Callable[..., int]:
-    """Return the command. `record` and `imperfections` make the captures."""
-
-    def fault_table(
-        scene: Positional[Path],
-        *,
-        lens_scene: Path | None = None,
-        methods: tuple[str, ...] = ("spike4dgs-x", "spk2img+stg"),
-        out: Path = Path("runs/faults"),
-        budget: str = "quick",
-        seed: int = 0,
-        device: str = "auto",
-    ) -> int:
-        """Make captures of a scene worse on purpose, fit each, and tabulate the dB that a held-out camera loses.
-
-        A killed run continues: give the same command again.
-
-        Args:
-            scene: A made scene with ground truth.
-            lens_scene: The same scene made with `make-dataset --lens`, for the rows of lens distortion; its held-out
-                camera is judged through its lens.
-            methods: Methods by name.
-            out: Folder for table.md, table.csv, table.json and table.png; captures and fits are kept there too.
-            budget: quick, standard (4 times the steps), or a multiple of quick.
-            seed: Seed of the imperfections and of the fits.
-            device: auto, cpu or cuda.
-        """
-        truth = _with_truth(scene)
-        curved = None if lens_scene is None else _with_truth(lens_scene)
-        found: list[Outcome] = []
-        for case in (*CASES, *(LENS_CASES if curved else ())):
-            shown = curved if curved and case.lens else truth
-            capture = out / "captures" / case.name
-            _capture(record, imperfections(**case.worse), shown.root, capture, seed)
-            for method in methods:
-                folder = out / "fits" / case.name / method
-                found.append(_outcome(case, method, capture, folder, shown, budget=budget, seed=seed, device=device))
-                about = {"command": command_line(), "harness": harness(), "environment": environment("cpu")}
-                _write(out, found, {"scene": truth.id, "budget": budget, "seed": seed, **about})
-        print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
-        return 0
-
-    return fault_table
+def fault_table(
+    fit: Fit,
+    scene: Path,
+    lens_scene: Path | None,
+    methods: Sequence[str],
+    out: Path,
+    budget: str,
+    seed: int,
+    device: str,
+) -> None:
+    """Make the captures, fit each with each method, and write OUT/table.{md,csv,json,png} after each fit."""
+    truth = _with_truth(scene)
+    curved = None if lens_scene is None else _with_truth(lens_scene)
+    found: list[Outcome] = []
+    about = {"scene": truth.id, "budget": budget, "seed": seed}
+    for case in (*CASES, *(LENS_CASES if curved else ())):
+        shown = curved if curved and case.lens else truth
+        capture = out / "captures" / case.name
+        _capture(Imperfections(**case.worse), shown.root, capture, seed)
+        for method in methods:
+            folder = out / "fits" / case.name / method
+            run = partial(fit, capture / "clip", method=method, out=folder, budget=budget, seed=seed, device=device)
+            found.append(Outcome(case, method, **_scored(run, folder, shown)))
+            _write(
+                out,
+                found,
+                {**about, "command": command_line(), "harness": harness(), "environment": environment("cpu")},
+            )
 
 
 def _with_truth(scene: Path) -> Scene:
@@ -136,7 +120,7 @@ def _with_truth(scene: Path) -> Scene:
     return opened
 
 
-def _capture(record: Recorder, worse: Any, scene: Path, out: Path, seed: int) -> None:
+def _capture(worse: Imperfections, scene: Path, out: Path, seed: int) -> None:
     """Record uniform light, darkness and the scene with an emulated array; a finished capture is kept."""
     if (out / "clip" / "manifest.json").exists():
         return
@@ -147,17 +131,17 @@ def _capture(record: Recorder, worse: Any, scene: Path, out: Path, seed: int) ->
     record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, **light)
 
 
-def _outcome(case: Case, method: str, capture: Path, out: Path, truth: Scene, **options: Any) -> Outcome:
+def _scored(fit: Callable[[], int], out: Path, truth: Scene) -> dict[str, Any]:
     """Fit a capture and score its held-out cameras against the truth; finished scores are kept."""
     kept = out / "scores.json"
     if not kept.exists():
         try:
-            fit(capture / "clip", method=method, out=out, **options)
-            scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
+            fit()
+            scores: dict[str, Any] = {**_scores(out / "predictions", truth), "error": ""}
         except UserError as e:
             scores = {**dict.fromkeys(METRICS), "error": str(e)}
         write_json(kept, scores)
-    return Outcome(case, method, **read_json(kept, "the scores of a fit"))
+    return read_json(kept, "the scores of a fit")
 
 
 def _scores(folder: Path, truth: Scene) -> dict[str, float]:
@@ -175,13 +159,13 @@ def _write(out: Path, found: Sequence[Outcome], about: Mapping[str, Any]) -> Non
     methods = list(dict.fromkeys(o.method for o in found))
     exact = {o.method: o for o in found if o.case.fault == _EXACT}
     write_json(out / "table.json", {**about, "outcomes": [asdict(o) for o in found]})
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["fault", "size", "method", *METRICS, *(f"{m}_lost" for m in METRICS), "error"])
+    rows = []
     for o in found:
-        values, lost = [getattr(o, m) for m in METRICS], _lost(o, exact[o.method])
-        rows.writerow([o.case.fault, o.case.size, o.method, *(_text(v) for v in (*values, *lost)), o.error])
-    write_text(out / "table.csv", text.getvalue())
+        values = [*(getattr(o, m) for m in METRICS), *_lost(o, exact[o.method])]
+        texts = ("" if v is None else f"{v:.4f}" for v in values)
+        rows.append([o.case.fault, o.case.size, o.method, *texts, o.error])
+    columns = ["fault", "size", "method", *METRICS, *(f"{m}_lost" for m in METRICS), "error"]
+    write_csv(out / "table.csv", columns, rows)
     write_text(out / "table.md", _markdown(found, methods, exact))
     _plot(out / "table.png", found, methods, exact)
 
@@ -193,17 +177,17 @@ def _lost(outcome: Outcome, exact: Outcome) -> list[float | None]:
 
 
 def _markdown(found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> str:
-    header = [f"{m}, dB" for m in methods] + [f"{m}, moving, dB" for m in methods]
-    lines = [f"| fault | size | {' | '.join(header)} |", "|" + "---|" * (2 + len(header))]
+    header = ["fault", "size", *(f"{m}, dB" for m in methods), *(f"{m}, moving, dB" for m in methods)]
     by_case: dict[str, dict[str, Outcome]] = {}
     for o in found:
         by_case.setdefault(o.case.name, {})[o.method] = o
+    rows = []
     for outcomes in by_case.values():
         case = next(iter(outcomes.values())).case
         cells = [_cell(outcomes.get(method), exact, k) for k in range(len(METRICS)) for method in methods]
-        lines.append(f"| {case.fault} | {case.size} | {' | '.join(cells)} |")
+        rows.append([case.fault, case.size, *cells])
     errors = [f"- {o.case.fault}, {o.case.size}, {o.method}: {o.error}" for o in found if o.error]
-    return "\n".join([*lines, "", *errors]).rstrip() + "\n"
+    return "\n".join([*markdown(header, rows), "", *errors]).rstrip() + "\n"
 
 
 def _cell(outcome: Outcome | None, exact: Mapping[str, Outcome], k: int) -> str:
@@ -214,10 +198,6 @@ def _cell(outcome: Outcome | None, exact: Mapping[str, Outcome], k: int) -> str:
         return f"{value:.2f}"
     lost = _lost(outcome, exact[outcome.method])[k]
     return "-" if lost is None else f"{-lost:+.2f}"
-
-
-def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
 
 
 def _plot(path: Path, found: Sequence[Outcome], methods: Sequence[str], exact: Mapping[str, Outcome]) -> None:

@@ -31,6 +31,8 @@ ORDER = {
     "checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings viewing",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes hard_cases",
     "leaderboard": "tracks entry truth_check rank verify refit submit page season",
+    "studies": "kit speed_error rendering images recorder_runs recorder saved_models oracle_truth oracle_methods "
+    "oracle_ladder faults patterns poses spike_agreement",
 }
 MOST_MODULES = 13  # in a folder; `__init__` does not count
 MANY_MODULES = {"cli"}  # one module a command: the listing is the table of commands

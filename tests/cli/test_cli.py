@@ -51,8 +51,6 @@ def test_the_overview_of_speed_lists_its_measurements(capsys: pytest.CaptureFixt
     assert main(["speed", "--help"]) == 0
     text = capsys.readouterr().out
     assert all(f"  {name} " in text for name in SPEED)
-    done = python("-m", "spike4dgs.studies.speed", "--help")
-    assert done.returncode == 0 and done.stdout == text
 
 
 def test_a_command_of_two_words_is_found_by_both(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -102,7 +100,8 @@ def test_what_computes_takes_a_seed(name: str, capsys: pytest.CaptureFixture[str
         (["scroe"], "error: spike4dgs: expected one of make-dataset, "),
         (["scroe"], "found 'scroe'; did you mean `spike4dgs score`?"),
         (["zzz"], "see `spike4dgs --help`"),
-        (["speed", "splot"], "did you mean `spike4dgs speed splat`?"),
+        (["speed", "rendr"], "did you mean `spike4dgs speed render`?"),
+        (["speed", "ssim"], "found the old one; use `spike4dgs report speed-error --only ssim`"),
         (["score", "nowhere", "also-nowhere"], "also-nowhere: expected a scene folder, found no such folder"),
         (["submit", "nothing.json"], "nothing.json: expected a spike4dgs-result/1 record, found no such file"),
         (["verify", "nowhere"], "nowhere: expected a scene folder"),

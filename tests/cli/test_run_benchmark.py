@@ -230,7 +230,7 @@ def test_a_track_and_table_6_are_modes_of_their_own(
     small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, measured = tmp_path / "out", list[Sequence[str]]()
-    monkeypatch.setattr("spike4dgs.studies.speed.images.images", lambda arguments: measured.append(arguments) or 0)
+    monkeypatch.setattr("spike4dgs.studies.images.images", lambda arguments: measured.append(arguments) or 0)
     monkeypatch.setattr(command, "track_scenes", lambda name: {small_scene.name: open_scene(small_scene).revision})
     assert run_benchmark((small_scene,), table=6, out=out) == 0 and not out.exists()
     assert measured == [[str(small_scene), "--out", str(out)]]

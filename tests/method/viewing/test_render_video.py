@@ -21,7 +21,7 @@ from spike4dgs.method.splat import Views
 from spike4dgs.method.splat import render as rasterise
 from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
 from spike4dgs.method.viewing.render_video import frame_times
-from spike4dgs.studies.speed.render import exact_patch
+from spike4dgs.studies.saved_models import exact_patch
 
 S = np.linspace(0, 1, 33)
 UP = np.array([0.0, 0.0, 1.0])

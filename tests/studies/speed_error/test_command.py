@@ -10,9 +10,10 @@ import pytest
 
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.cli import main
-from spike4dgs.studies.speed_error.command import make_speed_error
-from spike4dgs.studies.speed_error.measurement import GROUPS, MS, Measurement, Point, Request, Series
-from spike4dgs.studies.speed_error.runner import measured_from_to
+from spike4dgs.generators.make_dataset import SceneSettings
+from spike4dgs.studies.kit.measurement import GROUPS, MS, Measurement, Point, Request, Series
+from spike4dgs.studies.kit.runner import measured_from_to
+from spike4dgs.studies.speed_error import command as speed_error
 
 
 def measurements(fail: bool = False) -> tuple[Measurement, ...]:
@@ -32,7 +33,7 @@ def test_the_whole_command_in_its_smallest_size(
     assert main(command) == 0
     assert f"page: {out / 'index.html'}" in capsys.readouterr().out
     report = json.loads((out / "speed_error.json").read_text())
-    check_schema(report, load_schema("spike4dgs.benchmark", "speed_error.schema.json"), "the report", "")
+    check_schema(report, load_schema("spike4dgs.studies.kit", "speed_error.schema.json"), "the report", "")
     ids = {m["id"] for m in report["measurements"]}
     assert {"splat", "images", "sensor", "scores", "budget", "scale-pixels"} <= ids and not ids & {"keys", "msdi"}
     groups = [m["group"] for m in report["measurements"]]
@@ -49,29 +50,32 @@ def test_the_whole_command_in_its_smallest_size(
     assert "SSIM and its gradient: kept" in capsys.readouterr().out
 
 
-def test_a_scene_is_made_once_and_only_when_asked(tmp_path: Path) -> None:
+def test_a_scene_is_made_once_and_only_when_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[tuple[object, ...]] = []
-    command = make_speed_error(lambda *a, **k: made.append((a, k)) or 0, measurements, lambda: ())
-    assert command(out=tmp_path / "a", quick=True) == 0
-    assert made == [((("car",),), {"profile": "tiny", "out": tmp_path / "a/scenes", "seed": 0})]
+    monkeypatch.setattr(speed_error, "plan", measurements)
+    monkeypatch.setattr("spike4dgs.generators.make_dataset.make_dataset", lambda *a: made.append(a) or 0)
+    assert speed_error.speed_error(out=tmp_path / "a", quick=True) == 0
+    assert made == [([SceneSettings("tiny", 0).job("car")], tmp_path / "a/scenes")]
     report = json.loads((tmp_path / "a/speed_error.json").read_text())
     assert report["size"] == "quick" and report["measurements"][0]["series"][0]["name"] == "car-0-tiny"
-    assert command(out=tmp_path / "b", size="tiny", scene=tmp_path) == 0 and len(made) == 1
+    assert speed_error.speed_error(out=tmp_path / "b", size="tiny", scene=tmp_path) == 0 and len(made) == 1
 
 
-def test_a_failure_is_exit_1_and_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = make_speed_error(lambda *a, **k: 0, lambda: measurements(fail=True))
-    assert command(out=tmp_path / "a", size="tiny") == 1
+def test_a_failure_is_exit_1_and_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(speed_error, "plan", lambda: measurements(fail=True))
+    assert speed_error.speed_error(out=tmp_path / "a", size="tiny") == 1
     assert "failed, see the page: one" in capsys.readouterr().out
     assert "OSError: no luck" in (tmp_path / "a/index.html").read_text()
 
 
 def test_what_was_measured_is_measured_again_where_that_is_asked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = make_speed_error(lambda *a, **k: 0, measurements)
+    monkeypatch.setattr(speed_error, "plan", measurements)
     for again, kept in ((False, False), (False, True), (True, False)):
-        command(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
+        speed_error.speed_error(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
         assert ("one: kept" in capsys.readouterr().out) == kept
 
 

@@ -1,0 +1,163 @@
+"""Run a study: measure one after the other, then write the record, the tables and the page.
+
+Each result is a file at once, so that a killed study resumes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.environment import command_line, cpu_name, environment, harness, utc, utc_now
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.studies.kit.measurement import GROUPS, Measurement, Point, Request, Series
+from spike4dgs.studies.kit.timing import write_csv
+
+Result = dict[str, Any]  # a measurement of speed_error.schema.json
+_UNKNOWN_S = 10.0  # of a measurement that does not say how long it takes
+
+
+FORMAT = "spike4dgs-speed-error/1"
+
+
+def run_study(
+    measurements: Sequence[Measurement], request: Request, out: Path, options: dict[str, Any], again: bool = False
+) -> int:
+    """Measure, and write OUT/index.html, OUT/speed_error.json and OUT/measurements/ID.csv; return 1 if one failed.
+
+    What OUT has of the same `options`, request, commit and machine is kept, unless it is measured `again`.
+    """
+    from spike4dgs.studies.kit.page import write_page_of
+
+    shared: dict[str, Any] = {"size": request.size, "seed": request.seed, "device": request.device}
+    folder = out / "measurements"
+    for m in measurements if again else ():
+        (folder / f"{m.id}.json").unlink(missing_ok=True)
+    key = {**shared, **options, "commit": harness()["commit"]}
+    results = measure_all(measurements, request, folder, key, _say)
+    started, finished = measured_from_to(results)
+    report = {
+        "format": FORMAT, **shared, "started": started, "finished": finished, "command": command_line(),
+        "harness": harness(), "environment": environment(request.device), "measurements": results,
+    }  # fmt: skip
+    check_schema(report, load_schema("spike4dgs.studies.kit", "speed_error.schema.json"), "the report", "report this")
+    write_json(out / "speed_error.json", report)
+    for r in results:
+        rows = [[s["name"], p["name"], p["role"], *p["values"].values()] for s in r["series"] for p in s["points"]]
+        write_csv(folder / f"{r['id']}.csv", ["input", "setting", "role", *(c["title"] for c in r["columns"])], rows)
+    write_page_of(out / "index.html", report)
+    failed = [r["id"] for r in results if r["problem"]]
+    _say(f"page: {out / 'index.html'}\nJSON: {out / 'speed_error.json'}")
+    if failed:
+        _say(f"failed, see the page: {', '.join(failed)}")
+    return 1 if failed else 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def measure_all(
+    measurements: Sequence[Measurement], request: Request, folder: Path, key: dict[str, Any], say: Callable[[str], None]
+) -> list[Result]:
+    """Return a result for each measurement, failed ones too. Files FOLDER/ID.json of the same `key` are kept."""
+    left = {m.id: m.seconds.get(request.size, _UNKNOWN_S) for m in measurements}
+    told = spent = 0.0  # seconds: expected and measured, of what is done
+    results = []
+    for i, m in enumerate(measurements):
+        path, own = folder / f"{m.id}.json", sha256_json({**key, "machine": cpu_name(), "id": m.id})
+        label = f"[{i + 1}/{len(measurements)}] {m.title}"
+        if (kept := _kept(path, own)) is not None:
+            say(f"{label}: kept")
+            results.append(kept)
+            left.pop(m.id)
+            continue
+        factor = spent / told if told else 1.0
+        say(f"{label}; about {_minutes(factor * sum(left.values()))} to go")
+        result = measure(m, request)
+        told, spent = told + left.pop(m.id), spent + result["seconds"]
+        if result["problem"]:
+            say(f"    failed: {result['problem']}")
+        else:
+            write_json(path, {"key": own, "result": result})
+        results.append(result)
+    return results
+
+
+def measure(m: Measurement, request: Request) -> Result:
+    """Return the result of one measurement. Whatever it raises is the result's `problem`, beside what it had by then.
+
+    Somebody reads the page for the other measurements: one that fails never ends the report.
+    """
+    series: list[Series] = []
+    found, start = "", time.perf_counter()
+    try:
+        for s in m.run(request):
+            series.append(s)
+        if not series:
+            found = "nothing was measured"
+    except UserError as e:
+        found = str(e)
+    except Exception as e:
+        traceback.print_exc()
+        found = f"{type(e).__name__}: {e}"
+    texts = ("id", "group", "title", "approximation", "exact", "reason", "x", "held_by")
+    return {
+        **{name: getattr(m, name) for name in texts},
+        "y": list(m.y),
+        "cost": m.cost or m.x,
+        "error": m.error or m.y[0],
+        "columns": [asdict(c) for c in m.columns],
+        "series": [{"name": s.name, "points": [_point(p, m) for p in s.points]} for s in series],
+        "seconds": time.perf_counter() - start,
+        "measured": utc_now(),
+        "commit": harness()["commit"],
+        "problem": found,
+    }
+
+
+def measured_from_to(results: Sequence[Result]) -> tuple[str, str]:
+    """Return when the first of the results began and the last ended, those that were kept among them."""
+    ends = [datetime.fromisoformat(r["measured"]) for r in results]
+    begins = [end - timedelta(seconds=r["seconds"]) for end, r in zip(ends, results, strict=True)]
+    return utc(min(begins)), utc(max(ends))
+
+
+def _point(p: Point, m: Measurement) -> dict[str, Any]:
+    """Return a point with a value for each column; JSON has no infinity and no NaN."""
+    values = {c.id: p.values.get(c.id) for c in m.columns}
+    finite = {k: None if v is None or not math.isfinite(v) else float(v) for k, v in values.items()}
+    return {"name": p.name, "role": p.role, "values": finite}
+
+
+def _kept(path: Path, key: str) -> Result | None:
+    """Return the result in a file, if it is of the same key."""
+    if not path.is_file():
+        return None
+    try:
+        content = read_json(path, "a measurement of the report")
+    except UserError:  # a damaged file is measured again
+        return None
+    result: Result | None = content.get("result")
+    return result if content.get("key") == key else None
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+def in_order(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """Return measurements by their groups. Raises ValueError for one id twice, and for a group that is not known."""
+    found = sorted(measurements, key=lambda m: GROUPS.index(m.group))
+    ids = [m.id for m in found]
+    if twice := {i for i in ids if ids.count(i) > 1}:
+        raise ValueError(f"measurements with one id: {', '.join(sorted(twice))}")
+    return found

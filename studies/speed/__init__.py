@@ -1,1 +1,0 @@
-"""Speed measurements: the parts that all share, and those of this room."""

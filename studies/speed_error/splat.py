@@ -1,0 +1,231 @@
+"""The rasteriser against its float64 twin: precision, gradients, the background; and beside another program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat.background import Background, join
+from spike4dgs.method.splat.reference import composite_patch, cutoff_margin, project
+from spike4dgs.method.splat.types import EPS2D, NEAR
+from spike4dgs.method.torch_state import one_torch_thread
+from spike4dgs.studies.kit.measurement import (
+    TIMES,
+    Column,
+    Point,
+    Request,
+    Series,
+    compared,
+    max_rms,
+    measurement,
+)
+from spike4dgs.studies.kit.timing import by_turns_ms
+from spike4dgs.studies.speed_error.gaussians import MEAN_RADIUS_PX, Scene, hard_scenes, random_scene, wide
+
+GROUP = "Rasterizer"
+PATCH = 48  # px, a side of the parts that the reference composites: its memory grows with them
+MAX = Column("max", "largest error, radiance")
+RMS = Column("rms", "RMS error, radiance")
+SURE = Column("sure", "largest error away from the cut, radiance")
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+_CLEAR = 1e-3  # relative distance from a decision, alpha >= 1/255 or T > 1e-4, that float32 takes as float64 does
+
+
+@torch.no_grad()
+def exact_image(splats: Splats, views: Views) -> Tensor:
+    """Return the image [H, W, F] of one view by the reference, float64, part by part."""
+    s = wide(splats)
+    view = project(s, views.w2c[0].double(), views.K[0].double(), (views.width, views.height), False, NEAR, EPS2D)
+    image = torch.empty(views.height, views.width, splats.colors.shape[1], dtype=torch.float64)
+    for y in range(0, views.height, PATCH):
+        for x in range(0, views.width, PATCH):
+            size = min(PATCH, views.width - x), min(PATCH, views.height - y)
+            image[y : y + size[1], x : x + size[0]] = composite_patch(view, s.colors, (x, y), size)[0]
+    return image
+
+
+@measurement("splat", GROUP, "Rasterizer: float32 kernels", (*TIMES, MAX, RMS, SURE), ("rms", "max"), (8, 40, 400))
+def precision(request: Request) -> Iterator[Series]:
+    """Gaussians are projected in float64, sorted in tiles and composited in float32, with vector code.
+
+    Every pixel against every Gaussian in float64 (`method/splat/reference.py`), in parts of the image.
+
+    An image is 8 to 10 bits of light. Float32 errs by less than a millionth where no decision is near; at a pixel where
+    alpha is within rounding of 1/255, a whole Gaussian of 1/255 may be there or not. Parameters in float64 matter only
+    far from the origin, where a model keeps them in float64.
+
+    tests/method/splat/test_cpu.py
+    """
+    counts, size = request.pick(((100,), (40, 24)), ((1000, 5000), (200, 125)), ((1000, 5000, 20_000), (400, 250)))
+    for n in counts:
+        yield _precision(f"{n} random Gaussians", random_scene(n, request.seed, *size), request)
+    for name, scene in hard_scenes(request.seed).items():
+        yield _precision(name, scene, request)
+
+
+def _precision(name: str, scene: Scene, request: Request) -> Series:
+    splats, views = scene
+    narrow = Splats(*(t.float() for t in (*splats.geometry, splats.colors)))
+    sure = cutoff_margin(splats, views)[0] > _CLEAR if views.width * len(splats) <= 200_000 else None
+
+    def errors(found: Tensor, exact: Tensor) -> dict[str, float]:
+        some = {} if sure is None or not sure.any() else {"sure": float((found - exact)[sure].abs().max())}
+        return {**max_rms(found, exact), **some}
+
+    def kernels(s: Splats) -> Tensor:
+        return render(s, views, backend="cpu").image[0]
+
+    calls = {
+        "float64, all pixels": partial(exact_image, splats, views),
+        "kernels, parameters in float64": partial(kernels, wide(splats)),
+        "kernels, parameters in float32": partial(kernels, narrow),
+    }
+    with torch.no_grad(), one_torch_thread():
+        return compared(name, calls, errors, request.pick(2, 9, 21), "kernels, parameters in float32", once=True)
+
+
+def gradients_of(splats: Splats, views: Views, weight: Tensor, backend: str, dtype: torch.dtype) -> list[Tensor]:
+    """Return the gradients of a weighted sum of the image, by `PARAMETERS`."""
+    leaves = [t.to(dtype).requires_grad_() for t in (*splats.geometry, splats.colors)]
+    image = render(Splats(*leaves), views, backend=backend).image[0]  # type: ignore[arg-type]
+    return list(torch.autograd.grad((image * weight.to(image)).sum(), leaves))
+
+
+@measurement(
+    "splat-gradients",
+    GROUP,
+    "Rasterizer: gradients",
+    (*TIMES, *(Column(name, f"{name}, relative L2 error") for name in PARAMETERS)),
+    ("means", "scales"),
+    (1, 5, 60),
+)
+def gradients(request: Request) -> Iterator[Series]:
+    """The kernels replay each tile and chain its records to the parameters, in float32.
+
+    Autograd through the float64 reference.
+
+    Adam divides gradients by their size and its batches are four images: noise of a thousandth is far below the spread
+    between batches.
+
+    tests/method/splat/test_cpu.py
+    """
+    n, size = request.pick((60, (24, 16)), (300, (64, 40)), (1000, (100, 63)))
+    splats, views = random_scene(n, request.seed, *size)
+    weight = torch.randn(size[1], size[0], 1, generator=torch.Generator().manual_seed(request.seed + 1))
+    calls = {
+        "float64 by autograd": partial(gradients_of, splats, views, weight, "reference", torch.float64),
+        "kernels": partial(gradients_of, splats, views, weight, "cpu", torch.float32),
+    }
+
+    def errors(found: list[Tensor], exact: list[Tensor]) -> dict[str, float]:
+        return {k: float((a - b).norm() / b.norm()) for k, a, b in zip(PARAMETERS, found, exact, strict=True)}
+
+    with one_torch_thread():
+        name = f"{n} random Gaussians, {size[0]}x{size[1]}"
+        yield compared(name, calls, errors, request.pick(1, 3, 9), "kernels")
+
+
+@measurement(
+    "background",
+    GROUP,
+    "Background: rendered once",
+    (
+        Column("share", "share of Gaussians that move, %"),
+        TIMES[0],
+        Column("all_ms", "all rendered again, ms"),
+        Column("max", "largest difference, radiance"),
+    ),
+    ("ms",),
+    (1, 8, 30),
+    cost="ms",
+    error="max",
+)
+def background(request: Request) -> Iterator[Series]:
+    """What does not move is projected and listed once; tiles that nothing else touches are copied.
+
+    All Gaussians rendered again.
+
+    The images are equal to the bit, so that only time counts. The gain ends where everything moves.
+
+    tests/method/splat/test_background.py
+    """
+    n, size = request.pick((200, (40, 24)), (20_000, (200, 125)), (50_000, (400, 250)))
+    splats, views = random_scene(n, request.seed, *size)
+    leftmost = splats.means[:, 0].div(splats.means[:, 2]).argsort()
+    tensors = (*splats.geometry, splats.colors)
+    moving_first: list[Point] = []
+    for share in (0.02, 0.1, 0.3, 1.0):
+        cut = max(1, round(share * n))
+        moving, still = (Splats(*(t[part] for t in tensors)) for part in (leftmost[:cut], leftmost[cut:]))
+        behind, whole = Background(still, views), join(still, moving)
+        with torch.no_grad():
+            calls = [partial(render, whole, views, backend="cpu"), partial(behind.render, moving, [0])]
+            everything, only = by_turns_ms(calls, request.pick(2, 9, 21))
+            error = (calls[0]().image - calls[1]().image).abs()
+        values = {"share": 100 * share, "ms": only[0], "all_ms": everything[0], "max": float(error.max())}
+        moving_first.append(Point(f"{share:.0%} move", values, "chosen"))
+    yield Series("only what moves is rendered", tuple(moving_first))
+    again = [Point(p.name, {**p.values, "ms": p.values["all_ms"], "max": 0.0}, "exact") for p in moving_first]
+    yield Series("all is rendered", tuple(again))
+
+
+@measurement(
+    "splat-torch",
+    GROUP,
+    "Rasterizer: beside metal-gauss",
+    (
+        Column("count", "Gaussians"),
+        *TIMES,
+        Column("image", "image differs by"),
+        Column("gradient", "gradients differ by, relative L2"),
+    ),
+    ("ms",),
+    (None, None, None),
+)
+def beside_torch(request: Request) -> Iterator[Series]:
+    """Images of 400x250 by `torch_ref` of the package metal-gauss, which renders three channels, and by the kernels
+    with one, as spike cameras need, and with three. It cuts Gaussians off at three standard deviations, where the
+    kernels go on to an alpha of 1/255: images differ by up to 1/255 a Gaussian.
+    """
+    try:
+        from metal_gauss import torch_ref
+    except ImportError:
+        fix = "pip install metal-gauss"
+        raise problem("splat-torch", "the package metal-gauss to compare with", "none", fix) from None
+
+    def run(program: str, scene: Scene, channels: int, backward: bool) -> tuple[Tensor, list[Tensor]]:
+        (splats, v), colors = scene, scene[0].colors.expand(-1, channels)
+        leaves = [t.detach().clone().requires_grad_(backward) for t in (*splats.geometry, colors)]
+        if program == "metal-gauss":
+            *geometry, shown = leaves
+            size = (v.width, v.height)
+            image = torch_ref.render(*geometry, None, v.K[0], v.w2c[0], *size, colors=shown)[0][..., :1]
+        else:
+            image = render(Splats(*leaves), v, backend="cpu").image[0]
+        weight = torch.randn(v.height, v.width, 1, generator=torch.Generator().manual_seed(1))
+        return image[..., 0].detach(), list(torch.autograd.grad((image * weight).sum(), leaves)) if backward else []
+
+    size, counts = request.pick((40, 25), (400, 250), (400, 250)), request.pick((50,), (5000,), tuple(MEAN_RADIUS_PX))
+    scenes = {n: random_scene(n, 0, *size) for n in counts}
+    for backward in (False, True):
+        theirs = {n: run("metal-gauss", scene, 3, backward) for n, scene in scenes.items()}
+        for program, channels in (("metal-gauss", 3), ("spike4dgs", 1), ("spike4dgs", 3)):
+            points = []
+            for n, scene in scenes.items():
+                call = partial(run, program, scene, channels, backward)
+                best, median = by_turns_ms([call], 3 if program == "metal-gauss" else request.pick(1, 9, 30))[0]
+                image, found = call()
+                values = {"count": n, "ms": best, "median_ms": median}
+                values["image"] = float((image - theirs[n][0]).abs().max())
+                if backward and channels == 1:  # of three channels ours weighs all
+                    pairs = zip(found, theirs[n][1], strict=True)
+                    pairs = ((a, b[..., : a.shape[-1]] if a.ndim == 2 else b) for a, b in pairs)
+                    values["gradient"] = max(float((a - b).norm() / b.norm()) for a, b in pairs)
+                points.append(Point(str(n), values))
+            what = "with gradients" if backward else "images"
+            yield Series(f"{program}, {what}, {channels} channel{'s' * (channels > 1)}", tuple(points))
