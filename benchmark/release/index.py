@@ -12,8 +12,9 @@ what it wants, so a release of many terabytes costs its clients no more than the
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +97,10 @@ class SceneEntry:
     @property
     def parts(self) -> dict[str, int]:
         """Bytes by part."""
-        sizes: dict[str, int] = {}
+        sizes: Counter[str] = Counter()
         for sample in self.samples:
-            for part, size in sample.sizes.items():
-                sizes[part] = sizes.get(part, 0) + size
-        return sizes
+            sizes.update(sample.sizes)
+        return dict(sizes)
 
 
 @dataclass(frozen=True)
@@ -119,25 +119,9 @@ def release_json(name: str, scenes: list[SceneEntry], shards: list[Shard]) -> di
         "schema": SCHEMA,
         "name": name,
         "block_bytes": BLOCK,
-        "scenes": [_scene_json(scene) for scene in scenes],
-        "shards": [
-            {
-                "file": s.file,
-                "bytes": s.bytes,
-                "sha256": s.sha256,
-                "index_bytes": s.index_bytes,
-                "index_sha256": s.index_sha256,
-            }
-            for s in shards
-        ],
+        "scenes": [{**asdict(scene), "bytes": scene.bytes} for scene in scenes],
+        "shards": list(map(asdict, shards)),
     }
-
-
-def _scene_json(scene: SceneEntry) -> dict[str, Any]:
-    facts = {name: value for name, value in vars(scene).items() if name != "samples"}
-    facts["gaps"] = list(scene.gaps)
-    samples = [{"camera": s.camera, "shard": s.shard, "sizes": s.sizes} for s in scene.samples]
-    return {**facts, "bytes": scene.bytes, "samples": samples}
 
 
 def parse_release(text: bytes, sha256: str, where: str) -> Release:
@@ -152,12 +136,9 @@ def parse_release(text: bytes, sha256: str, where: str) -> Release:
 
 
 def _scene(data: dict[str, Any]) -> SceneEntry:
-    samples = tuple(Sample(s["camera"], s["shard"], s["sizes"]) for s in data["samples"])
-    return SceneEntry(
-        **{k: v for k, v in data.items() if k not in ("samples", "bytes", "gaps")},
-        samples=samples,
-        gaps=tuple(data["gaps"]),
-    )
+    samples = tuple(Sample(**s) for s in data["samples"])
+    facts = {k: v for k, v in data.items() if k != "bytes"}
+    return SceneEntry(**facts | {"samples": samples, "gaps": tuple(data["gaps"])})
 
 
 def shard_json(file: str, size: int, sha256: str, members: list[Member]) -> dict[str, Any]:
@@ -167,7 +148,7 @@ def shard_json(file: str, size: int, sha256: str, members: list[Member]) -> dict
         "shard": file,
         "bytes": size,
         "sha256": sha256,
-        "files": [{**vars(m), "blocks": list(m.blocks), "part": part_of(m.path)} for m in members],
+        "files": [{**asdict(m), "part": part_of(m.path)} for m in members],
     }
 
 

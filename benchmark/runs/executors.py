@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -37,29 +37,27 @@ def executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Run]:
     Raises UserError for fewer than one worker, for both at once, where distributed is not installed, where the
     scheduler does not answer within 10 s or has no workers, and, while running, where a worker process dies.
     """
-    _check(workers, scheduler)
-    if scheduler is None:
-        yield here if workers == 1 else lambda task, chunks: _in_processes(task, chunks, workers)
-    else:
-        with _cluster(scheduler) as client:
-            yield lambda task, chunks: _on_cluster(client, task, chunks)
+    with unordered_executor(workers, scheduler, task_travels_once=True) as run:
+        yield lambda task, chunks: _ordered(run(task, chunks))
 
 
 @contextmanager
-def unordered_executor(workers: int, scheduler: str | None) -> Iterator[RunUnordered]:
+def unordered_executor(workers: int, scheduler: str | None, task_travels_once: bool = False) -> Iterator[RunUnordered]:
     """Yield the executor for `workers` processes or a scheduler that gives each result as soon as it is there.
 
     Results are pairs of a chunk's position and `task(chunk)`. A cluster runs the chunk of a lost worker again
-    elsewhere; one that loses several workers has the result WORKERS_DIED. Raises UserError as `executor` does, and,
-    while running, where the scheduler is lost.
+    elsewhere; one that loses several workers has the result WORKERS_DIED. The task travels with every chunk: one that
+    travels once to the workers of a cluster would be lost with the last of them. Raises UserError as `executor` does,
+    and, while running, where the scheduler is lost.
     """
     _check(workers, scheduler)
-    if scheduler is None:
-        with _pool(None, workers) as pool:
-            yield lambda task, chunks: _as_ended({pool.submit(task, chunk): k for k, chunk in enumerate(chunks)})
-    else:
+    if scheduler is not None:
         with _cluster(scheduler) as client:
-            yield lambda task, chunks: _as_arrived(client, _submit_with_task(client, task, chunks))
+            yield lambda task, chunks: _on_cluster(client, task, chunks, task_travels_once)
+    elif workers == 1:
+        yield lambda task, chunks: enumerate(here(task, chunks))
+    else:
+        yield lambda task, chunks: _in_processes(task, chunks, workers)
 
 
 def _check(workers: int, scheduler: str | None) -> None:
@@ -79,17 +77,29 @@ def chunked(items: Sequence[int], most: int = 16) -> list[list[int]]:
     return [list(items[k : k + most]) for k in range(0, len(items), most)]
 
 
-def _in_processes(task: Callable[[C], R], chunks: Sequence[C], workers: int) -> Iterator[R]:
+def _in_processes(task: Callable[[C], R], chunks: Sequence[C], workers: int) -> Iterator[tuple[int, R]]:
     with _pool(task, workers) as pool:
-        yield from _ordered([pool.submit(_work, chunk) for chunk in chunks])
+        futures = {pool.submit(_work, chunk): k for k, chunk in enumerate(chunks)}
+        for future in as_completed(list(futures)):
+            yield futures.pop(future), future.result()
 
 
-def _as_ended(futures: Mapping[Future[R], int]) -> Iterator[tuple[int, R]]:
-    return ((futures[future], future.result()) for future in as_completed(futures))
+def _ordered(results: Iterator[tuple[int, R]]) -> Iterator[R]:
+    """Yield results in the order of their chunks; each is dropped once it is yielded."""
+    early: dict[int, R] = {}
+    turn = 0
+    for k, result in results:
+        if result is WORKERS_DIED:
+            fix = "give workers more memory, then run the same command again"
+            raise problem("a worker", "that it ends its task", "several died one after another", fix)
+        early[k] = result
+        while turn in early:
+            yield early.pop(turn)
+            turn += 1
 
 
 @contextmanager
-def _pool(task: Callable[[Any], Any] | None, workers: int) -> Iterator[ProcessPoolExecutor]:
+def _pool(task: Callable[[Any], Any], workers: int) -> Iterator[ProcessPoolExecutor]:
     context = get_context("spawn")
     arguments = (task, context.Value("i", 0), workers, os.getpid())
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
@@ -104,14 +114,7 @@ def _pool(task: Callable[[Any], Any] | None, workers: int) -> Iterator[ProcessPo
             process.terminate()
 
 
-def _ordered(futures: list[Future[R]]) -> Iterator[R]:
-    """Yield results in order; each is dropped once it is yielded."""
-    futures.reverse()
-    while futures:
-        yield futures.pop().result()
-
-
-def _start_worker(task: Callable[[Any], Any] | None, started: Any, workers: int, parent: int) -> None:
+def _start_worker(task: Callable[[Any], Any], started: Any, workers: int, parent: int) -> None:
     """Take this worker's share of the cores, which libraries ask for as they load, and keep the task."""
     global _task
     _task = task
@@ -162,23 +165,12 @@ def _cluster(address: str) -> Iterator[Any]:
         yield client
 
 
-def _on_cluster(client: Any, task: Callable[[C], R], chunks: Sequence[C]) -> Iterator[R]:
-    sent = client.scatter(task, broadcast=True, hash=False)
-    futures = [client.submit(_call, sent, chunk, pure=False, priority=-k) for k, chunk in enumerate(chunks)]
-    futures.reverse()
-    while futures:  # a result is dropped on the cluster as soon as it is here
-        yield futures.pop().result()
-
-
-def _submit_with_task(client: Any, task: Callable[[C], R], chunks: Sequence[C]) -> dict[Any, int]:
-    """Submit every chunk with the task: a task that lies on the workers would be lost with the last of them."""
-    return {client.submit(task, chunk, pure=False, priority=-k): k for k, chunk in enumerate(chunks)}
-
-
-def _as_arrived(client: Any, futures: dict[Any, int]) -> Iterator[tuple[int, Any]]:
+def _on_cluster(client: Any, task: Callable[[C], R], chunks: Sequence[C], once: bool) -> Iterator[tuple[int, Any]]:
     from distributed import KilledWorker
     from distributed import as_completed as arriving
 
+    sent = client.scatter(task, broadcast=True, hash=False) if once else task
+    futures = {client.submit(_call, sent, chunk, pure=False, priority=-k): k for k, chunk in enumerate(chunks)}
     for future in arriving(list(futures), loop=client.loop):  # type: ignore[no-untyped-call]
         k = futures.pop(future)
         try:
