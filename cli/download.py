@@ -8,11 +8,10 @@ from pathlib import Path
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.release.progress import size_text
 from spike4dgs.benchmark.release.scenes import WORKERS, check_revisions, open_release
 from spike4dgs.benchmark.release.scenes import download as fetch_scenes
 from spike4dgs.benchmark.release.selection import EVERYTHING, Selection
-from spike4dgs.benchmark.release.source import find_source
+from spike4dgs.benchmark.release.source import find_source, size_text
 from spike4dgs.cli.options import From
 from spike4dgs.leaderboard.tracks import track_scenes
 

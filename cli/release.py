@@ -14,7 +14,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.release.check import find_problems
 from spike4dgs.benchmark.release.index import Release, read_release
 from spike4dgs.benchmark.release.pack import pack as pack_scenes
-from spike4dgs.benchmark.release.progress import size_text
+from spike4dgs.benchmark.release.source import size_text
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 

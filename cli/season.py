@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import make_budget
+from spike4dgs.benchmark.method import choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.runs.run import Settings
@@ -16,11 +16,9 @@ from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.leaderboard.season import publish as public
 from spike4dgs.leaderboard.season import season_file
 from spike4dgs.leaderboard.season.check import checks
-from spike4dgs.leaderboard.season.fits import find_chosen, predict_all
 from spike4dgs.leaderboard.season.make import make_season
-from spike4dgs.leaderboard.season.opening import NAME, Seed
-from spike4dgs.leaderboard.season.results import read_results, score_season
-from spike4dgs.leaderboard.season.season_file import SEASONS, read_season, season_folder
+from spike4dgs.leaderboard.season.results import predict_all, read_results, score_season
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, SEASONS, Seed, read_season, season_folder
 
 
 def make(
@@ -116,8 +114,9 @@ def predict(
         seed: Seed of everything random.
         device: auto, cpu or cuda.
     """
-    chosen, on = find_chosen(methods, device)
-    failed = predict_all(open_scenes(scenes), chosen, Settings(out, seed, on, make_budget(budget)))
+    chosen = [get_method(name) for name in methods]
+    settings = Settings(out, seed, choose_device_for(chosen, device), make_budget(budget))
+    failed = predict_all(open_scenes(scenes), chosen, settings)
     print(f"predictions: {out / 'predictions'}, a folder for each method")
     return 1 if failed else 0
 
@@ -167,7 +166,7 @@ def reveal(number: Positional[int], *, secret: Path, seasons: Path = SEASONS) ->
         secret: Folder of `season make`.
         seasons: Folder of the public files.
     """
-    season, path = public.reveal(number, secret, seasons), season_folder(seasons, number) / NAME
+    season, path = public.reveal(number, secret, seasons), season_folder(seasons, number) / OPENING_NAME
     print(f"season {number}: seeds in {path}; `sha256sum {path}` gives the commitment {season.opening_sha256}")
     print(f"check it with `spike4dgs season check {number}`; `season publish` now writes the whole scenes")
     return 0

@@ -30,7 +30,7 @@ ORDER = {
     "method": "torch_state settings splat gaussians training_views motion supervision pose_refinement schedule models "
     "checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings viewing",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes hard_cases",
-    "leaderboard": "tracks entry truth_check rank verify refit submit page season",
+    "leaderboard": "tracks entry truth_check rank verify submit page season",
     "studies": "kit speed_error rendering images recorder_runs recorder saved_models oracle_truth oracle_methods "
     "oracle_ladder faults patterns poses spike_agreement",
 }

@@ -10,7 +10,7 @@ from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.files import sha256_file, write_json, write_text
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import SceneEntry, Shard
-from spike4dgs.benchmark.release.progress import size_text
+from spike4dgs.benchmark.release.source import size_text
 
 README = "README.md"
 NAMES = (README, croissant.NAME)

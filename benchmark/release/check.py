@@ -22,7 +22,7 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release import card, index
 from spike4dgs.benchmark.release.index import Release, parse_shard, read_release
 from spike4dgs.benchmark.release.pack import SUMS
-from spike4dgs.benchmark.release.progress import ByteProgress
+from spike4dgs.benchmark.release.source import ByteProgress
 from spike4dgs.benchmark.scene import manifest
 
 MOST_FILES = 100_000  # of a repository

@@ -39,8 +39,8 @@ from spike4dgs.benchmark.release.index import (
     read_release,
     release_json,
 )
-from spike4dgs.benchmark.release.progress import ByteProgress
 from spike4dgs.benchmark.release.shard import PlannedFile, find_shard, write_shard
+from spike4dgs.benchmark.release.source import ByteProgress
 from spike4dgs.benchmark.scene import manifest
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene

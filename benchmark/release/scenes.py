@@ -17,9 +17,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, sha256_file, write_json, writing
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import Member, Release, SceneEntry, Shard, parse_release, parse_shard
-from spike4dgs.benchmark.release.progress import ByteProgress, size_text
 from spike4dgs.benchmark.release.selection import Selection
-from spike4dgs.benchmark.release.source import Source, find_source
+from spike4dgs.benchmark.release.source import ByteProgress, Source, find_source, size_text
 from spike4dgs.benchmark.release.transfer import Wanted, transfer
 from spike4dgs.benchmark.scene import manifest
 from spike4dgs.benchmark.scene.scene import open_scene

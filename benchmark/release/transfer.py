@@ -17,8 +17,7 @@ from threading import Lock
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_bytes, writing
 from spike4dgs.benchmark.release.index import BLOCK, Member, Shard
-from spike4dgs.benchmark.release.progress import ByteProgress
-from spike4dgs.benchmark.release.source import Source, Stopped
+from spike4dgs.benchmark.release.source import ByteProgress, Source, Stopped
 
 PIECE = 16 << 20  # bytes of one request at most: each worker holds one piece in memory
 _GAP = 64 << 10  # bytes between wanted ones that are cheaper to read than a request of their own

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, sha256_file, writing
-from spike4dgs.benchmark.release.progress import ByteProgress, size_text
-from spike4dgs.benchmark.release.source import Source
+from spike4dgs.benchmark.release.source import ByteProgress, Source, size_text
 from spike4dgs.benchmark.release.transfer import PIECE
 from spike4dgs.benchmark.weights import WeightFile
 

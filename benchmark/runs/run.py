@@ -140,16 +140,17 @@ def _run_cells(
     if settings.workers == 1 and settings.scheduler is None:
         for k, place in enumerate(places):
             with display.cell(place.title) as shown:
-                yield k, _settle(place, _fit_here(place, shown), selection, shown)
+                yield k, _settle(place, fit_here(place, shown), selection, shown)
     else:
         with unordered_executor(settings.workers, settings.scheduler) as run:
             yield from _spread(places, settings.out, run, selection, display)
 
 
-def _fit_here(place: Place, shown: ShownCell) -> Failure | None:
+def fit_here(place: Place, shown: ShownCell) -> Failure | None:
+    """Fit in this process, or keep what is there; return the failure of the method, if it failed."""
     try:
         if place.is_done():
-            shown.note("predictions are there: scored from the files")
+            shown.note("predictions are there")
         else:
             run_job(place.job, place.folders, place.model, place.work, shown.progress, shown.note)
     except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
@@ -178,7 +179,7 @@ def _spread(
     for k, failure in settled.items():
         with display.cell(places[k].title) as shown:
             if failure is None:
-                shown.note("predictions are there: scored from the files")
+                shown.note("predictions are there")
             yield k, _settle(places[k], failure, selection, shown)
     sent = list(orders)
     for position, result in arrivals:

@@ -11,10 +11,16 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.scene.verify import verify_content
-from spike4dgs.leaderboard.season import opening
-from spike4dgs.leaderboard.season.opening import Seed, read_opening
 from spike4dgs.leaderboard.season.results import TABLE, read_result, read_results, result_path, table_text
-from spike4dgs.leaderboard.season.season_file import HiddenScene, Season, is_revealed, season_folder
+from spike4dgs.leaderboard.season.season_file import (
+    OPENING_NAME,
+    HiddenScene,
+    Season,
+    Seed,
+    is_revealed,
+    read_opening,
+    season_folder,
+)
 from spike4dgs.leaderboard.season.training_part import write_training_part
 from spike4dgs.leaderboard.verify import verify_record
 
@@ -41,7 +47,7 @@ def _check_seeds(season: Season, seasons: Path) -> str:
     """Check that opening.json is what was committed to, and that it names the season's scenes and code."""
     if not is_revealed(seasons, season.season):
         return f"not checked: the seeds, which are not revealed; the commitment is {season.opening_sha256}"
-    path = season_folder(seasons, season.season) / opening.NAME
+    path = season_folder(seasons, season.season) / OPENING_NAME
     found = read_opening(path, season.opening_sha256)
     expected = (season.season, [(s.id, s.world, s.variant, s.profile) for s in season.scenes], season.harness)
     stated = (found.season, [(s.scene, s.world, s.variant, s.profile) for s in found.scenes], found.harness)
@@ -92,7 +98,7 @@ def _check_scene(scene: HiddenScene, season: Season, seasons: Path, scenes: Path
 def _seed(scene: HiddenScene, season: Season, seasons: Path) -> Seed | None:
     """Return the revealed seed of a scene; None where it is not known, or not the one committed to."""
     try:
-        path = season_folder(seasons, season.season) / opening.NAME
+        path = season_folder(seasons, season.season) / OPENING_NAME
         return next((s for s in read_opening(path, season.opening_sha256).scenes if s.scene == scene.id), None)
     except UserError:  # of which `_check_seeds` tells
         return None

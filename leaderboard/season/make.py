@@ -11,15 +11,19 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.method import make_budget
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.leaderboard.season import opening
-from spike4dgs.leaderboard.season.opening import Opening, Seed, draw_opening, read_opening, write_secret
 from spike4dgs.leaderboard.season.season_file import (
+    OPENING_NAME,
     HiddenScene,
+    Opening,
     Season,
+    Seed,
+    draw_opening,
     is_announced,
+    read_opening,
     read_season,
     season_folder,
     write_season,
+    write_secret,
 )
 from spike4dgs.leaderboard.season.secret_folder import pack_file, pack_scene, scene_folder, training_folder
 from spike4dgs.leaderboard.season.training_part import write_training_part
@@ -88,7 +92,7 @@ def _opening(number: int, worlds: Sequence[str], profile: str, secret: Path) -> 
 
     Raises UserError where the one in SECRET is for another season, other scenes or other code.
     """
-    path = secret / opening.NAME
+    path = secret / OPENING_NAME
     if not path.exists():
         write_secret(secret, draw_opening(number, worlds, profile))
     drawn = read_opening(path)

@@ -9,10 +9,15 @@ from pathlib import Path
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, sha256_file, write_text
-from spike4dgs.leaderboard.season import opening
-from spike4dgs.leaderboard.season.opening import read_opening
 from spike4dgs.leaderboard.season.results import read_results
-from spike4dgs.leaderboard.season.season_file import Season, is_revealed, read_season, season_folder
+from spike4dgs.leaderboard.season.season_file import (
+    OPENING_NAME,
+    Season,
+    is_revealed,
+    read_opening,
+    read_season,
+    season_folder,
+)
 from spike4dgs.leaderboard.season.secret_folder import pack_file
 
 
@@ -50,7 +55,7 @@ def reveal(number: int, secret: Path, seasons: Path) -> Season:
     if not read_results(seasons, season):
         fix = "score the submissions first: no result counts after the reveal"
         raise problem(season_folder(seasons, number), "results", "none", fix)
-    path = season_folder(seasons, number) / opening.NAME
-    found = read_opening(secret / opening.NAME, season.opening_sha256)
+    path = season_folder(seasons, number) / OPENING_NAME
+    found = read_opening(secret / OPENING_NAME, season.opening_sha256)
     write_text(path, found.text)
     return season

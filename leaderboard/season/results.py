@@ -6,20 +6,46 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, read_json, write_json, write_text
+from spike4dgs.benchmark.method import Method, choose_device_for, get_method
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
-from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.runs.run import Place, Settings, fit_here
 from spike4dgs.benchmark.runs.score import score_predictions
+from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import check_no_oracle
-from spike4dgs.leaderboard.season.fits import find_chosen, predict_all
 from spike4dgs.leaderboard.season.season_file import Season, is_revealed, read_season, season_folder
 from spike4dgs.leaderboard.season.secret_folder import open_committed, runs_folder
+
+
+def predict_all(scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings) -> set[str]:
+    """Fit every method on every scene and write predictions, or keep those that are there. Nothing is scored.
+
+    Return the names of the methods that failed on a scene; the traceback is in a log file.
+    """
+    failed = set()
+    with (
+        locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
+        RunDisplay(make_console(), len(scenes) * len(methods)) as display,
+    ):
+        for method, scene in product(methods, scenes):
+            place = Place(Job(method, scene, settings.seed, settings.device, settings.budget), settings.out)
+            with display.cell(f"{method.name} on {scene.id}") as shown:
+                if failure := fit_here(place, shown):
+                    write_text(place.log, failure.traceback)
+                    shown.note(f"{failure.status}: {failure.reason} (see {place.log})")
+                    failed.add(method.name)
+    return failed
+
 
 SCHEMA = "spike4dgs-season-result/1"
 TABLE = "table.md"
@@ -157,7 +183,8 @@ def score_season(
         scenes = open_committed(secret, season)
         submitted = [(PREDICTIONS, folder) for folder in predictions]
         if methods:
-            chosen, on = find_chosen(methods, device)
+            chosen = [get_method(name) for name in methods]
+            on = choose_device_for(chosen, device)
             settings = Settings(runs_folder(secret), season.fit_seed, on, season.fit_budget)
             failed = predict_all(open_committed(secret, season, training=True), chosen, settings)
             refused += [f"{name}: not fitted, see its log in {settings.out / 'logs'}" for name in sorted(failed)]

@@ -9,7 +9,7 @@ from typing import Any
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.cli.season import score
-from spike4dgs.leaderboard.season.fits import predict_all
+from spike4dgs.leaderboard.season.results import predict_all
 from spike4dgs.leaderboard.season.season_file import Season, read_season
 from spike4dgs.leaderboard.season.secret_folder import open_committed
 

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 
-from spike4dgs.leaderboard.page.draws import draw_weights, hashed
+from spike4dgs.leaderboard.page.intervals import draw_weights, hashed
 
 
 def lowbias32(x: int) -> int:

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.leaderboard.page.intervals import GRID, LEVEL, MOST_UNITS, compare, resampled_means, widened_values
+from spike4dgs.leaderboard.page.intervals import (
+    GRID,
+    LEVEL,
+    MOST_UNITS,
+    compare,
+    resampled_means,
+    widened_values,
+)
 
 
 def scored(values: Float64) -> list[list[Float64]]:

@@ -15,8 +15,8 @@ from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli.season import check, reveal
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
-from spike4dgs.leaderboard.season.opening import NAME, draw_opening, read_opening
 from spike4dgs.leaderboard.season.results import write_table
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, draw_opening, read_opening
 
 SCENE = "car-9003-tiny"
 
@@ -55,7 +55,7 @@ def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureF
     assert checked(over, scenes=None, predictions=None) == 0
     out = capsys.readouterr().out
     assert out.count("ok: ") == 2 and out.count("not checked: ") == 6
-    for seed in read_opening(over.public / NAME).scenes:
+    for seed in read_opening(over.public / OPENING_NAME).scenes:
         assert f"spike4dgs make-dataset {seed.world} --profile tiny --variant 9003 --seed {seed.seed} --out" in out
 
 
@@ -70,14 +70,14 @@ def test_before_the_reveal_nothing_secret_is_shown(made: Made, capsys: pytest.Ca
     assert checked(made, scenes=None) == 0
     out = capsys.readouterr().out
     assert made.season.opening_sha256 in out and "ok: " not in out
-    assert not [s for s in read_opening(made.secret / NAME).scenes if s.seed in out]
+    assert not [s for s in read_opening(made.secret / OPENING_NAME).scenes if s.seed in out]
 
 
 def test_a_scene_made_again_from_its_seed_is_the_committed_one(
     over: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     render_fakes(monkeypatch)
-    for seed in read_opening(over.public / NAME).scenes:
+    for seed in read_opening(over.public / OPENING_NAME).scenes:
         settings = SceneSettings(seed.profile, int(seed.seed), seed.variant)
         make_dataset([settings.job(seed.world)], over.root / "again")
     assert checked(over, scenes=over.root / "again") == 0
@@ -88,15 +88,15 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
 
 
 def seed_text(over: Made) -> None:
-    change_json(over.public / NAME, lambda d: d["scenes"][0].update(seed="1"))
+    change_json(over.public / OPENING_NAME, lambda d: d["scenes"][0].update(seed="1"))
 
 
 def salt(over: Made) -> None:
-    change_json(over.public / NAME, lambda d: d.update(salt="0" * 64))
+    change_json(over.public / OPENING_NAME, lambda d: d.update(salt="0" * 64))
 
 
 def other_opening(over: Made) -> None:
-    (over.public / NAME).write_text(draw_opening(NUMBER, ("car", "turntable"), "tiny").text)
+    (over.public / OPENING_NAME).write_text(draw_opening(NUMBER, ("car", "turntable"), "tiny").text)
 
 
 def committed_world(over: Made) -> None:

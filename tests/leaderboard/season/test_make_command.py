@@ -15,7 +15,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import make
 from spike4dgs.generators.make_dataset import make_dataset
 from spike4dgs.generators.profiles import Job
-from spike4dgs.leaderboard.season.opening import NAME, read_opening
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, read_opening
 from spike4dgs.leaderboard.season.secret_folder import pack_file, scene_folder, training_folder
 
 
@@ -25,8 +25,8 @@ def command(made: Made, worlds: tuple[str, ...] = WORLDS, number: int = NUMBER, 
 
 
 def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
-    season, drawn = made.season, read_opening(made.secret / NAME)
-    assert season.opening_sha256 == sha256_file(made.secret / NAME)
+    season, drawn = made.season, read_opening(made.secret / OPENING_NAME)
+    assert season.opening_sha256 == sha256_file(made.secret / OPENING_NAME)
     assert [s.id for s in season.scenes] == ["car-9003-tiny", "turntable-9003-tiny"] == [s.scene for s in drawn.scenes]
     for scene, seed in zip(season.scenes, drawn.scenes, strict=True):
         whole = open_scene(scene_folder(made.secret, scene.id))
@@ -43,7 +43,7 @@ def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
 
 
 def test_no_secret_is_in_the_public_folder(made: Made) -> None:
-    drawn, public = read_opening(made.secret / NAME), b"".join(files(made.seasons).values()).decode()
+    drawn, public = read_opening(made.secret / OPENING_NAME), b"".join(files(made.seasons).values()).decode()
     assert list(files(made.seasons)) == [f"{NUMBER}/season.json"]
     for secret in (drawn.salt, *(s.seed for s in drawn.scenes)):
         assert secret not in public and f"{int(secret, 16 if secret == drawn.salt else 10):x}" not in public
@@ -64,12 +64,12 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
     given: dict[str, Any] = {"worlds": WORLDS, "profile": "tiny", "secret": made.secret, "seasons": made.seasons}
     with pytest.raises(KeyboardInterrupt):
         make(NUMBER, **given)
-    drawn = (made.secret / NAME).read_bytes()
+    drawn = (made.secret / OPENING_NAME).read_bytes()
     assert not made.seasons.exists(), "nothing is committed to before all is made"
     assert make(NUMBER, **given) == 0
-    assert (made.secret / NAME).read_bytes() == drawn
+    assert (made.secret / OPENING_NAME).read_bytes() == drawn
     assert rendered == ["car", "died", "car", "turntable"]
-    assert made.season.opening_sha256 == sha256_file(made.secret / NAME)
+    assert made.season.opening_sha256 == sha256_file(made.secret / OPENING_NAME)
 
 
 def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,7 +100,7 @@ def test_other_arguments_are_refused(options: dict[str, Any], message: str, made
 
 
 def test_another_version_of_the_code_does_not_finish_a_season(made: Made) -> None:
-    path = made.secret / NAME
+    path = made.secret / OPENING_NAME
     data = json.loads(path.read_text())
     data["harness"]["commit"] = "0" * 40
     path.write_text(json.dumps(data, indent=2, sort_keys=True) + "\n")

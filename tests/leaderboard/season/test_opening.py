@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.leaderboard.season.opening import NAME, Opening, draw_opening, read_opening, write_secret
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, Opening, draw_opening, read_opening, write_secret
 
 OPENING = draw_opening(3, ("car", "turntable"), "tiny")
 TEXT = OPENING.text.encode()
@@ -18,7 +18,7 @@ TEXT = OPENING.text.encode()
 
 def test_the_commitment_is_the_hash_of_the_file(tmp_path: Path) -> None:
     write_secret(tmp_path / "secret", OPENING)
-    path = tmp_path / "secret" / NAME
+    path = tmp_path / "secret" / OPENING_NAME
     assert hashlib.sha256(path.read_bytes()).hexdigest() == OPENING.sha256
     assert read_opening(path, OPENING.sha256) == OPENING
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -50,20 +50,20 @@ def test_the_commitment_depends_on_everything_in_it() -> None:
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_changed_byte_is_refused(tmp_path: Path, position: int, byte: int) -> None:
     changed = TEXT[:position] + bytes([byte]) + TEXT[position + 1 :]
-    (tmp_path / NAME).write_bytes(changed)
+    (tmp_path / OPENING_NAME).write_bytes(changed)
     if changed == TEXT:
-        assert read_opening(tmp_path / NAME, OPENING.sha256) == OPENING
+        assert read_opening(tmp_path / OPENING_NAME, OPENING.sha256) == OPENING
     else:
         with pytest.raises(UserError):
-            read_opening(tmp_path / NAME, OPENING.sha256)
+            read_opening(tmp_path / OPENING_NAME, OPENING.sha256)
 
 
 @given(st.integers(0, len(TEXT)), st.binary(min_size=1, max_size=3))
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_added_byte_is_refused(tmp_path: Path, position: int, more: bytes) -> None:
-    (tmp_path / NAME).write_bytes(TEXT[:position] + more + TEXT[position:])
+    (tmp_path / OPENING_NAME).write_bytes(TEXT[:position] + more + TEXT[position:])
     with pytest.raises(UserError):
-        read_opening(tmp_path / NAME, OPENING.sha256)
+        read_opening(tmp_path / OPENING_NAME, OPENING.sha256)
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,9 @@ def test_any_added_byte_is_refused(tmp_path: Path, position: int, more: bytes) -
 def test_a_text_with_two_meanings_cannot_be_committed_to(other: str, tmp_path: Path) -> None:
     """Even its own hash does not open a text of another form: a reader may take the first of two equal keys."""
     assert other != OPENING.text
-    (tmp_path / NAME).write_text(other)
+    (tmp_path / OPENING_NAME).write_text(other)
     with pytest.raises(UserError):
-        read_opening(tmp_path / NAME, hashlib.sha256(other.encode()).hexdigest())
+        read_opening(tmp_path / OPENING_NAME, hashlib.sha256(other.encode()).hexdigest())
 
 
 @pytest.mark.parametrize(
@@ -92,6 +92,6 @@ def test_a_text_with_two_meanings_cannot_be_committed_to(other: str, tmp_path: P
 )
 def test_a_weak_opening_is_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     weak = Opening(**{**vars(OPENING), **change})  # type: ignore[arg-type]
-    (tmp_path / NAME).write_text(weak.text)
+    (tmp_path / OPENING_NAME).write_text(weak.text)
     with pytest.raises(UserError, match=message):
-        read_opening(tmp_path / NAME)
+        read_opening(tmp_path / OPENING_NAME)

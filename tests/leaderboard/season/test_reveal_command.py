@@ -10,7 +10,7 @@ from made_season import NUMBER, Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file, write_json
 from spike4dgs.cli.season import publish, reveal
-from spike4dgs.leaderboard.season.opening import NAME, draw_opening, write_secret
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, draw_opening, write_secret
 
 
 def closing(made: Made, days: int) -> None:
@@ -22,14 +22,14 @@ def closing(made: Made, days: int) -> None:
 def test_the_revealed_file_is_what_was_committed_to(scored: Made) -> None:
     closing(scored, -1)
     assert reveal(NUMBER, secret=scored.secret, seasons=scored.seasons) == 0
-    assert (scored.public / NAME).read_bytes() == (scored.secret / NAME).read_bytes()
-    assert sha256_file(scored.public / NAME) == scored.season.opening_sha256
+    assert (scored.public / OPENING_NAME).read_bytes() == (scored.secret / OPENING_NAME).read_bytes()
+    assert sha256_file(scored.public / OPENING_NAME) == scored.season.opening_sha256
 
 
 def test_nothing_is_revealed_before_scores(made: Made) -> None:
     with pytest.raises(UserError, match="expected results, found none; score the submissions first"):
         reveal(NUMBER, secret=made.secret, seasons=made.seasons)
-    assert not (made.public / NAME).exists()
+    assert not (made.public / OPENING_NAME).exists()
 
 
 @pytest.mark.parametrize("days", [0, 3])
@@ -37,7 +37,7 @@ def test_nothing_is_revealed_before_the_closing_day_is_over(days: int, scored: M
     closing(scored, days)
     with pytest.raises(UserError, match="expected a day after"):
         reveal(NUMBER, secret=scored.secret, seasons=scored.seasons)
-    assert not (scored.public / NAME).exists()
+    assert not (scored.public / OPENING_NAME).exists()
 
 
 def test_another_secret_is_not_revealed(scored: Made) -> None:

@@ -17,8 +17,7 @@ from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import reveal, score
-from spike4dgs.leaderboard.season.fits import predict_all
-from spike4dgs.leaderboard.season.results import read_results
+from spike4dgs.leaderboard.season.results import predict_all, read_results
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
 

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +12,15 @@ from fake_renderer import files
 from made_season import Made
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.held_out import has_truth
 from spike4dgs.benchmark.runs.score import open_for, score_scene
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.leaderboard.season.opening import NAME, read_opening
-from spike4dgs.leaderboard.season.secret_folder import scene_folder, training_folder
+from spike4dgs.leaderboard.season.season_file import OPENING_NAME, read_opening
+from spike4dgs.leaderboard.season.secret_folder import pack_scene, scene_folder, training_folder
 from spike4dgs.leaderboard.season.training_part import training_files, write_training_part
 
 SCENE = "car-9003-tiny"
@@ -53,7 +56,7 @@ def test_no_byte_of_the_truth_is_in_it(made: Made, whole: Scene, part: Scene) ->
 
 
 def test_the_seed_is_not_in_it(made: Made, part: Scene) -> None:
-    drawn = read_opening(made.secret / NAME)
+    drawn = read_opening(made.secret / OPENING_NAME)
     everything = b"".join(files(training_folder(made.secret, SCENE)).values())
     for seed in drawn.scenes:
         assert seed.seed.encode() not in everything
@@ -123,3 +126,29 @@ def test_other_sensors_of_training_cameras_are_in_it(whole: Scene) -> None:
     names = training_files(open_scene(whole.root))
     assert "conventional/cam_00/000000.png" in names and "conventional/cam_04/000000.png" not in names
     assert {n.split("/")[0] for n in names} == {"spikes", "calibration", "conventional", "events"}
+
+
+def test_a_pack_unpacks_to_the_scene(small_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(small_scene)
+    digest = pack_scene(scene, tmp_path / "s.tar")
+    assert digest == sha256_file(tmp_path / "s.tar")
+    subprocess.run(["tar", "xf", "s.tar"], cwd=tmp_path, check=True)
+    assert files(tmp_path / scene.id) == files(small_scene)
+
+
+def test_equal_scenes_have_equal_packs(small_scene: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(small_scene, tmp_path / "copy"))
+    for path in copy.rglob("*"):
+        os.utime(path, (1, 1))
+        path.chmod(0o700)
+    (copy / ".hidden").write_text("not of the scene")
+    packs = [pack_scene(open_scene(root), tmp_path / f"{root.name}.tar") for root in (small_scene, copy)]
+    assert packs[0] == packs[1]
+
+
+def test_a_damaged_file_is_not_packed(small_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(small_scene)
+    (small_scene / "spikes/cam_01.dat").write_bytes(b"1")
+    with pytest.raises(UserError, match="cam_01.dat"):
+        pack_scene(scene, tmp_path / "s.tar")
+    assert not (tmp_path / "s.tar").exists()
