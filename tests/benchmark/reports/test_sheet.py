@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,8 +19,9 @@ from pypdf import PdfReader
 from sheets import Results, write_results
 
 from spike4dgs.benchmark.reports.error_map import OFF_SCALE, SCALES, absolute_error
-from spike4dgs.benchmark.reports.panels import Panels, make_panels
+from spike4dgs.benchmark.reports.panels import SMALLEST, Panels, bounds, crops, make_panels
 from spike4dgs.benchmark.reports.sheet import make_sheet, write_sheet
+from spike4dgs.benchmark.reports.sheet_video import FPS, WIDEST, Layout, make_layout, write_sheet_video
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 
 NOISE = {"worse": 0.15, "spk2img+colmap+spacetime-with-a-very-long-name+again": 0.02, "fine": 0.003}
@@ -134,3 +138,94 @@ def test_a_sheet_of_many_methods_grows(tmp_path: Path) -> None:
     rows = sorted({round(a.bbox.y0) for a in figure.axes})
     assert len(rows) == 15 and min(np.diff(rows)) > 150, "each as large as in a small sheet"
     test_nothing_is_cut_off_and_no_text_lies_on_another(figure)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.floats(0.0005, 0.2))
+def test_every_crop_contains_its_mask_and_all_have_one_size(seed: int, count: int, density: float) -> None:
+    rng = np.random.default_rng(seed)
+    height, width = (int(v) for v in rng.integers(8, 90, 2))
+    masks = [rng.random((height, width)) < density * rng.integers(0, 2) for _ in range(count)]
+    found = crops(masks)
+    assert [box is None for box in found] == [not mask.any() for mask in masks]
+    boxes = [box for box in found if box]
+    assert len({(box.width, box.height) for box in boxes}) <= 1
+    for mask, box in zip(masks, found, strict=True):
+        if box:
+            assert box.of(mask).sum() == mask.sum() and box.of(mask).shape == (box.height, box.width)
+            assert box.x >= 0 and box.y >= 0 and box.x + box.width <= width and box.y + box.height <= height
+
+
+def test_a_crop_stands_still_where_the_motion_is_small_and_follows_where_it_is_large() -> None:
+    def clip(step: int) -> list[np.ndarray]:
+        masks = [np.zeros((80, 400), bool) for _ in range(4)]
+        for k, mask in enumerate(masks):
+            mask[20:50, 10 + step * k : 60 + step * k] = True
+        return masks
+
+    still, following = crops(clip(2)), crops(clip(90))
+    assert len(set(still)) == 1 and still[0] is not None and still[0].width == round(56 * 1.3)
+    assert len(set(following)) == 4 and following[0] is not None and following[0].width == 65, "50 and its margins"
+    # The left edge is 7.5 pixels before what moves, but for the first, which the image's edge stops.
+    assert [box.x for box in following if box] == [3, 93, 183, 273]
+
+
+def test_crops_hold_some_context_and_end_with_the_image() -> None:
+    masks = [np.zeros((60, 90), bool) for _ in range(3)]
+    masks[0][5:15, 0:30] = masks[1][30:60, 70:80] = True
+    found = crops(masks)
+    assert found[2] is None and found[0] is not None and found[0][2:] == (39, 39)
+    small = np.zeros((60, 90), bool)
+    small[10, 10] = True
+    assert crops([small])[0] == (0, 0, SMALLEST, SMALLEST)
+    assert bounds(small) == (10, 10, 1, 1) and bounds(np.zeros((2, 2), bool)) is None
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    video, found = cv2.VideoCapture(str(path)), []
+    while (read := video.read())[0]:
+        found.append(read[1][:, :, ::-1].astype(int))
+    assert video.get(cv2.CAP_PROP_FPS) == FPS
+    return found
+
+
+def test_frames_decode_and_are_the_sheets_panels(tmp_path: Path) -> None:
+    results = write_results(tmp_path, {"worse": 0.15, "fine": 0.003}, {"bad": "no luck"})
+    write_sheet_video(tmp_path / "v.mp4", results.scene, results.folders, results.records)
+    panels = make_panels(results.scene, results.folders, results.records)
+    layout, found = make_layout(panels), frames(tmp_path / "v.mp4")
+    assert len(found) == 3 and found[0].shape[1::-1] == layout.size and layout.cells == 3, "without the failed one"
+    names = [None, "worse", "fine"]
+    for k, frame in enumerate(found):
+        for cell, name in enumerate(names):
+            wanted = {n: panels.image(n, k).repeat(layout.zoom, 0).repeat(layout.zoom, 1) for n in names}
+            difference = {n: np.abs(frame[layout.image(cell)] - w[..., None]).mean() for n, w in wanted.items()}
+            # Video is lossy; the fine method differs from the truth by less than that.
+            assert difference[name] < 4
+            assert min(difference["worse" if name != "worse" else n] for n in names if n != name) > 6
+            if name is not None:
+                errors = panels.errors(name, k).repeat(layout.zoom, 0).repeat(layout.zoom, 1)
+                shown = frame[layout.errors(cell)]
+                assert np.corrcoef(shown.ravel(), errors.ravel())[0, 1] > 0.9  # colours have half the resolution
+                other = panels.errors("worse" if name == "fine" else "fine", k).repeat(layout.zoom, 0)
+                assert np.corrcoef(shown.ravel(), other.repeat(layout.zoom, 1).ravel())[0, 1] < 0.5
+    outlined = found[0][layout.errors(0)]
+    assert (outlined[..., 2] - outlined[..., 0] > 60).any(), "the crop's outline in the whole picture"
+    assert np.abs(found[0][layout.image(0)] - found[2][layout.image(0)]).mean() > 1, "it moves"
+
+
+def test_panels_do_not_overlap_and_wrap_into_rows() -> None:
+    layout = Layout((230, 120), 2, 3, 5, 14)
+    used = np.zeros(layout.size[::-1], int)
+    for cell in range(14):
+        used[layout.image(cell)] += 1
+        used[layout.errors(cell)] += 1
+        x, y = layout.corner(cell)
+        assert layout.image(cell)[0].start - y == 54, "room for two lines of a name and its scale"
+    assert used.max() == 1 and used.sum() == 14 * 2 * 230 * 120
+    assert layout.size[0] <= WIDEST and not any(side % 2 for side in layout.size)
+
+
+def test_many_methods_stay_within_the_widest_frame(tmp_path: Path) -> None:
+    results = write_results(tmp_path, {f"m{i}": 0.1 for i in range(13)})
+    layout = make_layout(make_panels(results.scene, results.folders, results.records))
+    assert layout.size[0] <= WIDEST and layout.columns == 5 and layout.cells == 14
