@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
-from spike4dgs.generators.recorder.rig_calibration import calibrate_rig as rig_command
+from spike4dgs.generators.recorder.rig_calibration import array_calibration
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Detections,
     Freedom,
@@ -93,7 +93,7 @@ def test_the_adjustment_is_the_least_squares_solution_and_its_deviations_are_tho
 def test_poses_come_out_within_their_deviations(adjusted):
     cameras, _, rig, reference, found = adjusted
     size = (WIDTH, HEIGHT)
-    cameras_found = rig_command.levelled(found.rig, [c.id for c in cameras], size)
+    cameras_found = array_calibration.levelled(found.rig, [c.id for c in cameras], size)
     errors = pose_errors(cameras_found, cameras)
     assert errors.translation_m.max() < 4 * found.center_m.max() < 0.01
     assert errors.rotation_deg.max() < 4 * found.turn_deg.max() < 1.0
@@ -122,7 +122,7 @@ def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
     cost = np.sum(residuals(np.zeros(3 * n)) ** 2)
     solution = least_squares(residuals, np.zeros(3 * n), x_scale=np.tile([10.0, 0.1, 0.1], n), xtol=1e-14, ftol=1e-14)
     assert cost <= 2 * solution.cost * (1 + 1e-8)
-    for camera, true in zip(rig_command.levelled(at, [c.id for c in cameras], (WIDTH, HEIGHT)), cameras, strict=True):
+    for camera, true in zip(array_calibration.levelled(at, [c.id for c in cameras], (WIDTH, HEIGHT)), cameras, strict=True):
         assert camera.distortion[2:] == (0.0, 0.0, 0.0)
         corners = np.array([[10.0, 10], [150, 10], [10, 90], [150, 90], [80, 50]])
         rays = camera.normalized(corners) - camera.normalized(corners[-1:])
@@ -172,6 +172,6 @@ def test_an_array_that_no_pinholes_explain_is_refused():
     late = detections.uv.copy()
     late[detections.camera == 1] += 8 * np.sin(detections.view[detections.camera == 1])[:, None, None]  # another clock
     with pytest.raises(UserError, match="reprojection error below 1 px"):
-        rig_command.calibrate_array(
+        array_calibration.calibrate_array(
             replace(detections, uv=late), BOARD, [c.id for c in cameras], (WIDTH, HEIGHT), Freedom()
         )
