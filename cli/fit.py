@@ -1,53 +1,16 @@
-"""`fit`: a model of a recording, with what one wants to see of it.
-
-OUT/model.safetensors   the model, for `view` and `render`
-OUT/sheet.png           training views: image from spikes, render, error map
-OUT/video.mp4           the clip in slow motion along an orbit
-OUT/report.html         cameras, rates, poses, bad pixels, residuals, held-out cameras, times, versions
-OUT/predictions/        the held-out cameras, rendered, for `score`
-OUT/work/KEY/           the checkpoint of an unfinished fit
-"""
+"""`fit`: a model of a recording, with what one wants to see of it."""
 
 from __future__ import annotations
 
-import shutil
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.baselines.images.tfp import TFP
-from spike4dgs.benchmark.environment import command_line, device_type, environment, harness, utc_now
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, sha256_json
-from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, Method, choose_device_for, get_method, make_budget
-from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.reports.console import make_console
-from spike4dgs.benchmark.reports.video import video_writer
-from spike4dgs.benchmark.runs.cell import timed_fit
-from spike4dgs.benchmark.runs.display import RunDisplay
-from spike4dgs.benchmark.runs.predictions import MethodInfo
-from spike4dgs.benchmark.runs.provenance import Provenance, Savable
-from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.models.saved_model import SavedModel, load_model
-from spike4dgs.method.recordings.comparison import compare, mean_residual, residuals, write_sheet
-from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores, held_out_views, judge_held_out
-from spike4dgs.method.recordings.recording import Recording, open_recording
-from spike4dgs.method.recordings.report_page import Report, write_report
-from spike4dgs.method.recordings.self_calibrated import Source, self_calibrated
-from spike4dgs.method.viewing.camera_paths import orbit, resized
-from spike4dgs.method.viewing.render_video import frame_times, render_frames
-
-MODEL, SHEET, VIDEO, REPORT = "model.safetensors", "sheet.png", "video.mp4", "report.html"
-PREDICTIONS = "predictions"
-VIDEO_S, FPS, SCALE = 10.0, 30.0, 2.0  # of the video: its length, and its size as a multiple of the training views'
-SLOW_FRAME_S, SLOW_FPS = 0.5, 3.0  # a model that takes longer for a frame, such as a radiance field, gets fewer
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
+from spike4dgs.cli.options import COMPUTE, Compute
+from spike4dgs.method.recordings.fit import fit_recording
+from spike4dgs.method.recordings.self_calibrated import Source
 
 
 def fit(
@@ -56,8 +19,7 @@ def fit(
     method: str = "spike4dgs-x",
     out: Path = Path("runs/fit"),
     budget: str = DEFAULT_BUDGET,
-    seed: int = 0,
-    device: str = "auto",
+    compute: OmitArgPrefixes[Compute] = COMPUTE,
     poses: Source = "auto",
     clocks: Source = "auto",
 ) -> int:
@@ -73,165 +35,10 @@ def fit(
         method: Method by name.
         out: Folder for model.safetensors, sheet.png, video.mp4 and report.html.
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
-        seed: Seed of everything random.
-        device: auto, cpu or cuda.
         poses: auto (given ones are adjusted where features say that they are wrong) or given.
         clocks: auto (the cameras' clocks are estimated from what moves, and used where they differ) or given.
     """
-    wanted, steps = get_method(method), make_budget(budget)
-    on = choose_device_for([wanted], device)
-    console, times = make_console(), dict[str, float]()
-    with locked(out / ".lock", out, "a folder that no other fit uses"):
-        with _timed(times, "opening"):
-            recording = open_recording(scene, seed)
-        with _timed(times, "poses and clocks"):
-            own_poses = isinstance(wanted, RecipeMethod) and wanted.initialization.estimates_poses
-            checked = self_calibrated(recording, "given" if own_poses else poses, clocks, seed)
-            recording = checked.recording
-        origin = _poses(recording, wanted, "poses" in checked.changed)
-        for text in (f"poses: {origin}", *recording.notes):
-            _say(console, text)
-        request = FitRequest(steps, on, seed)
-        saved = _fitted(wanted, recording, request, out, console, checked.changed)
-        times["fit"] = saved.provenance.fit_seconds
-        cameras = saved.provenance.cameras
-        with _timed(times, "sheet"):
-            found = compare(wanted, saved.model, recording.training, cameras, on, TFP)
-            write_sheet(out / SHEET, found, f"{saved.title}: training views, residual {mean_residual(found):.2f} dB")
-        with _timed(times, "video"):
-            slow_motion = _write_video(out / VIDEO, saved)
-        judged = None
-        if recording.scene and recording.held_out:
-            with _timed(times, "held-out cameras"):
-                views = held_out_views(recording.scene, recording.training, checked.changed, seed)
-                judged = judge_held_out(saved, recording.scene, views, out / PREDICTIONS)
-        report = Report(
-            about=saved.provenance,
-            source=scene,
-            poses=origin,
-            given=checked.given,
-            held_out=recording.held_out,
-            judged=judged,
-            notes=(*recording.notes, f"the video is {slow_motion:.0f} times slower than the world"),
-            facts=recording.facts,
-            columns=checked.columns,
-            residuals=residuals(found),
-            maker=found.maker,
-            seconds=times,
-            model_mb=(out / MODEL).stat().st_size / 1e6,
-            environment=environment(on),
-            command=command_line(),
-            video=VIDEO,
-        )
-        write_report(out / REPORT, report, out / SHEET)
-    _say(
-        console,
-        f"fit: {times['fit']:.1f} s; residual of the training views {mean_residual(found):.2f} dB (not a score)",
-    )
-    if judged:
-        _say(console, f"held-out {', '.join(recording.held_out)} by their own spikes: {_scores(judged)}")
-    _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
+    wanted = get_method(method)
+    request = FitRequest(make_budget(budget), choose_device_for([wanted], compute.device), compute.seed)
+    fit_recording(scene, wanted, out, request, TFP, poses=poses, clocks=clocks)
     return 0
-
-
-def _scores(judged: HeldOutScores) -> str:
-    """Return the scores of the held-out cameras in a line, or why there are none."""
-    known = [m for m in SHOWN if judged.mean[m] is not None]
-    values = ", ".join(f"{m} {METRICS[m].format(judged.mean[m])}" for m in known)
-    return values or f"no score ({judged.notes[SHOWN[0]]})"
-
-
-def _poses(recording: Recording, method: Method, adjusted: bool) -> str:
-    """Return in words where the poses of a fit come from."""
-    if isinstance(method, RecipeMethod) and method.initialization.estimates_poses:
-        start = method.recipe.initialization
-        return f"estimated by the method ({start}), then moved to those {recording.poses}"
-    return f"{recording.poses}, then adjusted" if adjusted else recording.poses
-
-
-def _fitted(
-    method: Method, recording: Recording, request: FitRequest, out: Path, console: Console, changed: tuple[str, ...]
-) -> SavedModel:
-    """Return the fitted model, which OUT then holds: that of an earlier run, or a new one.
-
-    Raises UserError where OUT holds a model of another fit, and for a method whose models cannot be saved.
-    """
-    path, about = out / MODEL, _provenance(method, recording, request, changed)
-    if path.exists():
-        saved = load_model(path, request.device)
-        if _key(saved.provenance) != _key(about):
-            found = f"{saved.title}, budget {saved.provenance.budget}, seed {saved.provenance.method['seed']}"
-            fix = "choose another --out, or remove it"
-            raise problem(path, "no model, or one of this recording, method, budget and seed", found, fix)
-        _say(console, "the model is there: only sheet, video and report are made again")
-        return saved
-    work = out / "work" / _key(about)[:16]
-    with RunDisplay(console, 1) as display, display.cell(f"{about.name} on {about.scene}") as shown:
-        watched = replace(request, progress=shown.progress)
-        model, fit_seconds = timed_fit(method, recording.training, watched, work, shown.note)
-    if not isinstance(model, Savable):
-        raise problem(f"method {method.name}", "a method whose models can be saved", "none", "choose another --method")
-    cameras = _fitted_cameras(model, about.cameras)
-    about = replace(about, cameras=cameras, fit_seconds=fit_seconds, created=utc_now())
-    model.save(path, about)
-    shutil.rmtree(out / "work")
-    return SavedModel(model, about)
-
-
-def _fitted_cameras(model: Any, given: tuple[Camera, ...]) -> tuple[Camera, ...]:
-    """Return the training cameras as the fit left them, where the model knows them."""
-    return getattr(model, "cameras", ()) or given
-
-
-def _provenance(method: Method, recording: Recording, request: FitRequest, changed: tuple[str, ...]) -> Provenance:
-    """Return what is known of a fit before it; `changed` is what of the recording was estimated anew."""
-    version = getattr(method, "version", None) or harness()["version"]
-    trained_on = tuple(getattr(method, "trained_on", ()))
-    scene = recording.training
-    params = {**method.params, **({"estimated": list(changed)} if changed else {})}
-    return Provenance(
-        method=MethodInfo(method.name, version, params, request.seed, trained_on).as_dict(),
-        scene=scene.id,
-        scene_revision=scene.revision,
-        split=recording.split,
-        cameras=scene.cameras,
-        rate_hz=scene.rate_hz,
-        n_ticks=scene.n_ticks,
-        radiance_gain=scene.radiance_gain,
-        budget=request.budget.label,
-        device=request.device,
-        fit_seconds=0.0,
-        harness=harness(),
-        created=utc_now(),
-    )
-
-
-def _key(about: Provenance) -> str:
-    """Return the content key of a fit: everything that decides what comes out."""
-    names = "method", "scene", "scene_revision", "split", "budget"
-    return sha256_json({**{n: getattr(about, n) for n in names}, "device": device_type(about.device)})
-
-
-def _write_video(path: Path, saved: SavedModel) -> float:
-    """Write the clip along an orbit, and return how many times slower than the world it is."""
-    about, view = saved.provenance, orbit(saved.provenance.cameras)
-    slow_motion = VIDEO_S * 1e6 / about.duration_us
-    first = resized(view(0.0), SCALE)
-    start = time.perf_counter()
-    saved.model.render(first, 0.0)
-    fps = FPS if time.perf_counter() - start < SLOW_FRAME_S else SLOW_FPS
-    with video_writer(path, (first.width, first.height), fps) as write:
-        for image in render_frames(saved, view, frame_times(about.duration_us, slow_motion, fps), SCALE):
-            write(image)
-    return slow_motion
-
-
-@contextmanager
-def _timed(times: dict[str, float], step: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    times[step] = time.perf_counter() - start
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False)

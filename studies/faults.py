@@ -13,21 +13,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.environment import command_line, environment, harness
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.method import FitRequest, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
 from spike4dgs.generators.recorder.record import record
+from spike4dgs.method.recordings.fit import PREDICTIONS, fit_recording
 from spike4dgs.studies.kit.timing import markdown, write_csv
 
 FLAT_RADIANCE = 0.7  # of the emulated uniform light
 _EXACT = "none"
 METRICS = ("psnr", "psnr_dynamic")
-Fit = Callable[..., int]  # `spike4dgs fit`, which writes OUT/predictions
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,6 @@ class Outcome:
 
 
 def fault_table(
-    fit: Fit,
     scene: Path,
     lens_scene: Path | None,
     methods: Sequence[str],
@@ -104,7 +105,9 @@ def fault_table(
         _capture(Imperfections(**case.worse), shown.root, capture, seed)
         for method in methods:
             folder = out / "fits" / case.name / method
-            run = partial(fit, capture / "clip", method=method, out=folder, budget=budget, seed=seed, device=device)
+            wanted = get_method(method)
+            request = FitRequest(make_budget(budget), choose_device_for([wanted], device), seed)
+            run = partial(fit_recording, capture / "clip", wanted, folder, request, TFP)
             found.append(Outcome(case, method, **_scored(run, folder, shown)))
             _write(
                 out,
@@ -131,13 +134,13 @@ def _capture(worse: Imperfections, scene: Path, out: Path, seed: int) -> None:
     record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, **light)
 
 
-def _scored(fit: Callable[[], int], out: Path, truth: Scene) -> dict[str, Any]:
+def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:
     """Fit a capture and score its held-out cameras against the truth; finished scores are kept."""
     kept = out / "scores.json"
     if not kept.exists():
         try:
             fit()
-            scores: dict[str, Any] = {**_scores(out / "predictions", truth), "error": ""}
+            scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
         except UserError as e:
             scores = {**dict.fromkeys(METRICS), "error": str(e)}
         write_json(kept, scores)

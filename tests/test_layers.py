@@ -28,7 +28,7 @@ ORDER = {
     "generators": "profiles sensor worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews hard_cases scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state settings splat gaussians training_views motion supervision pose_refinement schedule models "
-    "checkpoint msdi images starts self_calibration trainer fit hard_cases recipes recordings viewing",
+    "checkpoint msdi images starts self_calibration trainer fit hard_cases recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes hard_cases",
     "leaderboard": "tracks entry truth_check rank verify submit page season",
     "studies": "kit speed_error rendering images recorder_runs recorder saved_models oracle_truth oracle_methods "

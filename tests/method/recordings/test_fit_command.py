@@ -32,8 +32,8 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
 from spike4dgs.cli import main
-from spike4dgs.cli.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
 from spike4dgs.method import load_model
+from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
 from spike4dgs.method.recordings.held_out import SHOWN
 from spike4dgs.method.recordings.recording import open_recording, own_frame
 
