@@ -13,7 +13,7 @@ from typing import Any
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.nearest_view import NearestView
-from spike4dgs.baselines.radiance_field import RADIANCE_FIELD
+from spike4dgs.baselines.radiance_field.fit import RADIANCE_FIELD
 from spike4dgs.baselines.spacetime import MOTIONS
 from spike4dgs.baselines.spike_render import SpikeRender
 from spike4dgs.baselines.starts.colmap import ColmapSettings, UncalibratedSettings, colmap, colmap_uncalibrated

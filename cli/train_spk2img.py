@@ -6,8 +6,7 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes
 
-from spike4dgs.baselines.images.spk2img.data import open_for_training, read_examples
-from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, run
+from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, open_for_training, read_examples, run
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.cli.options import COMPUTE, Compute

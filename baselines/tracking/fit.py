@@ -2,7 +2,7 @@
 
 At the first time all Gaussians are optimised and densified by the one trainer. Then sizes and opacities are fixed.
 At each further time the moving ones go on with the velocity that they had, x + (x - x') and likewise the rotations,
-and are optimised against that time's images for a few steps of a fresh Adam, with the terms of `tracking_losses`:
+and are optimised against that time's images for a few steps of a fresh Adam, with the terms of `losses`:
 
     1.0 image + 3.0 silhouette + 4.0 rigidity + 4.0 rotation + 2.0 isometry + 20 background + 0.01 colour,
     image = 0.8 mean |I - P| + 0.2 (1 - SSIM(I, P))
@@ -17,8 +17,8 @@ Differences from the publication, and why:
   images in which something moves is rendered again. `freeze_background` False gives the published soft term.
 - A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
   stays where it was at the time before.
-- Lengths are relative to the Gaussians' spacing (`tracking_losses`), learning rates fall within each time.
-- No exposure per camera (the array is calibrated), and no term for a floor (not every scene has one).
+- Lengths are relative to the Gaussians' spacing (`losses`), learning rates fall within each time, and there are no
+  terms for exposure (the array is calibrated) and for a floor.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from spike4dgs.baselines.tracking.losses import (
     unit_quaternions,
 )
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
-from spike4dgs.baselines.tracking.settings import PUBLISHED, TrackingSettings
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
 from spike4dgs.method.gaussians.density import DensitySettings
@@ -48,12 +47,60 @@ from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.motion.table import Static
 from spike4dgs.method.schedule import TrainerSettings
+from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.supervision.base import difference
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.foreground import foreground_masks, foreground_points, moving_window, stray_points
+
+
+@dataclass(frozen=True)
+class TrackingSettings(Settings):
+    """Steps, loss and learning rates (prefix `motion`). One step renders several views at one time.
+
+    The published 10,000 and 2,000 steps of one image are 200,000 images for a clip of 100 times. Here a fit has the
+    time of 4DGS: things move by about a pixel between two times, and a few steps follow that. At the first time the
+    trainer's and the density's defaults hold.
+    """
+
+    first_steps: int = 400
+    later_steps: int = 40  # at each further time
+    first_move: float = 3.0  # x later_steps at the second time, whose velocity is not known yet
+    views_per_step: int = 4
+
+    start: float = 0.5  # where in the clip the first time is: 0 at its beginning, as published, 1 at its end
+    clean_background: bool = True  # pixels that never change show their mean over the clip, without the spikes' noise
+    margin_px: int = 8  # around what moves, more than half a window of SSIM
+
+    # Loss; the weights are the publication's.
+    image_weight: float = 1.0
+    silhouette_weight: float = 3.0
+    rigidity_weight: float = 4.0
+    rotation_weight: float = 4.0
+    isometry_weight: float = 2.0
+    background_weight: float = 20.0
+    color_weight: float = 0.01
+    neighbours: int = 20
+    freeze_background: bool = True
+
+    # Adam at the further times, from the first to the last step of each; the publication's are constant.
+    lr_means: float = 1.2e-3  # x scene scale (1.6e-4 in 2,000 steps)
+    lr_means_last: float = 4e-5
+    lr_quats: float = 2e-3  # (1e-3)
+    lr_colors: float = 2.5e-3  # as published; slower, colours follow wheels and highlights too late
+    lr_colors_last: float = 5e-4
+    beta1: float = 0.9
+    beta2: float = 0.99  # (0.999, which would average over far more steps than a time has)
+
+    def scaled(self, scale: float) -> TrackingSettings:
+        """Return the same settings with the step counts multiplied by a budget's scale."""
+        first, later = (max(1, round(steps * scale)) for steps in (self.first_steps, self.later_steps))
+        return replace(self, first_steps=first, later_steps=later)
+
+
+PUBLISHED = {"motion.first_steps": 2500, "motion.later_steps": 500}  # 10,000 and 2,000 single images in steps of four
 
 
 @dataclass(frozen=True)
@@ -75,8 +122,8 @@ def visits(first: int, times: int) -> list[Visit]:
 def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
     """Fit Dynamic 3D Gaussians, from the job's checkpoint where it exists; it is written every `checkpoint_s` seconds.
 
-    A killed fit goes on from the last time in the checkpoint and gives the bits of one that never stopped (on the CPU).
-    Raises UserError for a damaged checkpoint or one of another fit.
+    A resumed fit gives the bits of one that never stopped (on the CPU). Raises UserError for a damaged checkpoint or
+    one of another fit.
     """
     checkpoint, device = job.request.checkpoint, job.request.device
     saved = load_checkpoint(checkpoint, job.key) if checkpoint else None

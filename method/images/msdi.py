@@ -9,8 +9,7 @@ from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import ImageMaker, learned_from
-from spike4dgs.method.images.windows import window
+from spike4dgs.method.images.base import ImageMaker, learned_from, window
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 
 if TYPE_CHECKING:

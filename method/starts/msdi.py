@@ -35,7 +35,7 @@ from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.images.windows import window
+from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import ImageMaker, learned_from
-from spike4dgs.method.images.windows import WINDOW, window
+from spike4dgs.method.images.base import WINDOW, ImageMaker, learned_from, window
 from spike4dgs.method.models.network_weights import WeightKind
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from spike4dgs.baselines.images.spk2img.deformable import DeformableConv
-from spike4dgs.method.images.windows import mirrored
+from spike4dgs.method.images.base import mirrored
 
 BLOCK_STARTS = (0, 7, 14, 21, 28)  # of the blocks in the window of 41 ticks
 BLOCK = 13  # ticks

@@ -14,10 +14,17 @@ import torch
 from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
 
 from spike4dgs.baselines.images.spk2img import maker
-from spike4dgs.baselines.images.spk2img.data import Example, draw, open_for_training, read_examples
 from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network, reconstruct
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
-from spike4dgs.baselines.images.spk2img.train import Training, TrainingSettings, loss_of
+from spike4dgs.baselines.images.spk2img.train import (
+    Example,
+    Training,
+    TrainingSettings,
+    draw,
+    loss_of,
+    open_for_training,
+    read_examples,
+)
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -25,7 +32,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli.options import Compute
 from spike4dgs.cli.train_spk2img import train_spk2img
-from spike4dgs.method.images.windows import window
+from spike4dgs.method.images.base import window
 
 
 def stream_of(spikes: np.ndarray) -> SpikeStream:

@@ -12,7 +12,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from spike4dgs.baselines.images.spk2img.deformable import DeformableConv, convolve, deformable_conv
 from spike4dgs.baselines.images.spk2img.network import Extractor, Spk2ImgNet
-from spike4dgs.method.images.windows import mirrored
+from spike4dgs.method.images.base import mirrored
 
 
 def slow_deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, bias: Tensor) -> np.ndarray:

@@ -9,8 +9,13 @@ import pytest
 import torch
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.radiance_field import PUBLISHED, RADIANCE_FIELD, RadianceFieldSettings, fit_radiance_field
-from spike4dgs.baselines.radiance_field.fit import Fitter
+from spike4dgs.baselines.radiance_field.fit import (
+    PUBLISHED,
+    RADIANCE_FIELD,
+    Fitter,
+    RadianceFieldSettings,
+    fit_radiance_field,
+)
 from spike4dgs.baselines.radiance_field.march import camera_rays
 from spike4dgs.baselines.radiance_field.model import RadianceModel
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings

@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.tracking.fit import (
+    PUBLISHED,
     TRACKING,
     Tracker,
+    TrackingSettings,
     Visit,
     first_index,
     fit_tracking,
@@ -19,7 +21,6 @@ from spike4dgs.baselines.tracking.fit import (
 )
 from spike4dgs.baselines.tracking.losses import find_neighbours
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
-from spike4dgs.baselines.tracking.settings import PUBLISHED, TrackingSettings
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
