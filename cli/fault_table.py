@@ -7,7 +7,6 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.method import DEFAULT_BUDGET
-from spike4dgs.cli.fit import fit
 from spike4dgs.studies import faults
 
 
@@ -35,6 +34,6 @@ def fault_table(
         seed: Seed of the imperfections and of the fits.
         device: auto, cpu or cuda.
     """
-    faults.fault_table(fit, scene, lens_scene, methods, out, budget, seed, device)
+    faults.fault_table(scene, lens_scene, methods, out, budget, seed, device)
     print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
     return 0
