@@ -122,7 +122,8 @@ def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
     cost = np.sum(residuals(np.zeros(3 * n)) ** 2)
     solution = least_squares(residuals, np.zeros(3 * n), x_scale=np.tile([10.0, 0.1, 0.1], n), xtol=1e-14, ftol=1e-14)
     assert cost <= 2 * solution.cost * (1 + 1e-8)
-    for camera, true in zip(array_calibration.levelled(at, [c.id for c in cameras], (WIDTH, HEIGHT)), cameras, strict=True):
+    found = array_calibration.levelled(at, [c.id for c in cameras], (WIDTH, HEIGHT))
+    for camera, true in zip(found, cameras, strict=True):
         assert camera.distortion[2:] == (0.0, 0.0, 0.0)
         corners = np.array([[10.0, 10], [150, 10], [10, 90], [150, 90], [80, 50]])
         rays = camera.normalized(corners) - camera.normalized(corners[-1:])
