@@ -45,7 +45,7 @@ _FAILURES = {  # what writing expected, and what to do; other errors are the pro
 
 def user_cache() -> Path:
     """Return the user's cache folder of this package, on Linux `spike4dgs` in XDG_CACHE_HOME or ~/.cache."""
-    return user_cache_path("spike4dgs", appauthor=False)
+    return Path(user_cache_path("spike4dgs", appauthor=False))
 
 
 @contextmanager

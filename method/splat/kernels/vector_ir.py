@@ -12,8 +12,9 @@ from typing import Any
 import llvmlite.binding
 from llvmlite import ir
 from numba import types
-from numba.core import config
 from numba.extending import intrinsic
+
+from spike4dgs.benchmark.compilation import config
 
 F32, F64, I32, I64 = ir.FloatType(), ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 FAST = ("contract", "nsz")  # a * b + c may become one instruction; NaN and infinity keep their meaning
