@@ -14,15 +14,9 @@ MEASUREMENTS: dict[str, Command] = {
         "report speed-error --quick --out runs/speed-error",
     ),
     "report hard-cases": Command(
-        "spike4dgs.benchmark.reports.hard_cases.command:make_hard_cases",
+        "spike4dgs.studies.hard_cases:hard_cases",
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
         "report hard-cases --out runs/hard-cases",
-        needs=(
-            "spike4dgs.benchmark.hard_cases.table:hard_cases",
-            "spike4dgs.generators.hard_cases.table:hard_cases",
-            "spike4dgs.method.hard_cases.table:hard_cases",
-            "spike4dgs.baselines.hard_cases.table:hard_cases",
-        ),
     ),
     "report oracle-ladder": Command(
         "spike4dgs.studies.oracle_ladder:oracle_ladder",

@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
 

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from small_scenes import GAIN, TICKS
+from splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from torch import Tensor
 from toy_world import ToyWorld
 
@@ -31,7 +32,6 @@ from spike4dgs.benchmark.scene.lens import resample
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.fit import Parts, RecipeMethod
-from spike4dgs.method.hard_cases.splat_scenes import FOCAL, HEIGHT, WIDTH, random_splats
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.models.fitted_model import FittedModel, GaussianModel
 from spike4dgs.method.motion.table import MOTIONS

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hard_case import BYTES, HardCase
 from toy_fits import PARTS, SMALL_PLANES, WORLD, images, method, request, silent, surfaces
 
 from spike4dgs.baselines.recipes import PARTS as BASELINE_PARTS
@@ -233,6 +234,14 @@ def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
     return tensors(whole)
 
 
+def bits(t: dict[str, torch.Tensor]) -> bytes:
+    return b"".join(t[name].contiguous().numpy().tobytes() for name in sorted(t))
+
+
+@pytest.mark.hard_case(
+    asked="a fit ({parts}) interrupted at step {step} and resumed", twin="the fit that never stopped", **BYTES,
+    kind="resume",
+)  # fmt: skip
 @pytest.mark.parametrize(
     ("parts", "step"),
     [
@@ -243,7 +252,7 @@ def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
         *(("spans", s) for s in (8, 12, 13, 14, 16, 17, 20)),
     ],
 )
-def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path):
+def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path, hard_case: HardCase):
     path = tmp_path / "fit.safetensors"
     first = trainer(**PARTS_WITH_STATE[parts])
     original = first.train_step
@@ -260,14 +269,14 @@ def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_pat
     second.run(silent, path, "this")
     result = tensors(second)
     assert result.keys() == uninterrupted(parts).keys()
-    for name, value in uninterrupted(parts).items():
-        assert torch.equal(result[name], value), name
+    hard_case.same_bytes([bits(uninterrupted(parts)), bits(result)], ["not stopped", f"stopped at step {step}"])
 
 
-def test_one_seed_one_result_and_another_seed_another():
+@pytest.mark.hard_case(asked="a fit twice with one seed", twin="the first of the two fits", **BYTES, kind="seeds")
+def test_one_seed_one_result_and_another_seed_another(hard_case: HardCase):
     again = trainer()
     again.run(silent)
-    assert all(torch.equal(v, uninterrupted()[k]) for k, v in tensors(again).items())
+    hard_case.same_bytes([bits(uninterrupted()), bits(tensors(again))], ["the first fit", "the second"])
     other = trainer()
     other.seed = 4
     other.run(silent)

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numba.cuda.simulator import kernel
 from splat_parity import compare
+from splat_scenes import HARD, HEIGHT, WIDTH, random_splats, views
 
-from spike4dgs.method.hard_cases.splat_scenes import HARD, HEIGHT, WIDTH, random_splats, views
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.cuda.background import make_layer, render_over
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slow_images import slow_tfi, slow_tfp
 
-from spike4dgs.baselines.images.reference import slow_tfi, slow_tfp
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_image, tfi_stack
 from spike4dgs.baselines.images.tfp import TfpSettings, count_stack, tfp_image, tfp_stack

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slow_images import slow_tfstp_pixel
 
-from spike4dgs.baselines.images.reference import slow_tfstp_pixel
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.images.tfp import tfp_image

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from clock_world import ClockWorld
+from hard_case import REFUSAL, HardCase
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.camera_state import Clock
+from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings, best_offsets
 from spike4dgs.method.self_calibration.clocks import ArrayClocks, clock_of_another, estimate_clocks
+from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
 
 FEW = ClockSettings(times=5, moving_patches=25, static_patches=8, prior_drift_ppm=1e4)
 SHORT = SearchSettings(times=3, most_ticks=100, patches=10, depths=6)
@@ -53,9 +59,34 @@ def test_the_clock_of_a_held_out_camera_is_on_the_clock_of_the_others() -> None:
     assert found.middle_ticks == pytest.approx(9.5, abs=0.3)
 
 
-def test_too_little_data_are_refused() -> None:
+@pytest.mark.hard_case(asked="clocks from two cameras, and from clips of 40 and 60 ticks", **REFUSAL)
+def test_too_little_data_are_refused(hard_case: HardCase) -> None:
     with pytest.raises(UserError, match="clocks of toy: expected 3 cameras"):
         estimate_clocks(ClockWorld(n_ticks=60).training)
+    usual = warm_up_scene()[0]
+    two = replace(usual, cameras=usual.cameras[:2], streams=usual.streams[:2], recordings=usual.recordings[:2])
+    short = filled_with(hard_case.rng().random((40, usual.streams[0].height, usual.streams[0].width)) < 0.5)
+    hard_case.refused({"two cameras": lambda: estimate_clocks(two), "40 ticks": lambda: estimate_clocks(short)})
+
+
+def filled_with(spikes: np.ndarray) -> TrainingScene:
+    """Return the warm-up scene with these spikes [T, H, W] for every camera."""
+    usual = warm_up_scene()[0]
+    stream = SpikeStream(pack(spikes.astype(np.uint8)), spikes.shape[2], spikes.shape[1], 20_000.0)
+    return replace(usual, streams=(stream,) * len(usual.streams), n_ticks=len(spikes))
+
+
+@pytest.mark.hard_case(
+    asked="clocks of an array whose pixels fire {level} times a tick",
+    twin="standard errors above 2 ticks: nothing is known", unit="cameras too sure",
+)  # fmt: skip
+@pytest.mark.parametrize("level", [0, 1])
+def test_an_array_that_sees_nothing_knows_no_clock(level: int, hard_case: HardCase) -> None:
+    first = warm_up_scene()[0].streams[0]
+    found = estimate_clocks(filled_with(np.full((240, first.height, first.width), level))).cameras.values()
+    errors = [e.error_ticks for e in found]
+    sure = sum(not (e.error_ticks > 2 and np.isfinite(e.clock.offset_ticks)) for e in found)
+    hard_case.check(sure, f"standard errors from {min(errors):.3g} ticks", bool(np.isfinite(errors).all()))
 
 
 def test_the_best_offsets_of_all_pairs_are_found() -> None:

@@ -6,10 +6,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from splat_scenes import HARD, random_splats, views
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.hard_cases.splat_scenes import HARD, random_splats, views
 from spike4dgs.method.splat import PixelFilter, Splats, Views, cpu, render
 from spike4dgs.method.splat.background import Background, Repeated, join
 from spike4dgs.method.splat.types import CUSTOMARY

@@ -41,8 +41,8 @@ def add_and_compile_for_arm(library, module):
 
 CPUCodeLibrary.add_ir_module = add_and_compile_for_arm
 
-from spike4dgs.method.hard_cases.splat import differentiate
-from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
+from splat_parity import differentiate
+from splat_scenes import random_splats, views
 v = views()
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes

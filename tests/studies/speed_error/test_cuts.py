@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from splat_scenes import random_splats, views
 
-from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
 from spike4dgs.method.splat import render
 from spike4dgs.method.splat.kernels.vector_ir import EXP2_POLYNOMIAL
 from spike4dgs.method.splat.types import ALPHA_MIN, T_MIN

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from splat_scenes import random_splats, views
 
-from spike4dgs.method.hard_cases.splat_scenes import random_splats, views
 from spike4dgs.method.splat import render
 from spike4dgs.studies.kit.measurement import Request
 from spike4dgs.studies.speed_error.gaussians import hard_scenes

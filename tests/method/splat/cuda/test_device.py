@@ -13,13 +13,13 @@ import pytest
 import saved_models
 import splat_parity
 import torch
+from splat_scenes import HARD, far_origin, random_splats, views
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.environment import missing_rasterizer
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
-from spike4dgs.method.hard_cases.splat_scenes import HARD, far_origin, random_splats, views
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.msdi import TINY
 from spike4dgs.method.msdi.train import Training, TrainingSettings

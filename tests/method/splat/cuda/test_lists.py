@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from splat_scenes import HARD, random_splats, views
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.hard_cases.splat_scenes import HARD, random_splats, views
 from spike4dgs.method.splat import render
 from spike4dgs.method.splat.cuda.prepare import TILE, all_tiles, make_pairs, project, sort_pairs
 from spike4dgs.method.splat.cuda.render import grid_of

@@ -1,4 +1,4 @@
-"""Hard cases of the spike simulator: darkness, saturation, flicker, tiny gains, long clips, seeds and threads."""
+"""Hard inputs of the spike simulator: darkness, saturation, flicker, tiny gains, long clips, seeds and threads."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from hard_case import BYTES, REFUSAL, HardCase, core_counts
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32
-from spike4dgs.benchmark.hard_cases.case import Case, Outcome, Setting, refused
-from spike4dgs.benchmark.hard_cases.cores import core_counts, equal_bytes
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.other_sensors import events
@@ -56,70 +55,61 @@ _INPUTS: dict[str, tuple[str, Callable[[np.random.Generator], Keys], Sensor]] = 
 }
 
 
-def cases() -> list[Case]:
-    """Return the cases of the sensor and of events."""
-    return [
-        *(_twin_case(name) for name in _INPUTS),
-        _case("drift", f"counts of {_LONG:,} ticks in constant light from dark to saturated",
-              "the closed form, float64", "spikes", 1, _drift),
-        _case("refuse", "NaN or infinite radiance, a tick twice, 10 photons a spike, a map of another size",
-              "the contract: one clear error each", "inputs taken", 0, _refused),
-        replace(_case("threads", "shot noise and pixel maps on 1, 2 ... threads", "one thread", "bytes that differ", 0,
-                      _threads), kind="threads"),
-        replace(_case("same-seed", "shot noise and first charges of one seed, twice", "the first of the two",
-                      "bytes that differ", 0, _same_seed), kind="seeds"),
-        replace(_case("other-seeds", f"counts of 5,000 pixels, {_PHOTONS:,.0f} photons a spike, four seeds",
-                      "their standard deviation in closed form", "relative", 0.1, _other_seeds), kind="seeds"),
-        Case(id="generators/events/steps", asked="events of black, of a step by 1e6 up and down, of still light",
-             twin="the number of thresholds between the logarithms", unit="events", tolerance=0, run=_events),
-    ]  # fmt: skip
-
-
-def _case(name: str, asked: str, twin: str, unit: str, tolerance: float, run: Callable[[Setting], Outcome]) -> Case:
-    return Case(id=f"generators/sensor/{name}", asked=asked, twin=twin, unit=unit, tolerance=tolerance, run=run)
-
-
 def _simulated(keys: Keys, ticks: Sequence[int], n: int, sensor: Sensor, seed: int, threads: int = 1) -> SpikeStream:
     charge = random_charge(keys.shape[1], keys.shape[2], [seed])
     packed = np.concatenate(list(simulate(keys, ticks, n, sensor, charge, threads=threads)))
     return SpikeStream(packed, keys.shape[2], keys.shape[1], 20_000.0)
 
 
-def _twin_case(name: str) -> Case:
-    asked, make, sensor = _INPUTS[name]
-
-    def run(setting: Setting) -> Outcome:
-        keys = make(setting.rng())
-        ticks = (np.arange(len(keys)) * (_TICKS // (len(keys) - 1))).tolist()
-        noisy = replace(sensor, noise_seed=(setting.seed,))
-        stream = _simulated(keys, ticks, _TICKS, noisy, setting.seed)
-        expected = simulate_reference(keys, ticks, _TICKS, noisy, random_charge(*_SHAPE, [setting.seed]))
-        apart = np.cumsum(stream.window(0, _TICKS).astype(int) - expected, axis=0)
-        rate = stream.counts(0, _TICKS) / _TICKS
-        moved = np.mean(stream.window(0, _TICKS) != expected)
-        text = f"{rate.min():.4g} to {rate.max():.4g} spikes per tick; {moved:.2%} of the spikes a tick early or late"
-        return Outcome(text, float(np.abs(apart).max()))
-
-    return _case(name, f"{asked}, {_TICKS} ticks", "one tick and one step after the other, float64",
-                 "spikes ahead or behind", 1, run)  # fmt: skip
+def _noisy(seed: int, threads: int = 1, shape: tuple[int, int] = (31, 45)) -> bytes:
+    keys = np.random.default_rng(0).random((30, *shape), dtype=np.float32)
+    sensor = Sensor(0.6, gain_map(*shape, 1, "c"), dark_map(*shape, 1, "c"), photons=5e4, noise_seed=(seed,))
+    return bytes(_simulated(keys, range(0, 150, 5), 145, sensor, seed, threads).packed.tobytes())
 
 
-def _drift(setting: Setting) -> Outcome:
+@pytest.mark.hard_case(
+    twin="one tick and one step after the other, float64", unit="spikes ahead or behind", tolerance=1
+)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.hard_case(asked=f"{i[0]}, {_TICKS} ticks")) for n, i in _INPUTS.items()]
+)
+def test_sensor(hard_case: HardCase, name: str) -> None:
+    _, make, sensor = _INPUTS[name]
+    keys = make(hard_case.rng())
+    ticks = (np.arange(len(keys)) * (_TICKS // (len(keys) - 1))).tolist()
+    noisy = replace(sensor, noise_seed=(hard_case.seed,))
+    stream = _simulated(keys, ticks, _TICKS, noisy, hard_case.seed)
+    expected = simulate_reference(keys, ticks, _TICKS, noisy, random_charge(*_SHAPE, [hard_case.seed]))
+    apart = np.cumsum(stream.window(0, _TICKS).astype(int) - expected, axis=0)
+    rate = stream.counts(0, _TICKS) / _TICKS
+    moved = np.mean(stream.window(0, _TICKS) != expected)
+    text = f"{rate.min():.4g} to {rate.max():.4g} spikes per tick; {moved:.2%} of the spikes a tick early or late"
+    hard_case.check(np.abs(apart).max(), text)
+
+
+@pytest.mark.hard_case(
+    asked=f"counts of {_LONG:,} ticks in constant light from dark to saturated",
+    twin="the closed form, float64", unit="spikes", tolerance=1,
+)  # fmt: skip
+def test_drift(hard_case: HardCase) -> None:
     light = np.linspace(0, 2.2, _HEIGHT * _WIDTH, dtype=np.float32).reshape(_SHAPE)
-    charge = random_charge(*_SHAPE, [setting.seed])
-    stream = _simulated(np.stack([light] * 3), [0, _LONG // 2, _LONG], _LONG, Sensor(), setting.seed)
+    charge = random_charge(*_SHAPE, [hard_case.seed])
+    stream = _simulated(np.stack([light] * 3), [0, _LONG // 2, _LONG], _LONG, Sensor(), hard_case.seed)
     counts = stream.counts(0, 50_000).astype(int) + stream.counts(50_000, _LONG)
     exact = np.floor(charge / THRESHOLD + _LONG * np.clip(0.6 * light.astype(np.float64), 0, 1))
-    return Outcome(f"{counts.min()} to {counts.max():,} spikes", float(np.abs(counts - exact).max()))
+    hard_case.check(np.abs(counts - exact).max(), f"{counts.min()} to {counts.max():,} spikes")
 
 
-def _refused(setting: Setting) -> Outcome:
+@pytest.mark.hard_case(
+    asked="NaN or infinite radiance, a tick twice, 10 photons a spike, a map of another size", **REFUSAL
+)
+def test_refuse(hard_case: HardCase) -> None:
     good, ticks = _light([0.5] * 3), [0, 5, 10]
 
     def run(keys: Keys, at: Sequence[int], sensor: Sensor = Sensor()) -> Callable[[], object]:  # noqa: B008
         return lambda: _simulated(keys, at, 10, sensor, 0)
 
-    return refused(
+    hard_case.refused(
         {
             "NaN": run(_light([0.5, np.nan, 0.5]), ticks),
             "infinity": run(_light([0.5, np.inf, 0.5]), ticks),
@@ -132,37 +122,39 @@ def _refused(setting: Setting) -> Outcome:
     )
 
 
-def _noisy(seed: int, threads: int = 1, shape: tuple[int, int] = (31, 45)) -> bytes:
-    keys = np.random.default_rng(0).random((30, *shape), dtype=np.float32)
-    sensor = Sensor(0.6, gain_map(*shape, 1, "c"), dark_map(*shape, 1, "c"), photons=5e4, noise_seed=(seed,))
-    return bytes(_simulated(keys, range(0, 150, 5), 145, sensor, seed, threads).packed.tobytes())
-
-
-def _threads(setting: Setting) -> Outcome:
+@pytest.mark.hard_case(
+    asked="shot noise and pixel maps on 1, 2 ... threads", twin="one thread", **BYTES, kind="threads"
+)
+def test_threads(hard_case: HardCase) -> None:
     counts = [*core_counts(), core_counts()[-1] + 1]
-    return equal_bytes([_noisy(setting.seed, n) for n in counts], [f"{n} threads" for n in counts])
+    hard_case.same_bytes([_noisy(hard_case.seed, n) for n in counts], [f"{n} threads" for n in counts])
 
 
-def _same_seed(setting: Setting) -> Outcome:
-    found = equal_bytes([_noisy(setting.seed) for _ in range(2)], ["the first run", "the second"])
-    if _noisy(setting.seed + 1) == _noisy(setting.seed):
-        return Outcome("another seed gives the same bytes", np.inf)
-    return found
+@pytest.mark.hard_case(
+    asked="shot noise and first charges of one seed, twice", twin="the first of the two", **BYTES, kind="seeds"
+)
+def test_same_seed(hard_case: HardCase) -> None:
+    hard_case.same_bytes([_noisy(hard_case.seed) for _ in range(2)], ["the first run", "the second"])
+    assert _noisy(hard_case.seed + 1) != _noisy(hard_case.seed), "another seed gives the same bytes"
 
 
-def _other_seeds(setting: Setting) -> Outcome:
-    """Compare the spread of counts with that of sums of independent charges, rounded down from a random start."""
+@pytest.mark.hard_case(
+    asked=f"counts of 5,000 pixels, {_PHOTONS:,.0f} photons a spike, four seeds",
+    twin="their standard deviation in closed form", unit="relative", tolerance=0.1, kind="seeds",
+)  # fmt: skip
+def test_other_seeds(hard_case: HardCase) -> None:
+    """The spread of counts is that of sums of independent charges, rounded down from a random start."""
     rate, n = 0.6, _TICKS  # n * rate is whole
-    light: Float32 = np.full((1, 5000), rate / 0.6, np.float32)  # each pixel has random numbers of its own
+    light = np.full((1, 5000), rate / 0.6, np.float32)  # each pixel has random numbers of its own
     counts = []
-    for seed in range(setting.seed, setting.seed + 4):
+    for seed in range(hard_case.seed, hard_case.seed + 4):
         sensor = Sensor(photons=_PHOTONS, noise_seed=(seed,))
         counts.append(_simulated(np.stack([light, light]), [0, n], n, sensor, seed).counts(0, n).astype(float).ravel())
     sd = np.sqrt(n * rate / _PHOTONS)
     expected = np.sqrt(sd**2 + _floor_variance(sd))
     spread = np.std(counts, axis=1)
     text = f"standard deviations {', '.join(f'{v:.3f}' for v in spread)} spikes of {np.mean(counts):.1f}"
-    return Outcome(text, float(np.abs(spread / expected - 1).max()))
+    hard_case.check(np.abs(spread / expected - 1).max(), text)
 
 
 def _floor_variance(sd: float) -> float:
@@ -173,13 +165,16 @@ def _floor_variance(sd: float) -> float:
     return float((weight * f * (1 - f)).sum() / weight.sum())
 
 
-def _events(setting: Setting) -> Outcome:
+@pytest.mark.hard_case(
+    asked="events of black, of a step by 1e6 up and down, of still light",
+    twin="the number of thresholds between the logarithms", unit="events",
+)  # fmt: skip
+def test_events(hard_case: HardCase) -> None:
     levels = ([0.0, 0.0, 0.0], [1e-3, 1e3, 2e-3], [0.5, 0.5, 0.5])  # by pixel: black, up by 1e6 and down, still
     keys = np.array(levels, np.float32).T[:, None]
     found = events(list(keys), [0, 20, 40], 40, 20_000, threshold=0.2)
     up = int(np.log(1e6) / 0.2)
     expected = [0, up + int(up - np.log(2.0) / 0.2), 0]
     counts = np.bincount(found.x, minlength=3)
-    ordered = bool((np.diff(found.t) >= 0).all())
-    text = f"{counts.tolist()} events where {expected} were expected"
-    return Outcome(text, float(np.abs(counts - expected).sum()) + (not ordered))
+    assert (np.diff(found.t) >= 0).all()
+    hard_case.check(np.abs(counts - expected).sum(), f"{counts.tolist()} events where {expected} were expected")

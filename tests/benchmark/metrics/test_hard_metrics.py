@@ -1,4 +1,4 @@
-"""Hard cases of the metrics: constant, equal, almost equal, HDR, black, tiny and broken images."""
+"""Hard inputs of the metrics: constant, equal, almost equal, HDR, black, tiny and broken images."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 
+import cv2
 import numpy as np
+import pytest
+import torch
+from flip_evaluator import evaluate
+from hard_case import REFUSAL, HardCase
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.hard_cases.case import Case, NotRunError, Outcome, Setting, compare, refused, worst
 from spike4dgs.benchmark.metrics.flip import flip
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.lpips import LpipsNetwork, empty_trunk, make_network
@@ -20,89 +23,14 @@ from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.metrics.table import METRICS
 
+Float64 = NDArray[np.float64]
 _SIZE = (48, 64)
-_PSNR, _SSIM = "-10 log10(MSE) in float64", "the formula of Wang et al. with OpenCV's filter, float64"
-
-
-def cases() -> list[Case]:
-    """Return the cases of the metrics."""
-    return [
-        _psnr("equal", "equal images", lambda rng: (image := _texture(rng), image)),
-        _psnr("almost-equal", "images 1e-7 apart", lambda rng: (image := _texture(rng), image + 1e-7)),
-        _psnr("constant", "0.5 everywhere against 0.6 everywhere", lambda rng: (_even(0.5), _even(0.6))),
-        _psnr("black-and-white", "black against white", lambda rng: (_even(0.0), _even(1.0))),
-        _psnr("hdr", "values from -1e4 to 1e4: clipped to 0..1", lambda rng: (_texture(rng), 1e4 * _noise(rng))),
-        _psnr("float32", "float32, 1e-4 apart", _float32_pair),
-        _ssim("equal", "equal images", lambda rng: (image := _texture(rng), image)),
-        _ssim("constant", "0.5 against 0.6 everywhere: variances cancel", lambda rng: (_even(0.5), _even(0.6))),
-        _ssim("both-black", "black against black", lambda rng: (_even(0.0), _even(0.0))),
-        _ssim("negative", "an image against its negative", lambda rng: (image := _texture(rng), 1 - image)),
-        _ssim("hdr", "values from -1e4 to 1e4: clipped to 0..1", lambda rng: (_texture(rng), 1e4 * _noise(rng))),
-        _ssim("smallest", "11x11 pixels: one window", lambda rng: (a := _texture(rng)[:11, :11], a[::-1])),
-        _case("moving-region", "a moving region of one pixel, and none", "float64 formulas", "dB", 1e-9, _moving),
-        _case("gain", "the gain of a prediction 1e-6 and 1e6 times the truth, of a black one and a negative one",
-              "numpy.linalg.lstsq; none", "of the gain", 1e-9, _gain),
-        _case("flip", "FLIP of equal, even, inverted, 1x1 images", "the package flip-evaluator", "", 2e-4, _flip, 1),
-        _case("lpips", "LPIPS of black, white, even and random images, random trunks of three networks",
-              "the formula in float64, layer by layer", "relative", 1e-4, _lpips, 4),
-        _case("refuse", "NaN, infinity, integers, another size, 10x64 pixels, no boolean mask",
-              "the contract: one clear error each", "inputs taken", 0, _bad_images),
-        _case("no-reference", "BRISQUE and NIQE of black, white, gray, HDR-bright and nearly even images",
-              "the contract: no value where an image shows nothing, else a finite one", "wrong answers", 0, _blind, 2),
-    ]  # fmt: skip
-
-
-def _float32_pair(rng: np.random.Generator) -> tuple[Image, Image]:
-    image = _texture(rng).astype(np.float32)
-    return image, image + np.float32(1e-4)
-
-
-def _case(
-    name: str,
-    asked: str,
-    twin: str,
-    unit: str,
-    tolerance: float,
-    run: Callable[[Setting], Outcome],
-    seconds: float = 0.1,
-) -> Case:
-    return Case(
-        id=f"benchmark/metrics/{name}",
-        asked=asked,
-        twin=twin,
-        unit=unit,
-        tolerance=tolerance,
-        run=run,
-        seconds=seconds,
-    )
-
 
 Pair = Callable[[np.random.Generator], tuple[Image, Image]]
 
 
-def _psnr(name: str, asked: str, pair: Pair) -> Case:
-    def run(setting: Setting) -> Outcome:
-        truth, prediction = pair(setting.rng())
-        a, b = (np.clip(np.float64(x), 0, 1) for x in (truth, prediction))
-        mse = float(np.mean((a - b) ** 2))
-        expected = min(-10 * math.log10(mse), MAX_PSNR_DB) if mse else MAX_PSNR_DB
-        return compare(_number(_values(truth, prediction)["psnr"]), expected)
-
-    return _case(f"psnr-{name}", f"PSNR of {asked}", _PSNR, "dB", 1e-6, run)
-
-
-def _ssim(name: str, asked: str, pair: Pair) -> Case:
-    def run(setting: Setting) -> Outcome:
-        truth, prediction = pair(setting.rng())
-        return compare(_number(_values(truth, prediction)["ssim"]), _ssim_twin(truth, prediction))
-
-    return _case(f"ssim-{name}", f"SSIM of {asked}", _SSIM, "", 1e-6, run)
-
-
 def _texture(rng: np.random.Generator) -> Float64:
     """Return a smooth random image in 0..1."""
-    import cv2
-
     smooth = cv2.GaussianBlur(rng.random(_SIZE), (0, 0), 3)
     return np.asarray((smooth - smooth.min()) / np.ptp(smooth), np.float64)
 
@@ -128,8 +56,6 @@ def _number(value: float | None) -> float:
 
 
 def _ssim_map(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> Float64:
-    import cv2
-
     x, y = (np.clip(np.asarray(i, np.float64), 0, 1) for i in (truth, prediction))
 
     def blur(image: Float64) -> Float64:
@@ -141,40 +67,80 @@ def _ssim_map(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> 
     return np.asarray((2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2)))
 
 
-def _ssim_twin(truth: NDArray[np.floating], prediction: NDArray[np.floating]) -> float:
+def _float32_pair(rng: np.random.Generator) -> tuple[Image, Image]:
+    image = _texture(rng).astype(np.float32)
+    return image, image + np.float32(1e-4)
+
+
+_PAIRS: dict[str, tuple[str, Pair]] = {
+    "equal": ("equal images", lambda rng: (image := _texture(rng), image)),
+    "almost-equal": ("images 1e-7 apart", lambda rng: (image := _texture(rng), image + 1e-7)),
+    "constant": ("0.5 everywhere against 0.6 everywhere: variances cancel", lambda rng: (_even(0.5), _even(0.6))),
+    "black-and-white": ("black against white", lambda rng: (_even(0.0), _even(1.0))),
+    "both-black": ("black against black", lambda rng: (_even(0.0), _even(0.0))),
+    "negative": ("an image against its negative", lambda rng: (image := _texture(rng), 1 - image)),
+    "hdr": ("values from -1e4 to 1e4: clipped to 0..1", lambda rng: (_texture(rng), 1e4 * _noise(rng))),
+    "float32": ("float32, 1e-4 apart", _float32_pair),
+    "smallest": ("11x11 pixels: one window", lambda rng: (a := _texture(rng)[:11, :11], a[::-1])),
+}
+each_pair = pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.hard_case(asked=p[0])) for n, p in _PAIRS.items()]
+)
+
+
+@pytest.mark.hard_case(twin="-10 log10(MSE) in float64", unit="dB", tolerance=1e-6)
+@each_pair
+def test_psnr(hard_case: HardCase, name: str) -> None:
+    truth, prediction = _PAIRS[name][1](hard_case.rng())
+    a, b = (np.clip(np.float64(x), 0, 1) for x in (truth, prediction))
+    mse = float(np.mean((a - b) ** 2))
+    expected = min(-10 * math.log10(mse), MAX_PSNR_DB) if mse else MAX_PSNR_DB
+    hard_case.close(_number(_values(truth, prediction)["psnr"]), expected)
+
+
+@pytest.mark.hard_case(twin="the formula of Wang et al. with OpenCV's filter, float64", tolerance=1e-6)
+@each_pair
+def test_ssim(hard_case: HardCase, name: str) -> None:
+    truth, prediction = _PAIRS[name][1](hard_case.rng())
     half = SSIM_WINDOW // 2
-    return float(_ssim_map(truth, prediction)[half:-half, half:-half].mean())
+    expected = _ssim_map(truth, prediction)[half:-half, half:-half].mean()
+    hard_case.close(_number(_values(truth, prediction)["ssim"]), expected)
 
 
-def _moving(setting: Setting) -> Outcome:
-    truth = _texture(setting.rng())
+@pytest.mark.hard_case(
+    asked="a moving region of one pixel, and none", twin="float64 formulas", unit="dB", tolerance=1e-9
+)
+def test_moving_region(hard_case: HardCase) -> None:
+    truth = _texture(hard_case.rng())
     prediction, one = 0.9 * truth + 0.02, np.zeros(_SIZE)
     one[7, 9] = 1
     values, none = _values(truth, prediction, one), _values(truth, prediction, 0 * one)
-    if none["psnr_dynamic"] is not None or none["ssim_dynamic"] is not None:
-        return Outcome(f"a value without a moving region: {none}", math.inf)
+    assert none["psnr_dynamic"] is None and none["ssim_dynamic"] is None, "a value without a moving region"
     expected = [-20 * math.log10(abs(truth[7, 9] - prediction[7, 9])), _ssim_map(truth, prediction)[7, 9]]
-    return compare([_number(values["psnr_dynamic"]), _number(values["ssim_dynamic"])], expected)
+    hard_case.close([_number(values["psnr_dynamic"]), _number(values["ssim_dynamic"])], expected)
 
 
-def _gain(setting: Setting) -> Outcome:
-    truth = _texture(setting.rng())
-    outcomes = {}
+@pytest.mark.hard_case(
+    asked="the gain of a prediction 1e-6 and 1e6 times the truth, of a black one and a negative one",
+    twin="numpy.linalg.lstsq; none",
+    unit="of the gain",
+    tolerance=1e-9,
+)
+def test_gain(hard_case: HardCase) -> None:
+    truth = _texture(hard_case.rng())
     for factor in (1e-6, 1.0, 1e6):
-        prediction = factor * (truth + 0.1 * setting.rng().random(_SIZE))
+        prediction = factor * (truth + 0.1 * hard_case.rng().random(_SIZE))
         expected = np.linalg.lstsq(prediction.reshape(-1, 1), truth.ravel(), rcond=None)[0][0]
-        outcomes[f"{factor:g}"] = compare(_number(fit_gain([(truth, prediction)])) / expected, 1.0)
+        hard_case.close(_number(fit_gain([(truth, prediction)])) / expected, 1.0, f"{factor:g}")
     taken = [level for level in (0.0, -1.0) if fit_gain([(truth, _even(level))]) is not None]
-    outcomes["black and negative"] = Outcome(f"{len(taken)} gains", float(len(taken)))
-    return worst(outcomes)
+    assert not taken, "black and negative images have no gain"
 
 
-def _flip(setting: Setting) -> Outcome:
-    try:
-        from flip_evaluator import evaluate
-    except ImportError:
-        raise NotRunError("the package flip-evaluator is not installed") from None
-    image = np.rint(255 * _texture(setting.rng())).astype(np.uint8)
+@pytest.mark.hard_case(
+    asked="FLIP of equal, even, inverted, 1x1 images", twin="the package flip-evaluator", tolerance=2e-4
+)
+def test_flip(hard_case: HardCase) -> None:
+    image = np.rint(255 * _texture(hard_case.rng())).astype(np.uint8)
     even = np.full_like(image, 128)
     pairs = {
         "equal": (image, image),
@@ -183,19 +149,20 @@ def _flip(setting: Setting) -> Outcome:
         "black and white": (0 * image, 0 * image + np.uint8(255)),
         "1x1": (image[:1, :1], 255 - image[:1, :1]),
     }
-    outcomes = {}
     for name, pair in pairs.items():
         colour = [np.repeat((x / 255).astype(np.float32)[..., None], 3, axis=2) for x in pair]
-        outcomes[name] = compare(
-            flip(*pair), float(evaluate(*colour, "LDR", applyMagma=False)[0].mean(dtype=np.float64))
-        )
-    return worst(outcomes)
+        expected = evaluate(*colour, "LDR", applyMagma=False)[0].mean(dtype=np.float64)
+        hard_case.close(flip(*pair), float(expected), name)
 
 
-def _lpips(setting: Setting) -> Outcome:
-    import torch
-
-    rng, outcomes = setting.rng(), {}
+@pytest.mark.hard_case(
+    asked="LPIPS of black, white, even and random images, random trunks of three networks",
+    twin="the formula in float64, layer by layer",
+    unit="relative",
+    tolerance=1e-4,
+)
+def test_lpips(hard_case: HardCase) -> None:
+    rng = hard_case.rng()
     black = np.zeros(_SIZE, np.uint8)
     noise = rng.integers(0, 256, _SIZE, dtype=np.uint8)
     pairs = {
@@ -206,19 +173,16 @@ def _lpips(setting: Setting) -> Outcome:
     }
     for net in ("alex", "vgg", "squeeze"):
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(setting.seed)
+            torch.manual_seed(hard_case.seed)
             trunk = empty_trunk(net).eval()
         network = make_network(net, trunk)
         found = {name: network.distance(*pair) for name, pair in pairs.items()}
         for name, pair in pairs.items():
-            outcomes[f"{net}, {name}"] = compare(found[name], _lpips_twin(network, *pair), relative=True)
-    return worst(outcomes)
+            hard_case.close(found[name], _lpips_twin(network, *pair), f"{net}, {name}", relative=True)
 
 
 def _lpips_twin(network: LpipsNetwork, a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     """Return LPIPS with torch's layers and numpy's sums, all in float64."""
-    import torch
-
     heads, seen = dict(zip(network.taps, network.weights, strict=True)), []
     trunk = deepcopy(network.trunk).double()
     for image in (a, b):
@@ -237,8 +201,9 @@ def _lpips_twin(network: LpipsNetwork, a: NDArray[np.uint8], b: NDArray[np.uint8
     return total
 
 
-def _bad_images(setting: Setting) -> Outcome:
-    truth = _texture(setting.rng())
+@pytest.mark.hard_case(asked="NaN, infinity, integers, another size, 10x64 pixels, no boolean mask", **REFUSAL)
+def test_refuse(hard_case: HardCase) -> None:
+    truth = _texture(hard_case.rng())
     mask, small = np.ones(_SIZE, bool), np.zeros((10, 64))
     bad = {
         "NaN": (truth, np.where(truth > 0.9, np.nan, truth), mask),
@@ -250,11 +215,16 @@ def _bad_images(setting: Setting) -> Outcome:
         "10x64 pixels": (small, small, small > 1),
         "a mask of numbers": (truth, truth, truth),
     }
-    return refused({name: partial(check_images, *images, where="image") for name, images in bad.items()})
+    hard_case.refused({name: partial(check_images, *images, where="image") for name, images in bad.items()})
 
 
-def _blind(setting: Setting) -> Outcome:
-    rng = setting.rng()
+@pytest.mark.hard_case(
+    asked="BRISQUE and NIQE of black, white, gray, HDR-bright and nearly even images",
+    twin="the contract: no value where an image shows nothing, else a finite one",
+    unit="wrong answers",
+)
+def test_no_reference(hard_case: HardCase) -> None:
+    rng = hard_case.rng()
     shape, ids = (200, 256), ("brisque", "niqe")
     even: dict[str, Float64] = {f"{level:g}": np.full(shape, level) for level in (0.0, 0.5, 1.0, 1e4, -1.0)}
     some = {"noise": rng.random(shape), "one bright pixel": np.zeros(shape), "bright noise": 1e3 * rng.random(shape)}
@@ -272,4 +242,4 @@ def _blind(setting: Setting) -> Outcome:
             if bad:
                 said.append(f"{i} of {name} is {value}")
             wrong += bad
-    return Outcome("; ".join(said) or f"{len(even)} even images refused, {len(some)} others answered", float(wrong))
+    hard_case.check(wrong, "; ".join(said) or f"{len(even)} even images refused, {len(some)} others answered")

@@ -1,1 +1,0 @@
-"""Hard cases of the baselines: images from spikes, whole fits, the array's clocks."""

@@ -1,1 +1,0 @@
-"""`report hard-cases`: hard inputs, seeds, interrupted fits and thread counts, each with a measured error."""

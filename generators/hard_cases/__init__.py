@@ -1,1 +1,0 @@
-"""Hard cases of the generators: the spike sensor, events, emulated cameras."""

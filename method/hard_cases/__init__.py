@@ -1,1 +1,0 @@
-"""Hard cases of the method: the rasteriser, losses, motions, fits that stop and go on, and saved models."""
