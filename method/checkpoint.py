@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Adam
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.method import Progress
 from spike4dgs.method.gaussians.optimizer import export_state, import_state
 from spike4dgs.method.models.model_file import part, read_tensors, write_tensors
+from spike4dgs.method.torch_state import one_torch_thread
 
 _SCHEMA = "spike4dgs-checkpoint/1"
 
@@ -21,6 +26,11 @@ class Checkpoint:
 
     step: int
     tensors: dict[str, Tensor]
+
+    @classmethod
+    def of(cls, step: int, **parts: Mapping[str, Tensor]) -> Checkpoint:
+        """Return the checkpoint of several parts, each tensors by name."""
+        return cls(step, {f"{part}.{name}": v for part, tensors in parts.items() for name, v in tensors.items()})
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """Return the tensors whose name starts with `prefix.`, without it."""
@@ -49,10 +59,30 @@ def load_checkpoint(path: Path, fit: str) -> Checkpoint | None:
     return Checkpoint(int(step), tensors)
 
 
+def run_steps(
+    fit: Any, progress: Progress, path: Path | None, key: str, checkpoint_s: float, note: Callable[[], str] = lambda: ""
+) -> None:
+    """Train to the end, from the checkpoint `path` where it exists; it is written every `checkpoint_s` seconds.
+
+    `fit` has `step`, `total`, `train_step`, `state` and `restore`; `key` identifies it, `note` adds to its progress.
+    Raises UserError for a damaged checkpoint or one of another fit.
+    """
+    if path and (saved := load_checkpoint(path, key)):
+        fit.restore(saved)
+    written = time.monotonic()
+    with one_torch_thread():
+        while fit.step < fit.total:
+            loss = fit.train_step()
+            if path and (time.monotonic() - written >= checkpoint_s or fit.step == fit.total):
+                save_checkpoint(path, fit.state(), key)
+                written = time.monotonic()
+            if fit.step % 10 == 0 or fit.step == fit.total:
+                progress(fit.step, fit.total, f"loss {loss.item():.4f}{note()}")
+
+
 def save_training(path: Path, step: int, network: nn.Module, adam: Adam, fit: str) -> None:
     """Write everything that the training of a network needs to go on from `step`."""
-    parts = {"network": network.state_dict(), "adam": export_state(adam)}
-    save_checkpoint(path, Checkpoint(step, {f"{n}.{k}": v for n, p in parts.items() for k, v in p.items()}), fit)
+    save_checkpoint(path, Checkpoint.of(step, network=network.state_dict(), adam=export_state(adam)), fit)
 
 
 def resume_training(path: Path, network: nn.Module, adam: Adam, fit: str) -> int:

@@ -6,7 +6,6 @@ and a fit that resumes from a checkpoint gives the bits of one that never stoppe
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Progress
-from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.checkpoint import Checkpoint, run_steps
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import (
     Averages,
@@ -36,7 +35,7 @@ from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, choos
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.background import Background
 from spike4dgs.method.supervision.base import Sample, Supervision
-from spike4dgs.method.torch_state import one_torch_thread, seeded
+from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.foreground import moving_points
 from spike4dgs.method.training_views.instants import Corrections, RenderViews
 from spike4dgs.method.training_views.training_images import TrainingImages
@@ -240,39 +239,26 @@ class Trainer:
     def run(
         self, progress: Progress, checkpoint: Path | None = None, fit: str = "", checkpoint_s: float = 15.0
     ) -> None:
-        """Train to the end, from `checkpoint` where it exists; it is written every `checkpoint_s` seconds.
-
-        `fit` identifies the fit. Raises UserError for a damaged checkpoint or one of another fit.
-        """
-        saved = load_checkpoint(checkpoint, fit) if checkpoint else None
-        if saved:
-            self.restore(saved)
-        written = time.monotonic()
-        with one_torch_thread(), closing(self):
-            while self.step < self.total:
-                loss = self.train_step()
-                if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == self.total):
-                    save_checkpoint(checkpoint, self.state(), fit)
-                    written = time.monotonic()
-                if self.step % 10 == 0 or self.step == self.total:
-                    progress(self.step, self.total, f"loss {loss.item():.4f}, {len(self.gaussians)} Gaussians")
+        """Train to the end; see `run_steps`. `fit` identifies the fit."""
+        with closing(self):
+            run_steps(self, progress, checkpoint, fit, checkpoint_s, lambda: f", {len(self.gaussians)} Gaussians")
 
     def state(self) -> Checkpoint:
         """Return everything that later steps depend on."""
-        parts = {
-            "gaussians": self.gaussians.tensors(),
-            "background": self.background.tensors(),
-            "snapshot": self.snapshot.tensors() if self.snapshot else {},
+        return Checkpoint.of(
+            self.step,
+            gaussians=self.gaussians.tensors(),
+            background=self.background.tensors(),
+            snapshot=self.snapshot.tensors() if self.snapshot else {},
             **{f"piece{i}": g.tensors() for i, g in self.ended.items()},
-            "motion": self.motion.state_dict(),
-            "supervision": self.supervision.state_dict(),
-            "poses": self.poses.state_dict(),
-            "adam": export_state(self.adam),
-            "average": self.averages.means,
-            "coherence": self.coherence.state(),
-            "statistics": {"gradient": self.statistics.gradient, "seen": self.statistics.seen},
-        }
-        return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+            motion=self.motion.state_dict(),
+            supervision=self.supervision.state_dict(),
+            poses=self.poses.state_dict(),
+            adam=export_state(self.adam),
+            average=self.averages.means,
+            coherence=self.coherence.state(),
+            statistics={"gradient": self.statistics.gradient, "seen": self.statistics.seen},
+        )
 
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same fit."""

@@ -10,7 +10,6 @@ gives the bits of one that never stopped (on the CPU).
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,7 +18,7 @@ from torch import Tensor
 from spike4dgs.baselines.radiance_field.march import Rays, camera_rays
 from spike4dgs.baselines.radiance_field.model import DynamicField, FieldShape, RadianceModel, bounds_of
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings, may_move
-from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from spike4dgs.method.checkpoint import Checkpoint, run_steps
 from spike4dgs.method.fit import Algorithm, FitJob
 from spike4dgs.method.gaussians.optimizer import Decay, export_state, import_state, make_adam, set_learning_rates
 from spike4dgs.method.images.training import ImageSettings
@@ -27,7 +26,7 @@ from spike4dgs.method.motion.hexplane import HexPlaneSettings, hexplane_shape, p
 from spike4dgs.method.schedule import GOLDEN
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.spike import Reset, firing_rate, spike_loss
-from spike4dgs.method.torch_state import one_torch_thread, seeded
+from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.changes import RAYS, changing
 from spike4dgs.method.training_views.training_images import known
 
@@ -116,7 +115,8 @@ class Fitter:
     """A fit in progress."""
 
     def __init__(self, job: FitJob) -> None:
-        self.job, self.settings, self.step = job, job.settings["motion"], 0
+        self.job, self.settings = job, job.settings["motion"]
+        self.step, self.total = 0, self.settings.steps
         self.spiking, self.occupancy = job.settings["supervision"], job.settings["occupancy"]
         s, extent, start, request = self.settings, job.extent, job.start, job.request
         planes = hexplane_shape(extent, HexPlaneSettings(features=s.features, mlp_width=s.deformation_width))
@@ -194,28 +194,12 @@ class Fitter:
         return loss.detach()
 
     def run(self, checkpoint_s: float = 15.0) -> None:
-        """Fit to the end, from the job's checkpoint where it exists; it is written every `checkpoint_s` seconds.
-
-        Raises UserError for a damaged checkpoint or one of another fit.
-        """
-        key, checkpoint, total = self.job.key, self.job.request.checkpoint, self.settings.steps
-        saved = load_checkpoint(checkpoint, key) if checkpoint else None
-        if saved:
-            self.restore(saved)
-        written = time.monotonic()
-        with one_torch_thread():
-            while self.step < total:
-                loss = self.train_step()
-                if checkpoint and (time.monotonic() - written >= checkpoint_s or self.step == total):
-                    save_checkpoint(checkpoint, self.state(), key)
-                    written = time.monotonic()
-                if self.step % 10 == 0 or self.step == total:
-                    self.job.request.progress(self.step, total, f"loss {loss.item():.4f}")
+        """Fit to the end; see `run_steps`."""
+        run_steps(self, self.job.request.progress, self.job.request.checkpoint, self.job.key, checkpoint_s)
 
     def state(self) -> Checkpoint:
         """Return everything that later steps depend on."""
-        parts = {"field": self.field.state_dict(), "adam": export_state(self.adam)}
-        return Checkpoint(self.step, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+        return Checkpoint.of(self.step, field=self.field.state_dict(), adam=export_state(self.adam))
 
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same fit."""

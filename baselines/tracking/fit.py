@@ -282,8 +282,7 @@ class Tracker:
 
     def state(self) -> Checkpoint:
         """Return everything that later times depend on."""
-        parts = {"gaussians": self.gaussians.tensors(), "tracks": self.tracks.tensors()}
-        return Checkpoint(self.done, {f"{part}.{k}": v for part, tensors in parts.items() for k, v in tensors.items()})
+        return Checkpoint.of(self.done, gaussians=self.gaussians.tensors(), tracks=self.tracks.tensors())
 
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same fit."""
