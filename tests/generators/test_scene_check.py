@@ -1,26 +1,160 @@
-"""The check of scenes without Mitsuba: what equals, what differs by noise, what by the world."""
+"""The check of scenes against a reference: differences, verdict, report."""
 
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from full_scene import write_full_scene
+from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.images import read_exr, read_geometry, write_exr, write_geometry
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.stream import pack
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.scene_check import NOISE_FOLDER, check_scenes, find_references
-from spike4dgs.generators.scene_differences import differing_facts
+from spike4dgs.generators.scene_check import (
+    CHANGE,
+    EQUAL,
+    MOST_OF_BLOCKS,
+    MOST_OF_CAMERA,
+    NOISE,
+    NOISE_FOLDER,
+    Comparison,
+    beyond_noise,
+    check_scenes,
+    find_references,
+    to_markdown,
+)
+from spike4dgs.generators.scene_differences import (
+    Difference,
+    bits_that_differ,
+    block_means,
+    difference,
+    differing_facts,
+    images_of,
+)
+
+
+def opened(root: Path) -> Scene:
+    write_manifest(root)
+    return open_scene(root)
+
+
+def test_a_scene_does_not_differ_from_itself(tmp_path: Path) -> None:
+    scene = open_scene(write_full_scene(tmp_path / "scene"))
+    found = difference(scene, scene, "cam_03")
+    assert (found.bits, found.spikes_block_rms, found.truth_rms, found.truth_block_max) == (0, 0, 0, 0)
+    assert found.truth_db is None and difference(scene, scene, "cam_01").truth_rms is None
+    assert [t.tick for t in images_of(scene, "cam_03")] == [20, 40, 60]
+
+
+def test_bits_are_those_of_plain_arrays() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 700, 5, 7)) < 0.3
+    streams = [SpikeStream(pack(x), 7, 5, 20000.0) for x in (a, b)]
+    assert math.isclose(bits_that_differ(*streams), np.mean(a != b))
+
+
+def test_a_known_change_of_truth_is_measured(tmp_path: Path) -> None:
+    a, b = open_scene(write_small_scene(tmp_path / "a")), write_small_scene(tmp_path / "b")
+    for path in b.glob("images/cam_03/*.exr"):
+        image = np.array(read_exr(path))
+        image[8:16, 16:24] += 0.125
+        write_exr(path, image, 0.0)
+    found = difference(a, opened(b), "cam_03")
+    share = 64 / (HEIGHT * WIDTH)
+    assert found.truth_rms == pytest.approx(0.125 * math.sqrt(share), rel=0.01)
+    assert found.truth_block_max == pytest.approx(0.125, rel=0.01)
+    assert found.truth_block_rms == pytest.approx(0.125 * math.sqrt(share), rel=0.01)
+    assert found.truth_db == pytest.approx(-20 * math.log10(0.125 * math.sqrt(share)), abs=0.1)
+    assert found.bits == 0
+
+
+def test_a_silent_block_of_spikes_is_measured(tmp_path: Path) -> None:
+    a, b = open_scene(write_small_scene(tmp_path / "a")), write_small_scene(tmp_path / "b")
+    spikes = open_scene(b).stream("cam_00").window(0, TICKS)
+    silent = spikes.copy()
+    silent[:, 8:16, 16:24] = 0
+    (b / "spikes/cam_00.dat").write_bytes(pack(silent).tobytes())
+    found = difference(a, opened(b), "cam_00")
+    lost = spikes[:, 8:16, 16:24].mean()
+    assert found.bits == pytest.approx(spikes[:, 8:16, 16:24].sum() / spikes.size)
+    assert found.spikes_block_max == pytest.approx(lost)
+    assert found.spikes_block_rms == pytest.approx(lost / math.sqrt(15))
+
+
+def test_block_means_leave_out_what_is_over() -> None:
+    image = np.arange(20.0 * 17).reshape(20, 17)
+    found = block_means(image)
+    assert found.shape == (2, 2) and found[1, 1] == image[8:16, 8:16].mean()
+
+
+FLOOR = Difference(0.17, 1e-3, 4e-3, 5e-3, 1e-3, 4e-3)
+
+
+def compared(
+    found: Difference, noise: Difference = FLOOR, facts: tuple[str, ...] = (), same: bool = False
+) -> Comparison:
+    return Comparison("car-0-tiny", "a" * 64, ("a" if same else "b") * 64, facts, {"cam_00": found}, {"cam_00": noise})
+
+
+def test_the_verdict_is_by_revision_then_facts_then_noise() -> None:
+    assert compared(FLOOR, same=True).verdict == EQUAL
+    assert compared(FLOOR).verdict == NOISE and compared(FLOOR).reasons == []
+    assert compared(FLOOR, facts=("n_ticks: 80, reference 400",)).verdict == CHANGE
+    assert compared(Difference(0, 0, 0, 0, 0, 0)).verdict == NOISE
+
+
+LIMITS = MOST_OF_CAMERA | MOST_OF_BLOCKS
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_each_measure_alone_tells_a_change(name: str) -> None:
+    values = {field: getattr(FLOOR, field) for field in LIMITS}
+    for factor, verdict in ((0.99, NOISE), (1.01, CHANGE)):
+        found = compared(Difference(**{**values, name: values[name] * LIMITS[name] * factor}))
+        assert found.verdict == verdict and len(found.reasons) == (verdict == CHANGE)
+
+
+def test_blocks_count_over_all_cameras_and_bits_by_camera() -> None:
+    def of_three(name: str, factor: float) -> list[str]:
+        noise = {f"cam_{i}": FLOOR for i in range(3)}
+        return beyond_noise(noise | {"cam_1": replace(FLOOR, **{name: factor * getattr(FLOOR, name)})}, noise)
+
+    assert of_three("bits", 1.3) == [
+        "cam_1: spike bits differ 1.3 times as much as by noise; up to 1.25 times is noise"
+    ]
+    assert of_three("truth_block_rms", 2.6) == []  # sqrt((1 + 1 + 2.6^2) / 3) = 1.71
+    (line,) = of_three("truth_block_rms", 2.8)
+    assert line.startswith("all cameras: truths in blocks differ 1.81 times")
+    (line,) = of_three("spikes_block_max", 2.6)
+    assert line.startswith("all cameras: spikes per tick in the worst block differ 2.6 times")
+
+
+def test_without_noise_any_difference_is_a_change() -> None:
+    still = Difference(0, 0, 0, 0, 0, 0)
+    found = compared(Difference(1e-4, 0, 0, 0, 0, 0), still)
+    assert found.verdict == CHANGE and "spike bits differ and not by noise" in found.reasons[0]
+    assert compared(Difference(0, 0, 0), Difference(0, 0, 0)).verdict == NOISE
+
+
+def test_the_report_has_the_figures_beside_those_of_noise() -> None:
+    text = to_markdown([compared(Difference(0.5, 1e-3, 4e-3, 0.1, 1e-3, 4e-3))])
+    assert "| car-0-tiny | change of the world | aaaaaaaaaaaaaaaa | bbbbbbbbbbbbbbbb |" in text
+    assert "| cam_00 | 50.000% | 17.000% | 20.0 | 46.0 | 1.00e-03 | 1.00e-03 | 1.00e-03 | 1.00e-03 |" in text
+    assert "- cam_00: spike bits differ 2.94 times as much as by noise; up to 1.25 times is noise" in text
+    assert to_markdown([compared(FLOOR, same=True)]).count("## car-0-tiny: equal") == 1
+
 
 JOB = Job("pattern", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 

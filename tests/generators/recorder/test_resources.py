@@ -1,7 +1,11 @@
-"""The memory that continuous mode takes for data that wait for the disk."""
+"""Memory for data that wait for the disk, and real-time priority."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +14,7 @@ import pytest
 from fake_camera import rig
 
 from spike4dgs.cli import main
-from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, free_bytes, least_seconds
+from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, free_bytes, least_seconds, real_time
 
 FAST = replace(rig(3), width=400, height=250, transfer_bytes=1 << 20, transfers=16)  # 250 MB/s a camera
 
@@ -52,3 +56,39 @@ def test_a_buffer_that_cannot_be_is_refused(
     out = tmp_path / "x"
     assert main(["record", "--emulate", str(small_scene), "--out", str(out), *arguments]) == 2
     assert message in capsys.readouterr().err and not out.exists()
+
+
+def policy_of(thread: threading.Thread) -> int:
+    return os.sched_getscheduler(thread.native_id or 0)
+
+
+def test_all_threads_have_it_while_it_lasts() -> None:
+    end = threading.Event()
+    before = threading.Thread(target=end.wait)
+    before.start()
+    try:
+        with real_time() as permitted:
+            if not permitted:
+                pytest.skip("this user may not have real-time priority")
+            within = threading.Thread(target=end.wait)
+            within.start()
+            assert [policy_of(t) for t in (threading.main_thread(), before, within)] == 3 * [os.SCHED_RR]
+        assert [policy_of(t) for t in (threading.main_thread(), before, within)] == 3 * [os.SCHED_OTHER]
+    finally:
+        end.set()
+
+
+REFUSED = """
+import os, resource
+from spike4dgs.generators.recorder.resources import real_time
+if os.getuid() == 0:
+    os.setuid(65534)
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+with real_time() as permitted:
+    print(permitted, os.sched_getscheduler(0) == os.SCHED_OTHER)
+"""
+
+
+def test_a_system_that_refuses_it_is_no_error() -> None:
+    done = subprocess.run([sys.executable, "-c", REFUSED], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "False True\n", done.stderr
