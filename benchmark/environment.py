@@ -136,11 +136,14 @@ def choose_device(device: str, *, rasterizes: bool = True) -> str:
     """Resolve `auto` and check that the device exists. Raises UserError where it does not.
 
     What `rasterizes` computes on CUDA only where numba-cuda works too. Without it `auto` is the CPU, and one line on
-    stderr says how to change that.
+    stderr says how to change that. `mps` is the CPU too, with a line.
     """
     kind = device_type(device)
-    if kind not in ("auto", "cpu", "cuda"):
+    if kind not in ("auto", "cpu", "cuda", "mps"):
         raise problem("--device", "auto, cpu or cuda", repr(device), "choose one of them")
+    if kind == "mps":
+        _say_once("spike4dgs: computing on the CPU: the kernels run on CPUs and on CUDA, not on Apple's GPU (mps)")
+        return "cpu"
     if kind == "cpu":
         return device
     import torch

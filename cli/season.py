@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import choose_device_for, get_method, make_budget
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO
 from spike4dgs.benchmark.reports.console import make_console, results_table
 from spike4dgs.benchmark.runs.run import Settings
@@ -29,7 +29,7 @@ def make(
     profile: str = "small",
     closes: str | None = None,
     hide_streams: bool = False,
-    budget: str = "quick",
+    budget: str = DEFAULT_BUDGET,
     fit_seed: int = 0,
     workers: int = 1,
     seasons: Path = SEASONS,
@@ -98,7 +98,7 @@ def predict(
     *,
     methods: tuple[str, ...],
     out: Path = Path("runs/season"),
-    budget: str = "quick",
+    budget: str = DEFAULT_BUDGET,
     seed: int = 0,
     device: str = "auto",
 ) -> int:

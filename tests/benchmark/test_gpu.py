@@ -108,6 +108,12 @@ def test_image_makers_with_a_network_follow_the_fit(name: str, monkeypatch: pyte
     assert IMAGES["tfp"].on("cuda:7") is IMAGES["tfp"]
 
 
+def test_apples_gpu_falls_back_to_the_cpu_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    environment._say_once.cache_clear()
+    assert [choose_device("mps"), choose_device("mps:0")] == ["cpu", "cpu"]
+    assert capsys.readouterr().err.count("not on Apple's GPU") == 1
+
+
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """numba-cuda beside a PyTorch for CUDA 12.8, and a trial that succeeds."""
