@@ -225,7 +225,7 @@ class SpacetimeLite(PolynomialMotion):
         return concatenate(parts)
 
     def guided_samples(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
-        """Return the Gaussians followed by new ones where the worst views lack some (`guided_sampling`)."""
+        """Return the Gaussians followed by new ones where the worst views lack some (`guide`)."""
         duration = self.settings.moving_temporal_scale
         new = guide(self, gaussians, images, generator)
         return concatenate([gaussians, *(self.timed(g, torch.full((len(g),), t), duration) for g, t in new)])

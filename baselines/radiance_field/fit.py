@@ -103,7 +103,7 @@ class FieldSpikeSettings(Settings):
     """The spiking layer behind the field (prefix `supervision`)."""
 
     neuron_ticks: int = 256  # for which a neuron sees a rendered ray
-    hard_reset: bool = False  # True: as published, biased (see supervision/spike_neuron.py)
+    hard_reset: bool = False  # True: as published, biased (see `supervision/spike.py`)
 
     @property
     def reset(self) -> Reset:

@@ -110,7 +110,7 @@ def physical_terms(graph: Neighbours, before: Before, means: Tensor, quats: Tens
 def physical_loss(
     graph: Neighbours, before: Before, means: Tensor, quats: Tensor, weights: tuple[float, float, float]
 ) -> Tensor:
-    """Return weights . `physical_terms`; float32 on the CPU goes through `losses_cpu`, all else through plain torch."""
+    """Return weights . `physical_terms`; float32 on the CPU goes through kernels, all else through plain torch."""
     if means.device.type != "cpu" or means.dtype != torch.float32:
         terms = physical_terms(graph, before, means, quats)
         return torch.stack([w * term for w, term in zip(weights, terms, strict=True)]).sum()

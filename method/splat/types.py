@@ -106,7 +106,7 @@ class Views:
     ) -> Views:
         """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp."""
         if bent := [c.id for c in cameras if c.distortion]:
-            fix = "render pinholes and resample them, see `method.observations.pinholes`"
+            fix = "render pinholes and resample them, see `method.training_views.pinholes`"
             raise problem("cameras", "pinholes", f"lens distortion of {', '.join(bent)}", fix)
         sizes = sorted({(c.width, c.height) for c in cameras})
         if len(sizes) != 1:
