@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,20 @@ from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 from small_scenes import write_small_scene
 
 from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.model_file import ModelFile, read_model, write_model
 from spike4dgs.method.models.saved_model import load_model
+from spike4dgs.method.motion.table import Static
 from spike4dgs.method.splat import PixelFilter
 
 MOTIONS = PARTS.motion
+
+
+class Drift(Static):
+    """A motion of another package."""
+
 
 FLAT = Path(__file__).parent / "flat_settings_models"  # of a version with one flat list of settings
 MOVING = [name for name in MODELS if name != "static"]
@@ -42,6 +51,26 @@ def test_a_loaded_model_renders_the_same_bits(name: str, tmp_path: Path, hard_ca
         assert image.std() > 0.01, "a test of nothing"
         hard_case.close(loaded.model.render(camera, t_us), image, f"{t_us:g} us")
     assert [p.name for p in path.parent.iterdir()] == ["m.safetensors"], "nothing temporary is left"
+
+
+def test_models_and_motions_of_other_packages_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By entry points, as the paper's baselines are: `method` imports neither."""
+    theirs = {
+        "spike4dgs.models": {"gaussians": FittedModel.from_file, "ghosts": lambda file, device: (file.config, device)},
+        "spike4dgs.motions": {"drift": Drift},
+    }
+
+    def entry_points(group: str) -> list[SimpleNamespace]:
+        return [SimpleNamespace(name="theirs", value="theirs:M", dist=None, load=lambda: theirs[group])]
+
+    monkeypatch.setattr(plugins, "entry_points", entry_points)
+    write_model(tmp_path / "ghosts", ModelFile("ghosts", {"a": 1}, {"x": torch.ones(2)}, provenance()))
+    assert load_model(tmp_path / "ghosts").model == ({"a": 1}, "cpu")
+    still = model("static")
+    moved = dataclasses.replace(still, spec=dataclasses.replace(still.spec, name="drift"))
+    moved.save(tmp_path / "drift", provenance())
+    loaded = load_model(tmp_path / "drift").model
+    assert isinstance(loaded, FittedModel) and isinstance(loaded.motion, Drift)
 
 
 def test_a_model_keeps_the_filter_that_it_was_fitted_with(tmp_path: Path) -> None:
