@@ -199,12 +199,12 @@ COMMANDS: dict[str, Command] = {
         "export-spikecv data/car-0-small --out car-spikecv",
     ),
     "poses": Command(
-        "spike4dgs.studies.poses:poses",
+        "spike4dgs.cli.poses:poses",
         "estimate the training cameras' poses and measure their errors",
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
     "patterns": Command(
-        "spike4dgs.studies.patterns:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
+        "spike4dgs.cli.patterns:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
     ),
     "export-nerfstudio": Command(
         "spike4dgs.cli.export_nerfstudio:export_nerfstudio",

@@ -8,7 +8,6 @@ from typing import Literal
 from tyro.conf import Positional
 
 from spike4dgs.cli.commands import COMMANDS
-from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY
 
 Shell = Literal["bash", "zsh", "fish"]
 Words = Mapping[str, str]  # word -> what it does
@@ -29,10 +28,9 @@ def completion(shell: Positional[Shell]) -> int:
 
 def script(shell: Shell) -> str:
     """Return the completion script of a shell."""
-    first = {name.partition(" ")[0]: command.summary for name, command in COMMANDS.items()} | {"speed": SPEED_SUMMARY}
+    first = {name.partition(" ")[0]: command.summary for name, command in COMMANDS.items()}
     second = {
         **verbs_of_two(),
-        "speed": {name: command.summary for name, command in SPEED.items()},
         "completion": {name: f"the script for {name}" for name in ("bash", "zsh", "fish")},
     }
     return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](first, second)

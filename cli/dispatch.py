@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
 import functools
@@ -16,7 +15,6 @@ from typing import Any, get_args, get_type_hints
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.commands import COMMANDS, MOVED
-from spike4dgs.cli.measurements import SPEED, SPEED_SUMMARY
 
 _MOST = 1e12  # of a number on the command line
 
@@ -48,22 +46,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in ("-h", "--help"):
-        speed = Command("", SPEED_SUMMARY, "")
-        print(_overview("spike4dgs", COMMANDS | {"speed": speed}))
+        print(_overview("spike4dgs", COMMANDS))
         return 0
     if name == "--version":
         print(version("spike4dgs"))
         return 0
-    if name == "speed":
-        return _speed(rest)
+    for old in (name, *(f"{name} {word}" for word in rest)):
+        if old in MOVED:
+            raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
     if verbs := {two: c for two, c in COMMANDS.items() if two.startswith(f"{name} ")}:
         if rest and f"{name} {rest[0]}" in verbs:
             name, rest = f"{name} {rest[0]}", rest[1:]
         elif name not in COMMANDS:
             return _verbs(name, rest, verbs)
-    for old in (name, *(f"{name} {word}" for word in rest)):
-        _check_moved(old)
-    command = _find(name, COMMANDS | {"speed": Command("", "", "")}, "spike4dgs")
+    command = _find(name, COMMANDS, "spike4dgs")
 
     import tyro
 
@@ -72,11 +68,6 @@ def _dispatch(arguments: list[str]) -> int:
         tyro.cli(_bounded(function), args=rest, prog=f"spike4dgs {name}", description=_description(function, command))
         or 0
     )
-
-
-def _check_moved(old: str) -> None:
-    if old in MOVED:
-        raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
 
 
 def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
@@ -120,18 +111,6 @@ def _numbers(option: str, value: Any) -> Iterator[tuple[str, float]]:
             yield from _numbers(option, item)
     elif isinstance(value, int | float):
         yield option, value
-
-
-def _speed(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview("spike4dgs speed", SPEED))
-        return 0
-    _check_moved(f"speed {arguments[0]}")
-    for option, text in zip(arguments, arguments[1:], strict=False):
-        with contextlib.suppress(ValueError):
-            if not abs(float(text)) <= _MOST:
-                raise problem(option, f"a number from {-_MOST:g} to {_MOST:g}", text[:60], "correct it")
-    return int(_load(_find(arguments[0], SPEED, "spike4dgs speed"))(arguments[1:]) or 0)
 
 
 def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:

@@ -9,7 +9,7 @@ from spike4dgs.cli.command import Command
 
 MEASUREMENTS: dict[str, Command] = {
     "report speed-error": Command(
-        "spike4dgs.studies.speed_error.command:speed_error",
+        "spike4dgs.cli.speed_error:speed_error",
         "measure every approximation beside its exact twin, and write one page",
         "report speed-error --quick --out runs/speed-error",
     ),
@@ -19,42 +19,37 @@ MEASUREMENTS: dict[str, Command] = {
         "report hard-cases --out runs/hard-cases",
     ),
     "report oracle-ladder": Command(
-        "spike4dgs.studies.oracle_ladder:oracle_ladder",
+        "spike4dgs.cli.oracle_ladder:oracle_ladder",
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
         "report oracle-ladder data/car-0-small --out runs/oracle",
     ),
     "spike-agreement": Command(
-        "spike4dgs.studies.spike_agreement:spike_agreement",
+        "spike4dgs.cli.spike_agreement:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
         "spike-agreement runs/small --data data --out runs/spike-agreement",
     ),
     "tradeoff": Command(
-        "spike4dgs.studies.rendering:tradeoff",
+        "spike4dgs.cli.spacing:tradeoff",
         "report render time against error for several settings",
         "tradeoff car --profile paper",
     ),
     "spacing": Command(
-        "spike4dgs.studies.rendering:spacing",
+        "spike4dgs.cli.spacing:spacing",
         "report key-frame spacing against error and render time",
         "spacing --help",
     ),
-}
-
-SPEED_SUMMARY = "measure the speed of a part beside a plain one"
-# Speed measurements take the rest of the command line as a list of strings.
-SPEED: dict[str, Command] = {
-    "render": Command(
-        "spike4dgs.studies.saved_models:render",
+    "speed render": Command(
+        "spike4dgs.cli.speed_render:render",
         "render images of saved models, side by side",
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
-    "record": Command(
-        "spike4dgs.studies.recorder:record",
+    "speed record": Command(
+        "spike4dgs.cli.speed_record:record",
         "record emulated cameras into memory and to disk, queued beside single reads",
         "speed record",
     ),
-    "images": Command(
-        "spike4dgs.studies.images:images",
+    "speed images": Command(
+        "spike4dgs.cli.speed_images:images",
         "time and quality of each way from spikes to an image, beside the paper's Table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),

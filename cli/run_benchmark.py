@@ -145,8 +145,7 @@ def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, out: Path) ->
     if not chosen:
         fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
         raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
-    gaps = ["--allow-gaps"] if choice.allow_gaps else []
-    return int(images([*map(str, chosen), "--out", str(out), *gaps]))
+    return images(chosen, out=out, allow_gaps=choice.allow_gaps)
 
 
 def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:

@@ -4,13 +4,12 @@ Each maker sees the stream of the held-out camera itself, and its images of the 
 ground truth, as the benchmark compares a method's. Nothing is trained here. Where a scene has that camera's calibration
 recordings, our images are scored a second time, corrected by them.
 
-spikezoo gets its window of 41 ticks as a ready-made float array, centred on the middle of the tick: taking the window
-out of the stream does not count for it, and its images are half a tick late. numpy gets an unpacked clip likewise.
+spikezoo gets its window of 41 ticks, centred on the middle of the tick, as a ready-made float array: taking the window
+out of the stream does not count. numpy gets an unpacked clip likewise.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tyro.conf import Positional
 
 from spike4dgs.baselines.images.table import IMAGES, ImageMaker
 from spike4dgs.baselines.images.tfstp import TfstpSettings, tfstp_image
@@ -68,31 +68,37 @@ TABLE_6 = {  # of the paper, name, PSNR and SSIM: averages over its own scenes, 
 STANDS_IN = {"tfstp": "stands in for TVS, which the paper does not define"}
 
 
-def images(argv: Sequence[str] = ()) -> int:
+def images(
+    scenes: Positional[tuple[Path, ...]] = (),
+    *,
+    repeats: int = 5,
+    out: Path = Path("runs/images"),
+    allow_gaps: bool = False,
+) -> int:
     """Time every image maker, and score it at the held-out cameras of the given scenes.
 
     Writes the table to OUT/images.csv, and for each scene OUT/strip_SCENE.png: truth, images, errors.
+
+    Args:
+        scenes: Scene folders; without any, only time is measured.
+        repeats: The median of so many images counts.
+        out: Folder for the table and the strips.
+        allow_gaps: Accept recordings with gaps.
     """
-    p = argparse.ArgumentParser("spike4dgs speed images", description=images.__doc__)
-    p.add_argument("scenes", nargs="*", type=Path, help="scene folders; without any, only time is measured")
-    p.add_argument("--repeats", type=int, default=5, help="the median of so many images counts")
-    p.add_argument("--out", type=Path, default=Path("runs/images"), help="folder for the table and the strips")
-    p.add_argument("--allow-gaps", action="store_true", help="accept recordings with gaps")
-    a = p.parse_args(list(argv))
-    scenes = [open_scene(path, a.allow_gaps) for path in a.scenes]
-    rows = measure_makers(scenes, a.repeats)
-    title = f"Images from spikes, median ms of {a.repeats}, quality at the held-out cameras of {len(scenes)} scene(s)"
-    show_table(title, _columns(scenes), [_texts(r) for r in rows], a.out / "images.csv", [r.note for r in rows])
-    if len(scenes) > 1:
+    opened = [open_scene(path, allow_gaps) for path in scenes]
+    rows = measure_makers(opened, repeats)
+    title = f"Images from spikes, median ms of {repeats}, quality at the held-out cameras of {len(opened)} scene(s)"
+    show_table(title, _columns(opened), [_texts(r) for r in rows], out / "images.csv", [r.note for r in rows])
+    if len(opened) > 1:
         scored = [row for row in rows if row.quality]
-        by_scene = [(s.id, *(_show("psnr", row.quality[s.id]["psnr"]) for row in scored)) for s in scenes]
+        by_scene = [(s.id, *(_show("psnr", row.quality[s.id]["psnr"]) for row in scored)) for s in opened]
         columns = ("scene", *(row.title for row in scored))
-        show_table("PSNR by scene", columns, by_scene, a.out / "images_by_scene.csv")
-    for scene in scenes:
+        show_table("PSNR by scene", columns, by_scene, out / "images_by_scene.csv")
+    for scene in opened:
         makers = [(row, IMAGES[row.name]) for row in rows if row.by == OURS and row.quality]
-        write_strip(a.out / f"strip_{scene.id}.png", scene, makers)
-    if scenes:
-        print(f"images: {a.out}/strip_*.png")
+        write_strip(out / f"strip_{scene.id}.png", scene, makers)
+    if opened:
+        print(f"images: {out}/strip_*.png")
     return 0
 
 
@@ -158,10 +164,10 @@ def measured(row: Row, prepare: Prepare, scenes: Sequence[Scene], repeats: int, 
     """Return the row with time and quality, or with the reason where the maker cannot run."""
     stream = fired_stream(TICKS, WIDTH, HEIGHT)
     try:
-        ms = _median_ms(prepare(stream, stream.n_ticks // 2, 1.0), repeats)
+        ms = by_turns_ms([prepare(stream, stream.n_ticks // 2, 1.0)], repeats)[0][1]
     except UserError as e:  # no weights, for example
         return replace(row, note=str(e))
-    scene_ms = _median_ms(prepare(*held_out(scenes[0], middle_target(scenes[0]))), repeats) if scenes else None
+    scene_ms = by_turns_ms([prepare(*held_out(scenes[0], middle_target(scenes[0])))], repeats)[0][1] if scenes else None
 
     def make(scene: Scene, target: Target) -> Float32:
         return prepare(*held_out(scene, target))()
@@ -203,10 +209,6 @@ def _score(make: Callable[[Scene, Target], Float32], scene: Scene) -> dict[str, 
     return {metric: mean([v for v in values if v is not None]) for metric, values in found.items()}
 
 
-def _median_ms(make: MakeImage, repeats: int) -> float:
-    return by_turns_ms([make], repeats)[0][1]
-
-
 def measure_numpy(repeats: int) -> Row:
     """Return the row of TFSTP in plain numpy, with the difference to ours in its note."""
     stream = fired_stream(TICKS, WIDTH, HEIGHT)
@@ -214,7 +216,7 @@ def measure_numpy(repeats: int) -> Row:
     spikes = stream.window(0, stream.n_ticks).astype(bool)
     plain = tfstp_plainly(spikes, tick)
     error = float(np.nanmax(np.abs(plain - tfstp_image(stream, tick))))
-    ms = _median_ms(lambda: tfstp_plainly(spikes, tick), repeats)
+    ms = by_turns_ms([lambda: tfstp_plainly(spikes, tick)], repeats)[0][1]
     return Row("tfstp", "numpy", ms, note=f"whole history, float64; {OURS} is within {error:.0e} spikes per tick")
 
 

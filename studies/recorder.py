@@ -5,7 +5,6 @@ To disk the figure is how many cameras every one of several runs sustains.
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 from collections.abc import Sequence
@@ -42,7 +41,20 @@ _LEFT_S = 0.1
 _WAITS = 0.5  # share of a clip: a delivery that waits longer than this for the disk is limited by it
 
 
-def record(argv: Sequence[str] = ()) -> int:
+def record(
+    *,
+    cameras: int = 9,
+    seconds: float = 0.5,
+    fps: int = 20000,
+    transfer_kib: int = 1024,
+    transfers: int = 16,
+    memory_kib: int = 64,
+    disk_seconds: float = 8.0,
+    runs: int = 3,
+    buffer_s: float | None = None,
+    disk: Path | None = None,
+    csv: Path | None = None,
+) -> int:
     """Measure how many emulated cameras this machine records, into memory and to disk, and how it reads them.
 
     Each camera sends 400x250 at 20 kHz by the clock, 250 MB/s, through pyusb and the code for real cameras; the
@@ -51,29 +63,29 @@ def record(argv: Sequence[str] = ()) -> int:
     and so on, each number several times, until one run is not sustained: ticks are lost, or the buffer does not empty
     again in its second half. Each number is shown beside the rate at which the disk stores as many bytes in as many
     files without any camera.
+
+    Args:
+        cameras: Most cameras.
+        seconds: Length of a clip in memory; 0: none.
+        fps: Frames a second of a camera.
+        transfer_kib: Size of a read.
+        transfers: Reads in flight for each camera.
+        memory_kib: Memory of a camera and its USB bridge.
+        disk_seconds: Length of each recording to disk; 0: none.
+        runs: Recordings to disk of each number of cameras.
+        buffer_s: Seconds that may wait for the disk; as `record` chooses if left out.
+        disk: Folder for them; a temporary one if left out.
+        csv: Also write the tables here, and with -disk and -disk-runs behind the name.
     """
-    p = argparse.ArgumentParser("spike4dgs speed record", description=record.__doc__)
-    p.add_argument("--cameras", type=int, default=9)
-    p.add_argument("--seconds", type=float, default=0.5, help="length of a clip in memory; 0: none")
-    p.add_argument("--fps", type=int, default=20000)
-    p.add_argument("--transfer-kib", type=int, default=1024, help="size of a read")
-    p.add_argument("--transfers", type=int, default=16, help="reads in flight for each camera")
-    p.add_argument("--memory-kib", type=int, default=64, help="memory of a camera and its USB bridge")
-    p.add_argument("--disk-seconds", type=float, default=8.0, help="length of each recording to disk; 0: none")
-    p.add_argument("--runs", type=int, default=3, help="recordings to disk of each number of cameras")
-    p.add_argument("--buffer-s", type=float, help="seconds that may wait for the disk (default: as `record` chooses)")
-    p.add_argument("--disk", type=Path, help="folder for them (default: a temporary one)")
-    p.add_argument("--csv", type=Path, help="also write the tables here, and with -disk and -disk-runs behind the name")
-    a = p.parse_args(list(argv))
-    load = Load(a.cameras, a.fps, a.transfer_kib << 10, a.transfers, a.memory_kib << 10, a.buffer_s)
+    load = Load(cameras, fps, transfer_kib << 10, transfers, memory_kib << 10, buffer_s)
     mb_s = load.fps * FRAME_BYTES / 1e6
-    title = f"emulated cameras of {mb_s:g} MB/s, {load.transfers} reads of {a.transfer_kib} KiB, {os.cpu_count()} cores"
-    if a.seconds:
-        rows = [_memory_row(load, run(load, a.seconds, queued), queued) for queued in (True, False)]
-        show_table(f"into memory: {title}", COLUMNS, rows, a.csv)
-    if a.disk_seconds:
-        with tempfile.TemporaryDirectory(dir=a.disk) as folder:
-            show_disk(title, load, a.disk_seconds, max(a.runs, 1), Path(folder), a.csv)
+    title = f"emulated cameras of {mb_s:g} MB/s, {load.transfers} reads of {transfer_kib} KiB, {os.cpu_count()} cores"
+    if seconds:
+        rows = [_memory_row(load, run(load, seconds, queued), queued) for queued in (True, False)]
+        show_table(f"into memory: {title}", COLUMNS, rows, csv)
+    if disk_seconds:
+        with tempfile.TemporaryDirectory(dir=disk) as folder:
+            show_disk(title, load, disk_seconds, max(runs, 1), Path(folder), csv)
     return 0
 
 

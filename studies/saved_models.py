@@ -6,18 +6,19 @@ is composited in float64 at some patches; the motion of a model's Gaussians is n
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
+from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
@@ -53,28 +54,38 @@ class Splatting(Protocol):
         ...
 
 
-def render(argv: Sequence[str] = ()) -> int:
-    """Time the images of saved models at the training cameras, over the clip, and compare them with float64."""
-    p = argparse.ArgumentParser("spike4dgs speed render", description=render.__doc__)
-    p.add_argument("models", type=Path, nargs="+", help="OUT/models/METHOD/SCENE.safetensors")
-    p.add_argument("--times", type=int, default=10, help="times of the clip at each camera")
-    p.add_argument("--scale", type=float, default=1.0, help="size, as a multiple of the training views' each way")
-    p.add_argument("--device", default="cpu", help="cpu or cuda")
-    p.add_argument("--csv", type=Path, help="write the table here too")
-    a = p.parse_args(list(argv))
-    models = [load_model(path, a.device) for path in a.models]
-    shots = [_shots(m, a.times, a.scale) for m in models]
+def render(
+    models: Positional[tuple[Path, ...]],
+    *,
+    times: int = 10,
+    scale: float = 1.0,
+    device: str = "cpu",
+    csv: Path | None = None,
+) -> int:
+    """Time the images of saved models at the training cameras, over the clip, and compare them with float64.
+
+    Args:
+        models: Saved models: OUT/models/METHOD/SCENE.safetensors.
+        times: Times of the clip at each camera.
+        scale: Size, as a multiple of the training views' each way.
+        device: cpu or cuda.
+        csv: Write the table here too.
+    """
+    if not models:
+        raise problem("speed render", "saved models", "none", "name OUT/models/METHOD/SCENE.safetensors of a run")
+    loaded = [load_model(path, device) for path in models]
+    shots = [_shots(m, times, scale) for m in loaded]
     with one_torch_thread():
-        for m, s in zip(models, shots, strict=True):
+        for m, s in zip(loaded, shots, strict=True):
             m.model.render(*s[0])  # compilation
-        times: list[list[float]] = [[] for _ in models]
+        taken: list[list[float]] = [[] for _ in loaded]
         for turn in range(max(map(len, shots))):
-            for i, m in enumerate(models):
-                times[i].append(_time_ms(m, *shots[i][turn % len(shots[i])]))
-        rows = [_row(*of) for of in zip(models, shots, times, strict=True)]
+            for i, m in enumerate(loaded):
+                taken[i].append(_time_ms(m, *shots[i][turn % len(shots[i])]))
+        rows = [_row(*of) for of in zip(loaded, shots, taken, strict=True)]
     columns = ("model", "pixels", "Gaussians", "min ms", "median ms", "frames/s", "mean error", "largest error")
-    threads = f"{a.device}, torch {torch.__version__} on one thread beside the kernels' own"
-    show_table(f"Images of saved models; {threads}; errors against float64", columns, rows, a.csv)
+    threads = f"{device}, torch {torch.__version__} on one thread beside the kernels' own"
+    show_table(f"Images of saved models; {threads}; errors against float64", columns, rows, csv)
     return 0
 
 

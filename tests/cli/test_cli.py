@@ -7,13 +7,12 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from dummy_methods import CountMethod, run
 
 from spike4dgs.benchmark.runs.record import read_record
-from spike4dgs.cli import COMMANDS, SPEED, Command, main
+from spike4dgs.cli import COMMANDS, Command, main
 from spike4dgs.cli import dispatch as cli
 from spike4dgs.cli.score import score
 
@@ -36,7 +35,7 @@ def test_help_answers_in_under_a_second_and_imports_nothing_heavy() -> None:
         seconds.append(time.perf_counter() - start)
     assert min(seconds) < 1
     assert done.stderr == "0 []\n"
-    for name in (*COMMANDS, "speed"):
+    for name in COMMANDS:
         assert f"  {name} " in done.stdout
 
 
@@ -45,12 +44,6 @@ def test_no_arguments_and_help_say_the_same(capsys: pytest.CaptureFixture[str]) 
     text = capsys.readouterr().out
     assert main([]) == 0 and capsys.readouterr().out == text
     assert main(["-h"]) == 0 and capsys.readouterr().out == text
-
-
-def test_the_overview_of_speed_lists_its_measurements(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["speed", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"  {name} " in text for name in SPEED)
 
 
 def test_a_command_of_two_words_is_found_by_both(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -72,7 +65,7 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out.strip() == version("spike4dgs")
 
 
-@pytest.mark.parametrize("command", [*COMMANDS.values(), *SPEED.values()], ids=lambda c: c.target)
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=lambda c: c.target)
 def test_every_command_exists(command: Command) -> None:
     for target in (command.target, *command.needs):
         module, _, function = target.partition(":")
@@ -167,14 +160,6 @@ def test_a_command_is_given_the_functions_of_other_rooms_that_it_needs(monkeypat
         cli, "COMMANDS", {"double": Command(f"{here}:make_double", "", "double", needs=(f"{here}:add",))}
     )
     assert cli.load("double")(4) == 8
-
-
-def test_speed_passes_the_rest_of_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Any] = []
-    monkeypatch.setattr(cli, "SPEED", {"x": Command("m:f", "measure", "speed x")})
-    monkeypatch.setattr(cli, "_load", lambda command: lambda argv: seen.append(argv))
-    assert main(["speed", "x", "--frames", "10"]) == 0
-    assert seen == [["--frames", "10"]]
 
 
 def test_score_prints_a_table_and_writes_a_record(

@@ -10,7 +10,7 @@ from typing import get_args
 
 import pytest
 
-from spike4dgs.cli import COMMANDS, SPEED, main
+from spike4dgs.cli import COMMANDS, main
 from spike4dgs.cli.completion import Shell, script
 
 
@@ -27,13 +27,13 @@ def completed(folder: Path, *words: str) -> list[str]:
 
 def test_bash_completes_commands_and_leaves_the_rest_to_files(tmp_path: Path) -> None:
     words = dict.fromkeys(name.partition(" ")[0] for name in COMMANDS)
-    assert completed(tmp_path, "") == [*words, "speed", "--help", "--version"]
+    assert completed(tmp_path, "") == [*words, "--help", "--version"]
     assert completed(tmp_path, "release", "") == ["pack", "check"]
     assert completed(tmp_path, "download", "") == ["weights"]
     assert completed(tmp_path, "run-") == ["run-benchmark"]
-    assert completed(tmp_path, "speed", "") == list(SPEED)
+    assert completed(tmp_path, "speed", "") == ["render", "record", "images"]
     assert completed(tmp_path, "completion", "z") == ["zsh"]
-    assert completed(tmp_path, "verify", "") == [] == completed(tmp_path, "speed", "splat", "")
+    assert completed(tmp_path, "verify", "") == [] == completed(tmp_path, "speed", "render", "")
     assert "complete -o bashdefault -o default" in script("bash"), "no word offered: file names are"
 
 
@@ -41,7 +41,7 @@ def test_bash_completes_commands_and_leaves_the_rest_to_files(tmp_path: Path) ->
 def test_the_shell_can_read_its_script(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     text = capsys.readouterr().out
-    assert all(word in text for name in (*COMMANDS, *SPEED) for word in name.split())
+    assert all(word in text for name in COMMANDS for word in name.split())
     assert text.count("'") % 2 == 0
     if not (program := shutil.which(shell)):
         pytest.skip(f"no {shell} here")

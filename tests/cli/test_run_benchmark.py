@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -229,11 +228,11 @@ def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_track_and_table_6_are_modes_of_their_own(
     small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, measured = tmp_path / "out", list[Sequence[str]]()
-    monkeypatch.setattr("spike4dgs.studies.images.images", lambda arguments: measured.append(arguments) or 0)
+    out, measured = tmp_path / "out", list[tuple[Path, ...]]()
+    monkeypatch.setattr("spike4dgs.studies.images.images", lambda scenes, **_: measured.append(scenes) or 0)
     monkeypatch.setattr(command, "track_scenes", lambda name: {small_scene.name: open_scene(small_scene).revision})
     assert run_benchmark((small_scene,), table=6, out=out) == 0 and not out.exists()
-    assert measured == [[str(small_scene), "--out", str(out)]]
+    assert measured == [(small_scene,)]
     options = {"data": small_scene.parent, "methods": ("counts",), "device": "cpu", "metrics": ("psnr",)}
     assert run_benchmark(track="moon", out=out, **options) == 0
     assert (out / "leaderboard/local").is_dir(), "the scenes of the track are those in the folder"

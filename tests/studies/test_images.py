@@ -168,7 +168,7 @@ def test_without_scenes_only_time_is_measured(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(images, "SPIKEZOO", {})
     for name, value in {"WIDTH": 40, "HEIGHT": 24, "TICKS": 60}.items():
         monkeypatch.setattr(images, name, value)
-    assert images.images(["--repeats", "1", "--out", str(tmp_path)]) == 0
+    assert images.images(repeats=1, out=tmp_path) == 0
     row = read_rows(tmp_path / "images.csv")["tfp"]
     assert float(row["ms 40x24"]) > 0 and row["PSNR"] == row["ms, scene"] == "-"
     assert not list(tmp_path.glob("*.png"))

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.arrays import UInt8
+from spike4dgs.cli import main
 from spike4dgs.generators.recorder import disk as disk
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.studies import recorder_runs as speed_runs
-from spike4dgs.studies.recorder import COLUMNS, DISK_COLUMNS, RUN_COLUMNS, left_s, limit, not_sustained, record
+from spike4dgs.studies.recorder import COLUMNS, DISK_COLUMNS, RUN_COLUMNS, left_s, limit, not_sustained
 from spike4dgs.studies.recorder_runs import FRAME_BYTES, Load, Outcome, disk_rate, run
 
 SLOW = Load(cameras=2, fps=400, transfer_bytes=16384, transfers=16, memory_bytes=1 << 24, buffer_s=5.0)
@@ -94,7 +95,7 @@ def test_the_disk_alone_writes_as_many_bytes_and_keeps_none(tmp_path: Path, monk
 
 def test_the_command_writes_all_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--cameras 2 --fps 400 --seconds 0.05 --transfer-kib 16 --memory-kib 16384 --disk-seconds 0.05 --runs 2"
-    assert record([*arguments.split(), "--disk", str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
+    assert main(["speed", "record", *arguments.split(), "--disk", str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
     lines = list(csv.reader((tmp_path / "t.csv").read_text().splitlines()))
     assert lines[0] == list(COLUMNS)
     assert [line[:2] for line in lines[1:]] == [["16 queued", "2"], ["one at a time", "2"]]
