@@ -122,21 +122,9 @@ def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
 
 
 def _load(command: Command) -> Callable[..., Any]:
-    function = _import(command.target)
-    if not command.needs:
-        return function
-    made: Callable[..., Any] = function(*map(_imported_when_called, command.needs))
-    return made
-
-
-def _import(target: str) -> Callable[..., Any]:
-    module, _, function = target.partition(":")
+    module, _, function = command.target.partition(":")
     found: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return found
-
-
-def _imported_when_called(target: str) -> Callable[..., Any]:
-    return lambda *args, **kwargs: _import(target)(*args, **kwargs)
 
 
 def _overview(prog: str, table: Mapping[str, Command]) -> str:

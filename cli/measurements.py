@@ -1,7 +1,4 @@
-"""The commands that measure: reports, and the speed of single parts.
-
-A report is one line of the table, `report NAME`; the measurements that rooms contribute to it are among its `needs`.
-"""
+"""The commands that measure the project: each is a study's own function."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ MEASUREMENTS: dict[str, Command] = {
         "report speed-error --quick --out runs/speed-error",
     ),
     "report hard-cases": Command(
-        "spike4dgs.studies.hard_cases:hard_cases",
+        "spike4dgs.cli.hard_cases:hard_cases",
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
         "report hard-cases --out runs/hard-cases",
     ),

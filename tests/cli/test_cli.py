@@ -5,7 +5,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -67,9 +66,8 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=lambda c: c.target)
 def test_every_command_exists(command: Command) -> None:
-    for target in (command.target, *command.needs):
-        module, _, function = target.partition(":")
-        assert callable(getattr(importlib.import_module(module), function))
+    module, _, function = command.target.partition(":")
+    assert module.startswith("spike4dgs.cli.") and callable(getattr(importlib.import_module(module), function))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -138,28 +136,6 @@ def test_an_interruption_is_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_load_finds_the_functions() -> None:
     assert cli.load("score") is score
-
-
-def add(a: int, b: int) -> int:
-    """Return the sum."""
-    return a + b
-
-
-def make_double(adder: Callable[[int, int], int]) -> Callable[[int], int]:
-    """Return a command that doubles a number by the adder that it is given."""
-
-    def double(number: int) -> int:
-        return adder(number, number)
-
-    return double
-
-
-def test_a_command_is_given_the_functions_of_other_rooms_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = __name__
-    monkeypatch.setattr(
-        cli, "COMMANDS", {"double": Command(f"{here}:make_double", "", "double", needs=(f"{here}:add",))}
-    )
-    assert cli.load("double")(4) == 8
 
 
 def test_score_prints_a_table_and_writes_a_record(
