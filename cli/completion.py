@@ -1,4 +1,8 @@
-"""`completion`: print a script that completes commands in a shell; everything after a command completes as files."""
+"""`completion`: print a script that completes commands in a shell; everything after a command completes as files.
+
+tyro writes such scripts too, but none for fish; with commands that load lazily theirs start Python at each Tab and
+offer no file names.
+"""
 
 from __future__ import annotations
 
