@@ -19,7 +19,7 @@ _RENDER = """
 import sys
 import numpy as np
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.profiles import cameras
+from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
 world = WORLDS["car"].build(0, 0, 0.02)
 renderer = MultiViewRenderer(world, cameras(world, 32, 20, (4,)), seed=0, spp=32, background_spp=128)
