@@ -128,10 +128,10 @@ def _capture(worse: Imperfections, scene: Path, out: Path, seed: int) -> None:
     if (out / "clip" / "manifest.json").exists():
         return
     shutil.rmtree(out, ignore_errors=True)
-    light = {"flat": out / "flat", "dark": out / "dark"}
-    for mode, folder in light.items():
-        record(emulate=scene, out=folder, mode=mode, worse=worse, seed=seed)
-    record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, **light)
+    flat, dark = out / "flat", out / "dark"
+    record(emulate=scene, out=flat, mode="flat", worse=worse, seed=seed)
+    record(emulate=scene, out=dark, mode="dark", worse=worse, seed=seed)
+    record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, flat=flat, dark=dark)
 
 
 def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:

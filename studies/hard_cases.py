@@ -86,7 +86,7 @@ def hard_cases(
         raise problem("--only", "a part of the name of a test marked hard_case", repr(only), "choose another part")
     if code > pytest.ExitCode.TESTS_FAILED:
         raise problem(f"tests of {root}", "tests that run", f"exit code {int(code)} of pytest", "see the lines above")
-    report = {
+    report: dict[str, Any] = {
         "format": FORMAT, "seed": seed, "device": where, "only": only, "started": start, "finished": utc_now(),
         "command": command_line(), "harness": harness(), "environment": environment(where),
         "cases": list(found.rows.values()),

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -162,13 +163,13 @@ def make_table(ladder: Ladder, scenes: Sequence[str], records: Sequence[Record])
     return LadderTable(ladder.method, tuple(scenes), rows)
 
 
-def _of_seeds(cells: Sequence[dict[str, object]]) -> Cell:
+def _of_seeds(cells: Sequence[dict[str, Any]]) -> Cell:
     errors = [str(c["error"]) for c in cells if c["error"]]
     found = [{**dict.fromkeys(COLUMNS), **_metrics(c), "fit_seconds": c["fit_seconds"]} for c in cells]
     return Cell({name: mean([v[name] for v in found]) for name in COLUMNS}, "; ".join(errors))
 
 
-def _metrics(cell: dict[str, object]) -> dict[str, object]:
+def _metrics(cell: dict[str, Any]) -> dict[str, Any]:
     metrics = cell["metrics"]
     return {name: metrics[name] for name in _GAINS} if isinstance(metrics, dict) else {}
 

@@ -6,8 +6,6 @@ spikes with PSNR, and of those of the moving region with the PSNR there. 1 is th
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +21,7 @@ from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_fi
 from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, has_truth
 from spike4dgs.benchmark.runs.score import open_for, score_scene
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.studies.kit.timing import markdown, write_csv
 
 FEWEST = 3  # methods with two values, of which an order says something
 Scores = dict[str, dict[str, Values]]  # scene -> method -> metrics
@@ -65,7 +64,9 @@ def spike_agreement(
         raise problem("runs", "predictions/METHOD/SCENE of scenes with ground truth", "none", fix)
     found = correlations(scores)
     write_text(out / "agreement.md", to_markdown(found, scores))
-    write_text(out / "agreement.csv", to_csv(scores))
+    ids = [*next(iter(next(iter(scores.values())).values()))]
+    rows = ([scene, method, *(v[i] for i in ids)] for scene, of in scores.items() for method, v in of.items())
+    write_csv(out / "agreement.csv", ["scene", "method", *ids], rows)
     write_json(out / "agreement.json", {"correlations": found, "mean": means(found), "scores": scores})
     write_plot(out / "agreement.png", scores)
     for metric, mean in means(found).items():
@@ -116,33 +117,18 @@ def to_markdown(found: Correlations, scores: Mapping[str, Mapping[str, Values]])
     """Return the correlations as a Markdown table: a row for each metric, a column for each scene."""
     mean = means(found)
 
-    def row(cells: Sequence[str]) -> str:
-        return f"| {' | '.join(cells)} |"
-
     lines = [
         "# Rank correlation of the metrics of spikes with PSNR",
         "",
         "Spearman's, over methods; the metrics of the moving region with the PSNR of that region. 1 is the same order.",
         "",
-        row(["metric", *scores, "mean"]),
-        row(["---"] * (len(scores) + 2)),
-        row(["methods", *(str(len(methods)) for methods in scores.values()), ""]),
     ]
+    rows = [["methods", *(str(len(methods)) for methods in scores.values()), ""]]
     for metric, of_scenes in found.items():
         values = [*(of_scenes[scene] for scene in scores), mean[metric]]
-        lines.append(row([f"`{metric}`", *("-" if v is None else f"{v:.3f}" for v in values)]))
+        rows.append([f"`{metric}`", *("-" if v is None else f"{v:.3f}" for v in values)])
+    lines += markdown(["metric", *scores, "mean"], rows)
     return "\n".join(lines) + "\n"
-
-
-def to_csv(scores: Mapping[str, Mapping[str, Values]]) -> str:
-    """Return the scores as CSV: a row for each scene and method."""
-    out = io.StringIO()
-    first = next(iter(next(iter(scores.values())).values()))
-    writer = csv.DictWriter(out, ["scene", "method", *first], lineterminator="\n")
-    writer.writeheader()
-    for scene, methods in scores.items():
-        writer.writerows({"scene": scene, "method": method, **values} for method, values in methods.items())
-    return out.getvalue()
 
 
 def write_plot(path: Path, scores: Mapping[str, Mapping[str, Values]]) -> None:

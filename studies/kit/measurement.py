@@ -91,7 +91,7 @@ class Measurement:
     x: str  # of the plot, by column
     y: tuple[str, ...]  # a plot each
     run: Run = field(compare=False)
-    seconds: Mapping[str, float] = field(default_factory=dict)  # by size: what it took on two cores, for the estimate
+    seconds: Mapping[Size, float] = field(default_factory=dict)  # by size: what it took on two cores, for the estimate
     held_by: str = ""  # the test that holds the error
     cost: str = ""  # column of the summary, where it is not x
     error: str = ""  # column of the summary, where it is not the first of y
@@ -115,7 +115,7 @@ def measurement(
     where a cost grows, the first alone. The first column is the x of plots. `seconds` are those of each size, None
     where it is no part of that size.
     """
-    took = {size: s for size, s in zip(SIZES, seconds, strict=True) if s is not None}
+    took: dict[Size, float] = {size: s for size, s in zip(SIZES, seconds, strict=True) if s is not None}
 
     def made(run: Run) -> Measurement:
         paragraphs = [" ".join(p.split()) for p in (inspect.getdoc(run) or "").split("\n\n")]

@@ -234,7 +234,7 @@ def exponential(request: Request) -> Iterator[Series]:
     found = compared(f"{count} numbers from -8 to 0", calls, errors, request.pick(2, 15, 31), chosen)
 
     def per_number(p: Point) -> Point:
-        times = {name.replace("ms", "ns"): 1e6 * p.values[name] / count for name in ("ms", "median_ms")}
+        times = {name.replace("ms", "ns"): 1e6 * (p.values[name] or 0.0) / count for name in ("ms", "median_ms")}
         return replace(p, values={**times, "relative": p.values["relative"]})
 
     yield replace(found, points=tuple(map(per_number, found.points)))

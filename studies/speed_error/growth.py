@@ -179,7 +179,7 @@ def _metrics(pair: ImagePair) -> dict[str, Call]:
     """Return a call for each metric that is not another one with a gain; a copy of the pair has nothing cached."""
     stream = _stream(pair)
     calls: dict[str, Call] = {
-        m.id: partial(_of_spikes, m, pair, stream) if m.takes == "spikes" else lambda m=m: m.measure(replace(pair))
+        m.id: partial(_of_spikes, m, pair, stream) if m.takes == "spikes" else partial(_anew, m, pair)
         for m in METRICS.values()
         if not m.aligned and m.weights is None
     }
@@ -187,6 +187,10 @@ def _metrics(pair: ImagePair) -> dict[str, Call]:
         network = make_network(net, empty_trunk(net).eval())
         calls[f"lpips_{net}"] = partial(network.distance, pair.truth8, pair.prediction8)
     return {**calls, "metaiqa": partial(predict, metaiqa_network().eval(), pair.prediction8)}
+
+
+def _anew(metric: Metric, pair: ImagePair) -> float | None:
+    return metric.measure(replace(pair))
 
 
 def _stream(pair: ImagePair) -> SpikeStream:

@@ -98,7 +98,7 @@ def makers(request: Request) -> Iterator[Series]:
     scene = open_scene(request.scene())
     windows: dict[str, Maker] = {f"{2 * h} ticks": partial(_window, h) for h in _HALF_WINDOWS}
     yield _judged(scene, windows, f"{2 * HALF_WINDOW} ticks", f"TFP by its window, {scene.id}", request)
-    named = {n: partial(_named, n) for n in IMAGES if request.size != "tiny" or n not in _NETWORKS}
+    named: dict[str, Maker] = {n: partial(_named, n) for n in IMAGES if request.size != "tiny" or n not in _NETWORKS}
     yield _judged(scene, named, "intervals", f"image makers, {scene.id}", request)
 
 
@@ -211,16 +211,16 @@ def half_floats(request: Request) -> Iterator[Series]:
         return {"bytes": size, "relative": float(off.max()), "rms": float(np.sqrt(np.mean(off**2)))}
 
     for name, light in lights.items():
-        calls = {
+        calls: dict[str, Callable[[], Any]] = {
             "float64": partial(np.copy, light),
             "float32": partial(light.astype, np.float32),
             "half floats": partial(light.astype, np.float16),
-            "8-bit sRGB": lambda light=light: _decoded(encode_srgb(light)),  # type: ignore[misc]
+            "8-bit sRGB": partial(_stored_in_8_bits, light),
         }
         yield compared(name, calls, errors, request.pick(1, 3, 5), "half floats")
 
 
-def _decoded(codes: Any) -> Any:
-    """Return the linear radiance of 8-bit sRGB codes (IEC 61966-2-1)."""
-    x = codes / 255
+def _stored_in_8_bits(light: Any) -> Any:
+    """Return the linear radiance of light's 8-bit sRGB codes (IEC 61966-2-1)."""
+    x = encode_srgb(light) / 255
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)

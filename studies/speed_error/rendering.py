@@ -70,7 +70,7 @@ def savings(request: Request) -> Iterator[Series]:
     Where nothing moves the background has more samples than any key. At moving pixels the noise of the samples counts:
     four times as many halve it, for up to four times the time.
 
-    tests/generators/test_audit.py
+    tests/generators/test_truth.py
     """
     for world in OF_SIZE[request.size]:
         yield saved(_job(request, world))

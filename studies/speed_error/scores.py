@@ -20,6 +20,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, bytes_per_tick
 from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, compared, measurement
 
 GROUP = "Metrics and streams"
+Calls = dict[str, Callable[[], float]]
 _COLUMNS = (*TIMES, Column("error", "error of the score"))
 _C1, _C2 = 0.01**2, 0.03**2  # of SSIM, for the data range 1
 
@@ -97,11 +98,11 @@ def scores(request: Request) -> Iterator[Series]:
     """
     for name, pair in pairs(request).items():
         for metric, slowly in (("psnr", psnr_slowly), ("ssim", ssim_slowly)):
-            calls = {
+            calls: Calls = {
                 "extended precision": partial(slowly, pair.truth, pair.prediction),
                 "the score": partial(_score, metric, pair, np.asarray),
                 "of float32 images": partial(_score, metric, pair, np.float32),
-                "of 8-bit images": lambda metric=metric, pair=pair: _score(metric, _in_8_bits(pair), np.asarray),
+                "of 8-bit images": partial(_score, metric, _in_8_bits(pair), np.asarray),
             }
             yield compared(f"{metric.upper()} of {name}", calls, _error, request.pick(1, 3, 7), "the score")
 
@@ -131,7 +132,7 @@ def flip_score(request: Request) -> Iterator[Series]:
     """
     for name, pair in pairs(request).items():
         images = pair.truth8, pair.prediction8
-        calls = {"flip-evaluator, colour": package_flip(*images), "flip": partial(flip, *images)}
+        calls: Calls = {"flip-evaluator, colour": package_flip(*images), "flip": partial(flip, *images)}
         yield compared(f"FLIP of {name}", calls, _error, request.pick(1, 3, 7), "flip")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -112,7 +112,7 @@ def integration(request: Request) -> Iterator[Series]:
     charge = random_charge(height, width, [request.seed])
     for name, keys in light(request.seed, height, width, n_keys).items():
         clip = (keys, key_ticks, ticks, sensor, charge)
-        calls = {
+        calls: dict[str, Callable[[], Any]] = {
             "float64, tick by tick": partial(exact_counts, *clip),
             "numpy, float32": partial(_numpy, *clip),
             "kernel, 1 thread": partial(_kernel, 1, *clip),
@@ -149,7 +149,7 @@ def other_program(request: Request) -> Iterator[Series]:
     np.random.seed(0)  # noqa: NPY002
     charge = (np.random.random((height, width)) * THRESHOLD).astype(np.int32)  # noqa: NPY002
     clip = (keys, key_ticks, ticks, sensor, charge)
-    calls = {
+    calls: dict[str, Callable[[], Any]] = {
         "float64, tick by tick": partial(exact_counts, *clip),
         "spikezoo": theirs,
         "kernel, 1 thread": partial(_kernel, 1, *clip),

@@ -223,8 +223,8 @@ def beside_torch(request: Request) -> Iterator[Series]:
                 values = {"count": n, "ms": best, "median_ms": median}
                 values["image"] = float((image - theirs[n][0]).abs().max())
                 if backward and channels == 1:  # of three channels ours weighs all
-                    pairs = zip(found, theirs[n][1], strict=True)
-                    pairs = ((a, b[..., : a.shape[-1]] if a.ndim == 2 else b) for a, b in pairs)
+                    both = zip(found, theirs[n][1], strict=True)
+                    pairs = ((a, b[..., : a.shape[-1]] if a.ndim == 2 else b) for a, b in both)
                     values["gradient"] = max(float((a - b).norm() / b.norm()) for a, b in pairs)
                 points.append(Point(str(n), values))
             what = "with gradients" if backward else "images"
