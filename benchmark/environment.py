@@ -8,6 +8,7 @@ known only from a trial, so one is made: a kernel of one line, compiled and run 
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 import shlex
@@ -220,6 +221,8 @@ def cpu_name() -> str:
 
 def available_cores() -> int:
     """Return the number of cores that this process may use; those of the machine where the system does not tell."""
+    if hasattr(os, "sched_getaffinity"):  # Linux: a call that hot paths afford; psutil reads files first
+        return len(os.sched_getaffinity(0))
     process = psutil.Process()
     return len(process.cpu_affinity()) if hasattr(process, "cpu_affinity") else psutil.cpu_count() or 1
 

@@ -1,4 +1,4 @@
-"""`board-clip` of the command line."""
+"""`board-clip`: a scene of a chessboard that moves in front of an array, to record and calibrate with."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.untrusted import MAX_SIDE
+from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_clip import (
     DISTANCE_M,
-    RATE_HZ,
     BoardMotion,
     array,
     in_front,

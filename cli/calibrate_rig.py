@@ -1,4 +1,4 @@
-"""`calibrate-rig` of the command line."""
+"""`calibrate-rig`: intrinsics and poses of an array from clips of a moving chessboard, with a report and an image."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The table of commands.
 
-With `measurements` beside it, it is the one place where rooms meet. Import strings name the commands, and the functions
-of other rooms that a command calls; both are loaded only when they run, so `--help` imports nothing heavy and no room
-imports another for the command line's sake.
+Each row names a function of a module of this room, which is imported when the command runs: `--help` imports nothing
+heavy. Those modules are where rooms meet. The commands that measure the project are in `measurements`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`run-benchmark`: run methods on scenes, then write the table, the images and the leaderboard's entries.
 
-OUT is as `benchmark.runs.benchmark` keeps it, and has leaderboard/ and, for a table of the paper, table.*. A run on
+OUT is as `benchmark.reports.benchmark` keeps it, and has leaderboard/ and, for a table of the paper, table.*. A run on
 another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 """
 

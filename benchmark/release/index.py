@@ -7,6 +7,16 @@
 
 The SHA-256 of release.json pins all of it. A client reads release.json and the lists of those shards alone that hold
 what it wants, so a release of many terabytes costs its clients no more than they take.
+
+A release is a WebDataset: the members of a shard whose names agree up to the first dot of the base name are one sample.
+Here a sample is one camera of a scene, with all that belongs to it, or the scene's own files:
+
+    car-0-small/scene.scene.json                  car-0-small: scene.json
+    car-0-small/cam_00.spikes.dat                 car-0-small: spikes/cam_00.dat
+    car-0-small/cam_00.images.000120.exr          car-0-small: images/cam_00/000120.exr
+
+Names that unpack with `tar xf` into a scene folder would make a sample of every single file. So the list states the
+path of each member, and `spike4dgs download --from FOLDER` unpacks.
 """
 
 from __future__ import annotations

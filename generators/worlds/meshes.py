@@ -1,4 +1,7 @@
-"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the image."""
+"""Procedural triangle meshes. Z is up; texture coordinates have v = 0 at the top row of the image.
+
+Every surface is shaded on both sides, so winding only has to be consistent within one mesh.
+"""
 
 from __future__ import annotations
 

@@ -35,6 +35,7 @@ def hashed(counters: UInt32, seed: int) -> UInt32:
 
 
 def _lowbias32(x: UInt32) -> UInt32:
+    """Return a bijection of 32 bits (C. Wellons, hash-prospector), which the page's JavaScript has too."""
     with np.errstate(over="ignore"):
         x = (x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D)
         x = (x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B)

@@ -6,7 +6,6 @@ The marker says what is asked, the independent `twin`, and the `unit` and `toler
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import ArrayLike
 
+from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import UserError
 
 SETTING = 7, "cpu"  # seed and device; the report sets others
@@ -128,16 +129,19 @@ def described(values: np.ndarray[Any, Any]) -> str:
 
 def core_counts() -> list[int]:
     """Return the numbers of cores to try: 1, 2, 4 ... and all that this process may use."""
-    most = len(os.sched_getaffinity(0))
+    most = available_cores()
     return sorted({min(2**k, most) for k in range(most.bit_length())} | {most})
 
 
 @contextmanager
 def on_cores(count: int) -> Iterator[None]:
     """Run on the first `count` cores of this process only: parts that start a thread a core start that many."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:count])
+    process = psutil.Process()
+    if not hasattr(process, "cpu_affinity"):
+        pytest.skip("this system binds no process to cores")
+    before = process.cpu_affinity()
+    process.cpu_affinity(before[:count])
     try:
         yield
     finally:
-        os.sched_setaffinity(0, before)
+        process.cpu_affinity(before)

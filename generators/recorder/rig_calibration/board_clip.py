@@ -25,11 +25,11 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, str
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
-RATE_HZ = 20000
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
 _POSES = 500  # samples of the motion from which its speed is computed
