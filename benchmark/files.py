@@ -64,8 +64,9 @@ def writing(path: Path) -> Iterator[None]:
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success fsync it and rename it into place.
 
-    The temporary name keeps the suffix, because image writers choose the format by it. Raises UserError where the
-    system cannot write the file; whatever goes wrong, nothing half written stays behind.
+    The temporary name keeps the suffix, because image writers choose the format by it. The file has the mode of any new
+    file, whatever wrote it. Raises UserError where the system cannot write the file; whatever goes wrong, nothing half
+    written stays behind.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     with writing(path):
@@ -74,9 +75,25 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield part
             with open(part, "rb+") as f:
                 os.fsync(f.fileno())
+            _open_up(part)
             os.replace(part, path)
         finally:
             part.unlink(missing_ok=True)
+
+
+def _open_up(part: Path) -> None:
+    """Give a file that only its owner may read the mode of any new file beside it, which the umask decides.
+
+    Writers that go through a temporary file of their own, as safetensors does, leave 0600.
+    """
+    if os.name != "posix" or stat.S_IMODE(part.stat().st_mode) != 0o600:
+        return
+    probe = part.with_name(f"{part.name}.mode")
+    try:
+        probe.touch()
+        part.chmod(stat.S_IMODE(probe.stat().st_mode))
+    finally:
+        probe.unlink(missing_ok=True)
 
 
 def check_new(folder: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from dummy_methods import CountMethod, run
 from small_scenes import array_cameras
 
@@ -165,3 +166,15 @@ def test_a_killed_writer_leaves_no_file_under_the_final_name(tmp_path: Path) -> 
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.dat")])
     assert all(p.name.startswith(".") for p in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_every_file_has_the_mode_that_the_umask_gives(tmp_path: Path, umask: int, mode: int) -> None:
+    before = os.umask(umask)
+    try:
+        write_json(tmp_path / "a.json", {})
+        with atomic_path(tmp_path / "a.safetensors") as part:
+            safetensors.numpy.save_file({"x": BIG}, part)
+    finally:
+        os.umask(before)
+    assert {p.name: p.stat().st_mode & 0o777 for p in tmp_path.iterdir()} == {"a.json": mode, "a.safetensors": mode}
