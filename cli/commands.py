@@ -13,6 +13,8 @@ from spike4dgs.cli.measurements import MEASUREMENTS
 MOVED = {
     "run-benchmark --oracle": "report oracle-ladder",
     "run-benchmark --oracle-samples": "report oracle-ladder",
+    "inspect --fps": "inspect --rate-hz",
+    "inspect --top-down": "inspect --rows-top-down",
     "speed splat": "report speed-error --only splat-torch",
     "speed ssim": "report speed-error --only ssim",
     "speed simulate": "report speed-error --only sensor sensor-spikezoo",
@@ -142,7 +144,12 @@ COMMANDS: dict[str, Command] = {
     "inspect": Command(
         "spike4dgs.cli.inspect:inspect",
         "show a scene or a raw spike stream: rates, bad pixels, images",
-        "inspect recording.dat --width 400 --height 250 --fps 20000",
+        "inspect recording.dat --width 400 --height 250 --rate-hz 20000",
+    ),
+    "images": Command(
+        "spike4dgs.cli.images:images",
+        "make images of a raw stream or a scene: PNG, EXR and a slow-motion video",
+        "images recording.dat --width 400 --height 250 --rate-hz 20000 --method tfi --every 20 --out runs/recording",
     ),
     "render": Command(
         "spike4dgs.cli.render:render",

@@ -10,20 +10,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
-from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
-from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.gaps import present
-from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
-from spike4dgs.benchmark.untrusted import MAX_HZ
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.cli.options import warn_of_size
 
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
 _TIMELINE_BINS = 400
@@ -196,39 +194,10 @@ def _write_csv(path: Path, reports: list[StreamReport]) -> None:
     write_text(path, out.getvalue())
 
 
-def _open(
-    path: Path, width: int | None, height: int | None, fps: float | None, top_down: bool, allow_gaps: bool
-) -> dict[str, tuple[SpikeStream, Recordings | None]]:
-    """Return each camera's stream, and its recordings of uniform light and darkness where the scene has them."""
-    size = {"--width": width, "--height": height, "--fps": fps}
-    if path.is_dir():
-        if given := [name for name, value in size.items() if value is not None]:
-            raise problem(
-                ", ".join(given), "nothing for a folder, which states its own size", "values", "leave them out"
-            )
-        if (path / STREAM_FOLDER).is_file():
-            return {camera: (stream, None) for camera, stream in open_stream_folder(path, allow_gaps).items()}
-        scene = open_scene(path, allow_gaps)
-        return {camera: (scene.stream(camera), scene.recordings(camera)) for camera in scene.cameras}
-    if not path.exists():
-        raise problem(path, "a stream file or a scene folder", "no such file", "check the path")
-    if width is None or height is None or fps is None:
-        missing = ", ".join(name for name, value in size.items() if value is None)
-        raise problem(
-            path, "--width, --height and --fps for a headerless stream", f"no {missing}", "state the camera's"
-        )
-    if not 0 < fps <= MAX_HZ:
-        raise problem("--fps", f"a positive rate, {MAX_HZ:g} at most", f"{fps:g}", "state the camera's")
-    return {path.stem: (open_stream(path, width, height, fps, rows_bottom_up=not top_down), None)}
-
-
 def inspect(
     path: Positional[Path],
     *,
-    width: int | None = None,
-    height: int | None = None,
-    fps: float | None = None,
-    top_down: bool = False,
+    dat_file: OmitArgPrefixes[DatFile] = DAT_FILE,
     out: Path = Path("runs/inspect"),
     allow_gaps: bool = False,
 ) -> int:
@@ -239,22 +208,22 @@ def inspect(
 
     Args:
         path: A scene folder, a folder of imported streams, or a headerless .dat file.
-        width: Pixels per row of a .dat file.
-        height: Rows of a .dat file.
-        fps: Ticks per second of a .dat file.
-        top_down: The first row of a .dat file is the top one (cameras of this kind store the bottom row first).
         out: Folder for a folder of this name: one PNG per stream, and statistics.csv.
         allow_gaps: Accept recordings with gaps.
     """
-    streams = _open(path, width, height, fps, top_down, allow_gaps)
+    opened = open_streams(path, dat_file, allow_gaps)
+    scene = opened if isinstance(opened, Scene) else None
+    streams = {camera: opened.stream(camera) for camera in opened.cameras} if isinstance(opened, Scene) else opened
+    if not path.is_dir():
+        warn_of_size(streams)
     folder = out / (path.resolve().name if path.is_dir() else path.stem)
     reports = []
-    for name, (stream, recordings) in streams.items():
-        reports.append(examine(name, stream, recordings))
+    for name, stream in streams.items():
+        reports.append(examine(name, stream, scene.recordings(name) if scene else None))
         write_image(folder / f"{name}.png", reports[-1], stream)
     _print_reports(reports)
     _write_csv(folder / "statistics.csv", reports)
-    for gap in (gap for stream, _ in streams.values() for gap in stream.gaps):
+    for gap in (gap for stream in streams.values() for gap in stream.gaps):
         print(f"{gap.camera}: no data in ticks [{gap.first_tick}, {gap.stop_tick}): {gap.ticks} ticks, {gap.reason}")
     print(f"images and statistics.csv: {folder}")
     return 0

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from tyro.conf import arg
+
+from spike4dgs.benchmark.spikes.image_size import size_doubt
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 From = Annotated[str | None, arg(name="from")]  # where a release or a weight file is fetched from
 
@@ -42,3 +47,9 @@ class Compute:
 
 
 COMPUTE = Compute()
+
+
+def warn_of_size(streams: Mapping[str, SpikeStream]) -> None:
+    """Print a line for each stream whose given size looks wrong."""
+    for doubt in filter(None, map(size_doubt, streams.values())):
+        print(f"warning: {doubt}", file=sys.stderr)

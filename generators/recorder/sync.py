@@ -123,9 +123,9 @@ class SyncReport:
         return _without_nan(asdict(self) | {"suspect": [c.camera for c in self.cameras if c.suspect]})
 
 
-def fit_arrival(clip: Clip, fps: float) -> SyncReport:
-    """Fit every camera of a clip whose nominal rate is `fps` ticks per second."""
-    nominal_ns = 1e9 / fps
+def fit_arrival(clip: Clip, rate_hz: float) -> SyncReport:
+    """Fit every camera of a clip whose nominal rate is `rate_hz` ticks per second."""
+    nominal_ns = 1e9 / rate_hz
     lines = {c.camera: _theil_sen(c.arrival.astype(np.float64)) for c in clip.cameras}
     known = {camera: line for camera, line in lines.items() if not math.isnan(line.slope)}
     middle = float(np.median([line.height for line in known.values()])) if known else math.nan

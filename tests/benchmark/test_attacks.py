@@ -351,7 +351,7 @@ def test_texts_of_model_files(tmp_path: Path, name: str, old: str, new: str, mes
         "import-dat SCENE --width 40 --height 24 --rate-hz nan --out OUT",
         "import-dat SCENE --width 100000000 --height 1 --rate-hz 1 --out OUT",
         "import-spikecv SCENE --rate-hz inf --out OUT",
-        "inspect SCENE --fps nan",
+        "inspect SCENE --rate-hz nan",
         "fit SCENE --out OUT --budget nan",
         "fit SCENE --out OUT --budget 1e300",
         "speed record --seconds nan",

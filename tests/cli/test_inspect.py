@@ -11,6 +11,7 @@ from PIL import Image
 from small_scenes import shared_file
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.streams import DatFile
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
@@ -97,7 +98,7 @@ def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.Ca
     fired = np.random.default_rng(2).random((60, 24, 40)) < np.where(np.arange(24) < 12, 0.6, 0.05)[:, None]
     with SpikeWriter(tmp_path / "top.dat", 40, 24) as writer:
         writer.write(pack(fired))
-    assert inspect(tmp_path / "top.dat", width=40, height=24, fps=20_000, out=tmp_path / "out") == 0
+    assert inspect(tmp_path / "top.dat", dat_file=DatFile(40, 24, 20_000), out=tmp_path / "out") == 0
     with Image.open(tmp_path / "out" / "top" / "top.png") as png:
         image = np.asarray(png.convert("L"), np.float64)
     height, width = image.shape
@@ -138,10 +139,11 @@ def test_the_table_is_whole_in_a_pipe_and_in_a_file(
     ("arguments", "message"),
     [
         (["missing.dat"], "no such file"),
-        (["short.dat", "--width", "40", "--height", "24", "--fps", "20000"], "whole ticks of 120 bytes"),
-        (["short.dat", "--width", "40"], "no --height, --fps"),
-        (["short.dat", "--width", "40", "--height", "24", "--fps", "0"], "a positive rate"),
+        (["short.dat", "--width", "40", "--height", "24", "--rate-hz", "20000"], "whole ticks of 120 bytes"),
+        (["short.dat", "--width", "40"], "no --height, --rate-hz"),
+        (["short.dat", "--width", "40", "--height", "24", "--rate-hz", "0"], "a positive rate"),
         (["scene", "--width", "40"], "nothing for a folder"),
+        (["short.dat", "--width", "40", "--height", "24", "--fps", "20000"], "use `spike4dgs inspect --rate-hz`"),
     ],
 )
 def test_bad_input_is_one_line(

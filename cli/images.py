@@ -1,0 +1,101 @@
+"""`images`: the images of a recording, from its spikes alone: PNG, EXR and a slow-motion video."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tyro.conf import OmitArgPrefixes, Positional
+
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.spikes.bad_pixels import total_counts
+from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.untrusted import MAX_GAIN
+from spike4dgs.cli.options import warn_of_size
+from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_clip_images
+
+_WHITE = 99  # percentile of the pixels' rates that is shown white, where nothing says what white is
+_MOST_FPS = 1000.0
+
+
+def images(
+    path: Positional[Path],
+    *,
+    out: Path,
+    method: str = "tfi",
+    every: int = 20,
+    dat_file: OmitArgPrefixes[DatFile] = DAT_FILE,
+    camera: tuple[str, ...] = (),
+    radiance_gain: float | None = None,
+    fps: float = 30.0,
+    device: str = "auto",
+    allow_gaps: bool = False,
+) -> int:
+    """Make images of a recording from its spikes: a PNG and an EXR each, and a slow-motion video of them all.
+
+    OUT/CAMERA holds the images, named by their ticks, and OUT/CAMERA.mp4 is the video. PNG is 8-bit sRGB, EXR linear
+    radiance with 1 for white. Size and rate are those of a .dat file; a folder states its own. What is finished is
+    kept, a run that was stopped goes on, and other images are never overwritten.
+
+    Args:
+        path: A headerless .dat file, a folder of imported streams, or a scene folder.
+        out: Folder for the images.
+        method: The image maker: tfp, tfi, tfstp, spk2img, adaptive, intervals or msdi.
+        every: Ticks from one image to the next.
+        camera: Cameras; all of a folder of streams, or the training cameras of a scene, if none is named.
+        radiance_gain: Spikes per tick of white. If left out it is the scene's, or for streams alone the rate that 1 %
+            of the pixels exceed.
+        fps: Frames per second of the video.
+        device: Of a method with a network: auto, cpu or cuda.
+        allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
+    """
+    if method not in IMAGES:
+        raise problem("--method", f"one of {', '.join(IMAGES)}", repr(method), "correct the name")
+    _check("--every", every, 1, math.inf, "1 tick or more")
+    _check("--fps", fps, 1e-3, _MOST_FPS, f"0.001 to {_MOST_FPS:g}")
+    if radiance_gain is not None:
+        _check("--radiance-gain", radiance_gain, 1e-6, MAX_GAIN, f"1e-06 to {MAX_GAIN:g} spikes per tick")
+    streams, white = _streams(path, dat_file, camera, allow_gaps)
+    if not path.is_dir():
+        warn_of_size(streams)
+    gain = radiance_gain or white or _white(list(streams.values()))
+    source = "given" if radiance_gain else "the scene's" if white else f"what {100 - _WHITE} % of the pixels exceed"
+    print(f"{method} images of {', '.join(streams)}; white is {gain:.4g} spikes per tick, {source}")
+    maker = IMAGES[method].on(device)
+    for name, stream in streams.items():
+        wanted = ClipImages(name, stream, maker, every, gain, fps)
+        made = write_clip_images(out, wanted)
+        count, seconds = len(wanted.ticks), len(wanted.ticks) / fps
+        print(f"{out / name}: {count} PNG and {count} EXR images" + ("" if made else ", finished before and kept"))
+        print(f"{clip_video(out, name)}: {seconds:.2f} s at {fps:g} frames/s, {wanted.slow_motion:.4g} times slower")
+    return 0
+
+
+def _check(option: str, value: float, least: float, most: float, expected: str) -> None:
+    if not least <= value <= most:
+        raise problem(option, expected, f"{value:g}", "correct it")
+
+
+def _streams(
+    path: Path, dat_file: DatFile, cameras: Sequence[str], allow_gaps: bool
+) -> tuple[dict[str, SpikeStream], float | None]:
+    """Return the streams by camera, and a scene's gain. Raises UserError for a camera that is not there."""
+    opened = open_streams(path, dat_file, allow_gaps)
+    known = list(opened.cameras) if isinstance(opened, Scene) else list(opened)
+    if missing := [name for name in cameras if name not in known]:
+        raise problem("--camera", f"among {', '.join(known)}", missing[0], "correct the name")
+    if isinstance(opened, Scene):
+        return {name: opened.stream(name) for name in cameras or opened.train}, opened.radiance_gain
+    return {name: opened[name] for name in cameras or known}, None
+
+
+def _white(streams: Sequence[SpikeStream]) -> float:
+    """Return the rate, in spikes per tick, that 1 % of the pixels of all streams exceed; 1 where nothing fired."""
+    rates = [total_counts(s) / max(int(present(s.gaps, s.n_ticks).sum()), 1) for s in streams]
+    return float(np.percentile(np.concatenate([rate.ravel() for rate in rates]), _WHITE)) or 1.0

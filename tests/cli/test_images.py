@@ -1,0 +1,196 @@
+"""`images` on a bare stream, a folder of streams and a scene: what it writes, keeps, refuses and proposes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, shared_file
+
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.exchange.dat import import_dat
+from spike4dgs.benchmark.exchange.recording import Recording
+from spike4dgs.benchmark.files import read_json, write_json
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.stream import open_stream
+from spike4dgs.cli import main
+from spike4dgs.method.images import clip_images
+
+SIZE = ["--width", str(WIDTH), "--height", str(HEIGHT), "--rate-hz", "20000"]
+
+
+@pytest.fixture
+def dat(small_scene: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "clip.dat"
+    path.write_bytes((small_scene / "spikes/cam_01.dat").read_bytes())
+    return path
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    video, found = cv2.VideoCapture(str(path)), []
+    while (read := video.read())[0]:
+        found.append(read[1][..., 0])
+    return found
+
+
+@pytest.mark.parametrize("method", IMAGES)
+def test_every_maker_makes_the_images_of_a_dat_file(dat: Path, tmp_path: Path, method: str) -> None:
+    out = tmp_path / "out"
+    assert main(["images", str(dat), *SIZE, "--method", method, "--every", "40", "--out", str(out)]) == 0
+    assert sorted(p.name for p in (out / "clip").iterdir()) == [
+        *("000000.exr", "000000.png", "000040.exr", "000040.png"),
+        "images.json",
+    ]
+    stream = open_stream(dat, WIDTH, HEIGHT, 2e4)
+    white = float(np.percentile(stream.window(0, TICKS).mean(axis=0), 99))
+    expected = IMAGES[method](stream, [40], white)[0]
+    np.testing.assert_allclose(read_exr(out / "clip/000040.exr"), expected, rtol=1e-3, atol=1e-6)
+    np.testing.assert_array_equal(read_png(out / "clip/000040.png"), encode_srgb(expected))
+
+
+def test_the_video_has_a_frame_for_each_image(dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(dat), *SIZE, "--every", "10", "--fps", "25", "--out", str(tmp_path / "out")]
+    assert main(["images", *arguments]) == 0
+    shown = frames(tmp_path / "out/clip.mp4")
+    assert len(shown) == 8 and shown[0].shape == (HEIGHT, WIDTH)
+    image = read_png(tmp_path / "out/clip/000040.png").astype(float)
+    assert np.abs(shown[4] - image).mean() < 20
+    printed = capsys.readouterr().out
+    assert "0.32 s at 25 frames/s, 80 times slower" in printed and str(tmp_path / "out/clip") in printed
+
+
+def test_an_odd_size_has_a_video_too(tmp_path: Path) -> None:
+    (tmp_path / "odd.dat").write_bytes(np.random.default_rng(0).integers(0, 256, 50 * 35, np.uint8).tobytes())
+    size = ["--width", "21", "--height", "13", "--rate-hz", "20000"]
+    assert main(["images", str(tmp_path / "odd.dat"), *size, "--out", str(tmp_path / "out")]) == 0
+    assert frames(tmp_path / "out/odd.mp4")[0].shape == (14, 22)
+    assert read_png(tmp_path / "out/odd/000020.png").shape == (13, 21)
+
+
+def test_a_scenes_training_cameras_or_those_that_are_named(small_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(["images", str(small_scene), "--every", "40", "--out", str(out)]) == 0
+    assert sorted(p.name for p in out.iterdir() if p.is_dir()) == list(open_scene(small_scene).train)
+    expected = IMAGES["tfi"](open_scene(small_scene).stream("cam_01"), [40], GAIN)[0]
+    np.testing.assert_allclose(read_exr(out / "cam_01/000040.exr"), expected, rtol=1e-3)
+    assert main(["images", str(small_scene), "--every", "40", "--out", str(out), "--camera", "cam_03", "cam_00"]) == 0
+    assert (out / "cam_03.mp4").is_file()
+
+
+def test_a_folder_of_streams(dat: Path, tmp_path: Path) -> None:
+    import_dat(dat, tmp_path / "in", width=WIDTH, height=HEIGHT, recording=Recording(20000.0))
+    assert main(["images", str(tmp_path / "in"), "--every", "40", "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out/clip/000040.png").is_file()
+
+
+def test_what_is_finished_is_kept_and_nothing_is_overwritten(
+    dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["images", str(dat), *SIZE, "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "out").rglob("*.*")}
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert "finished before and kept" in capsys.readouterr().out
+    for other, message in (
+        (["--method", "tfp"], "expected images with maker tfp, found tfi"),
+        (["--every", "10"], "expected images with every 10, found 20"),
+        (["--rows-top-down"], "expected images with rows_bottom_up False, found True"),
+    ):
+        assert main([*arguments, *other]) == 2
+        error = capsys.readouterr().err
+        assert message in error and "choose another --out" in error and error.count("\n") == 1
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in before} == before
+    (tmp_path / "foreign/clip").mkdir(parents=True)
+    (tmp_path / "foreign/clip/notes.txt").write_text("mine")
+    assert main([*arguments[:-1], str(tmp_path / "foreign")]) == 2
+    assert "found other files" in capsys.readouterr().err
+
+
+def test_a_stopped_run_goes_on(dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments, out = ["images", str(dat), *SIZE, "--every", "10", "--out"], tmp_path / "out"
+    assert main([*arguments, str(tmp_path / "whole")]) == 0
+    write, done = clip_images.write_png, []
+
+    def stop(path: Path, image: np.ndarray) -> None:
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(path)
+        write(path, image)
+
+    monkeypatch.setattr(clip_images, "write_png", stop)
+    assert main([*arguments, str(out)]) == 130
+    assert len(list(out.rglob("*.png"))) == 3 and not (out / "clip.mp4").exists()
+    monkeypatch.setattr(clip_images, "write_png", write)
+    kept = done[0].stat().st_mtime_ns
+    assert main([*arguments, str(out)]) == 0
+    assert done[0].stat().st_mtime_ns == kept and read_json(out / "clip/images.json", "images")["complete"] is True
+    for whole in (tmp_path / "whole").rglob("*.*"):
+        assert (out / whole.relative_to(tmp_path / "whole")).read_bytes() == whole.read_bytes()
+
+
+def test_images_at_missing_ticks_are_left_out(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meta = read_json(small_scene / "scene.json", "a scene")
+    write_json(
+        small_scene / "scene.json",
+        {**meta, "gaps": [{"camera": "cam_01", "first_tick": 35, "ticks": 10, "reason": "test"}]},
+    )
+    write_manifest(small_scene)
+    arguments = ["images", str(small_scene), "--camera", "cam_01", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    assert "a recording without gaps" in capsys.readouterr().err
+    assert main([*arguments, "--allow-gaps"]) == 0
+    assert sorted(p.stem for p in (tmp_path / "out").rglob("*.png")) == ["000000", "000020", "000060"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "no --width, --height, --rate-hz; state the camera's; its length fits 64x40"),
+        ([*SIZE, "--method", "tvs"], "--method: expected one of tfp, tfi, tfstp, "),
+        ([*SIZE, "--every", "0"], "--every: expected 1 tick or more, found 0"),
+        ([*SIZE, "--fps", "0"], "--fps: expected 0.001 to 1000, found 0"),
+        ([*SIZE, "--radiance-gain", "-1"], "--radiance-gain: expected"),
+        ([*SIZE, "--camera", "cam_09"], "--camera: expected among clip, found cam_09"),
+        (["--width", "41", *SIZE[2:]], "whole ticks of 123 bytes (41x24)"),
+        (["--width", "0", *SIZE[2:]], "--width and --height: expected 1 to"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_write_nothing(
+    dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert main(["images", str(dat), *arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_network_without_weights_says_what_it_needs(
+    dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SPIKE4DGS_MSDI", str(tmp_path / "absent.safetensors"))
+    assert main(["images", str(dat), *SIZE, "--method", "msdi", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "expected weights of MSDI" in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_the_real_recording_and_a_swapped_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(shared_file("data/real_spikes/car_100kmh_250x400_200f.dat"))
+    assert main(["images", path, "--out", str(tmp_path / "none")]) == 2
+    fits = "its length fits 400x250, 200x125, 1000x1000, its rows 400x250 best"
+    assert fits in capsys.readouterr().err
+    arguments = ["images", path, "--rate-hz", "40000", "--every", "100"]
+    assert main([*arguments, "--width", "400", "--height", "250", "--out", str(tmp_path / "right")]) == 0
+    assert capsys.readouterr().err == ""
+    assert main([*arguments, "--width", "250", "--height", "400", "--out", str(tmp_path / "wrong")]) == 0
+    warning = capsys.readouterr().err
+    assert warning.endswith("try --width 400 --height 250\n") and warning.count("\n") == 1
+    image = read_png(tmp_path / "right/car_100kmh_250x400_200f/000100.png").astype(float)
+    assert image.shape == (250, 400) and image[180:, 200:240].mean() > image[:60].mean(), "the white car, right way up"
+    json.loads((tmp_path / "right/car_100kmh_250x400_200f/images.json").read_text())
