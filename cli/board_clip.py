@@ -8,14 +8,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.untrusted import MAX_SIDE
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.recorder.rig_calibration.board import Board
-from spike4dgs.generators.recorder.rig_calibration.board_clip import (
-    DISTANCE_M,
-    BoardMotion,
-    array,
-    in_front,
-    write_board_clip,
-)
+from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, array, write_board_clip
+from spike4dgs.generators.recorder.rig_calibration.board_place import place_board
 
 _MOST_SECONDS = 3600
 
@@ -28,11 +22,14 @@ def board_clip(
     height: int = 250,
     columns: int = 8,
     rows: int = 5,
-    square_m: float = 0.04,
+    square_m: float | None = None,
     seed: int = 0,
     like: Path | None = None,
 ) -> int:
     """Simulate a chessboard that moves in front of an array of cameras: a scene for `record --emulate`.
+
+    The board is where every camera sees all of it for most of the clip. Where cameras stand far apart it is farther
+    away and larger; its size is printed, for `calibrate-rig --square-m`.
 
     Args:
         out: Folder of the scene.
@@ -41,7 +38,7 @@ def board_clip(
         height: Rows of the cameras.
         columns: Inner corners of the board from left to right.
         rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres.
+        square_m: Side of a square in metres; if left out 0.04, or more where the array needs a larger board.
         seed: Seed of the array's mounting errors and of the sensors.
         like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
     """
@@ -52,9 +49,15 @@ def board_clip(
         found = f"{width}, {height}"
         raise problem("--width and --height", f"whole numbers from 1 to {MAX_SIDE}", found, "correct them")
     n_ticks = round(seconds * RATE_HZ)
-    cameras, distance_m = array(width, height, seed), DISTANCE_M
-    if like is not None:
-        cameras, distance_m = in_front(tuple(open_scene(like).cameras.values()))
-    path = write_board_clip(out, cameras, Board(columns, rows, square_m), BoardMotion(distance_m), n_ticks, seed)
-    print(f"{path}: {n_ticks} ticks of {len(cameras)} cameras")
+    if like is None:
+        place = place_board(array(width, height, seed), columns, rows, square_m, DISTANCE_M)
+    else:
+        place = place_board(tuple(open_scene(like).cameras.values()), columns, rows, square_m)
+    path = write_board_clip(out, place.cameras, place.board, place.motion, n_ticks, seed)
+    print(f"{path}: {n_ticks} ticks of {len(place.cameras)} cameras")
+    print(
+        f"board of {columns} x {rows} corners at {place.distance_m:.2f} m; each camera sees all of it for "
+        f"{min(place.seen.values()):.0%} of the clip or more"
+    )
+    print(f"calibrate-rig needs --columns {columns} --rows {rows} --square-m {place.board.square_m:g}")
     return 0

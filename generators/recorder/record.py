@@ -248,12 +248,22 @@ def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
     table = Table(*columns, title=title)
     for c in clip.cameras:
         s, fit = c.stats, fits[c.camera]
-        drift = f"{fit.drift_ppm:+.0f} +- {fit.drift_error_ppm:.0f}" + (" suspect" if fit.suspect else "")
         buffer = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
         idle = f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
-        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", drift, f"{fit.offset_us:+.0f}", buffer, idle, s.end]
+        row = [
+            c.camera,
+            f"{s.bytes / 1e6:.1f}",
+            f"{s.lost_ticks}",
+            fit.drift_text,
+            f"{fit.offset_us:+.0f}",
+            buffer,
+            idle,
+            s.end,
+        ]
         table.add_row(*row, style="red" if c.gaps else None)
     console.print(table)
+    if any(fit.too_short for fit in sync.cameras):
+        print("the clip is too short to tell the drift of every clock; a second or more tells it")
     if sync.worst_pair:
         print(f"the arrival times of {' and '.join(sync.worst_pair)} differ most, by {sync.worst_pair_us:.0f} us")
     for gap in (gap for c in clip.cameras for gap in c.gaps):

@@ -87,6 +87,10 @@ def spikes_per_tick(layout: Layout, block: Block | None) -> float:
 
 
 SUSPECT_PPM = 100.0  # crystals keep 50 ppm each: more means a rate that differs from the profile's, or lost data
+TELLING_PPM = 50.0  # a larger standard error than crystals' own differences tells nothing: the clip is too short
+# In such a clip, delays that grow or shrink look like drift, many times beyond its standard error: up to 16 of them were
+# seen in 20 ms. Only a rate that is wrong altogether is a hundred away.
+_ERRORS, _ERRORS_TOO_SHORT = 3, 100
 _MOST_READS = 400  # of each camera that are used: all pairs of them are compared
 
 
@@ -103,9 +107,22 @@ class ArrivalFit:
     reads: int
 
     @property
+    def too_short(self) -> bool:
+        """True if the clip cannot tell the drift of a crystal: its error is larger, or unknown."""
+        return not self.drift_error_ppm <= TELLING_PPM
+
+    @property
     def suspect(self) -> bool:
         """True if the rate is off by more than crystals can be, beyond the scatter of the arrivals."""
-        return abs(self.drift_ppm) - 3 * self.drift_error_ppm > SUSPECT_PPM
+        errors = _ERRORS_TOO_SHORT if self.too_short else _ERRORS
+        return abs(self.drift_ppm) - errors * self.drift_error_ppm > SUSPECT_PPM
+
+    @property
+    def drift_text(self) -> str:
+        """The drift for people, with its standard error, or that the clip is too short to tell."""
+        if self.too_short and not self.suspect:
+            return "too short to tell"
+        return f"{self.drift_ppm:+.0f} +- {self.drift_error_ppm:.0f}" + (" suspect" if self.suspect else "")
 
 
 @dataclass(frozen=True)

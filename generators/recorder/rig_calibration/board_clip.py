@@ -19,8 +19,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.metrics.pose_error import Sim3
-from spike4dgs.benchmark.scene.cameras import Camera, array_axes, look_at
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
@@ -91,18 +90,6 @@ def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M
         R = wobble @ c.R
         cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ center))
     return tuple(cameras)
-
-
-def in_front(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], float]:
-    """Return the cameras of any array in the board's frame, and the distance at which they see it as those of `array`.
-
-    Camera-to-camera poses are the array's own. The frame's origin is that far in front of the array's middle.
-    """
-    W, centers = array_axes(cameras), np.stack([c.center for c in cameras])
-    half_field = max(c.width / (2 * c.fx) for c in cameras)
-    distance_m = DISTANCE_M * math.tan(math.radians(FIELD_DEG) / 2) / half_field
-    frame = Sim3(1.0, W, -W @ centers.mean(axis=0) - [0.0, distance_m, 0.0])
-    return tuple(map(frame.camera, cameras)), distance_m
 
 
 def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float32:

@@ -86,11 +86,29 @@ def test_a_rate_that_no_crystal_has_is_suspect() -> None:
     assert found.as_dict()["suspect"] == ["b"]
 
 
+def test_a_clip_too_short_to_tell_says_so_instead_of_a_number() -> None:
+    rng = np.random.default_rng(3)
+    for n in (20, 100):  # 20 and 100 ms at 20 kHz, read in bursts; delays grow by a millisecond on the way
+        late = np.linspace(0, 1000, n) + rng.normal(0, 400, n)
+        camera = fit_arrival(clip_of({"a": arrivals(0, 0, late)}, 20 * n), FPS).cameras[0]
+        assert camera.drift_ppm > 3 * camera.drift_error_ppm > 300, "what standard errors alone would believe"
+        assert camera.too_short and not camera.suspect and camera.drift_text == "too short to tell"
+    long = fit_arrival(clip_of({"a": arrivals(30, 0, rng.normal(0, 400, 2000))}, 40_000), FPS).cameras[0]
+    assert not long.too_short and long.drift_text == f"{long.drift_ppm:+.0f} +- {long.drift_error_ppm:.0f}"
+
+
+def test_a_rate_twice_the_stated_one_is_suspect_in_a_short_clip_too() -> None:
+    late = np.random.default_rng(4).normal(0, 400, 100)
+    camera = fit_arrival(clip_of({"a": arrivals(-5e5, 0, late)}, 2000), FPS).cameras[0]
+    assert camera.too_short and camera.suspect and camera.drift_text.endswith(" suspect")
+
+
 def test_a_camera_with_too_few_reads_is_not_known_and_json_says_null() -> None:
     good, few = arrivals(0, 0, np.zeros(50)), arrivals(0, 0, np.zeros(2))
     found = fit_arrival(clip_of({"a": good, "b": few}, 1000), FPS)
     assert math.isnan(found.cameras[1].drift_ppm) and found.cameras[1].reads == 2
     assert found.worst_pair is None and not found.cameras[1].suspect
+    assert found.cameras[1].drift_text == "too short to tell"
     record = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert record["method"] == ARRIVAL_TIMES
     assert record["cameras"][1]["drift_ppm"] is None and record["worst_pair_us"] is None
