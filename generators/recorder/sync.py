@@ -88,8 +88,8 @@ def spikes_per_tick(layout: Layout, block: Block | None) -> float:
 
 SUSPECT_PPM = 100.0  # crystals keep 50 ppm each: more means a rate that differs from the profile's, or lost data
 TELLING_PPM = 50.0  # a larger standard error than crystals' own differences tells nothing: the clip is too short
-# In such a clip, delays that grow or shrink look like drift, many times beyond its standard error: up to 16 of them were
-# seen in 20 ms. Only a rate that is wrong altogether is a hundred away.
+# In such a clip, delays that grow or shrink look like drift, many times beyond its standard error: up to 16 of them in
+# 20 ms. Only a rate that is wrong altogether is a hundred away.
 _ERRORS, _ERRORS_TOO_SHORT = 3, 100
 _MOST_READS = 400  # of each camera that are used: all pairs of them are compared
 
