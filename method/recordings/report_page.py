@@ -31,12 +31,19 @@ ABOVE, BEHIND = (0, 1), (0, 2)  # of right, forward and up, the axes that a plot
 _CSS = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
+body { overflow-wrap: break-word; } code, .facts td { overflow-wrap: anywhere; }
 h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.2rem; margin-top: 2rem; }
 .scroll { overflow-x: auto; font-size: 13px; } table { border-collapse: collapse; }
 th, td { padding: .2rem .6rem .2rem 0; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
-th { font-weight: 600; } th:first-child, td:first-child, .facts td { text-align: left; white-space: normal; }
+th { font-weight: 600; } th:first-child, td:first-child, .facts td { text-align: left; }
+.facts td { white-space: normal; }
 .facts td:first-child { white-space: nowrap; font-weight: 600; vertical-align: top; }
-img, video { max-width: 100%; height: auto; background: #fff; } code { overflow-wrap: anywhere; }
+img, video { max-width: 100%; height: auto; background: #fff; }
+@media (max-width: 40rem) {
+  body { margin: 1rem auto; } ul { padding-left: 1.2rem; } .facts, .facts tbody { display: block; }
+  .facts tr { display: block; padding: .3rem 0; border-bottom: 1px solid #8884; }
+  .facts td { display: block; border: 0; padding: 0; }
+}
 """
 
 
@@ -78,7 +85,7 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         "<h2>Training views</h2>",
         f"<p>The {escape(report.maker)} image made from the spikes, the model's render, and their absolute "
         "difference, at three times. Pixels that were left out are white in the difference.</p>",
-        _image(sheet.read_bytes(), "training views"),
+        f'<a href="{escape(sheet.name)}">{_image(sheet.read_bytes(), "training views")}</a>',
         "<h2>Cameras</h2>",
         _cameras_table(report),
         f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {report.maker} "

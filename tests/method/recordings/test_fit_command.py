@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from devtools import browser
 from PIL import Image
 from small_scenes import write_small_scene
 from toy_world import GAIN, RATE_HZ, ToyWorld
@@ -104,7 +105,10 @@ def test_a_fit_leaves_a_model_a_sheet_a_video_and_a_report(fitted: Path) -> None
 
 def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
     page = (fitted / REPORT).read_text()
-    assert not re.search(r"(src|href)=\"(?!data:image/png;base64,|video\.mp4\")", page) and "url(" not in page
+    assert (
+        not re.search(r"(src|href)=\"(?!data:image/png;base64,|(?:video\.mp4|sheet\.png)\")", page)
+        and "url(" not in page
+    )
     assert page.count("<img") == 2 and "<script" not in page and "<link" not in page
     text = re.sub(r"<[^>]+>", " ", re.sub(r"base64,[^\"]+", "", page))
     for words in (
@@ -122,6 +126,17 @@ def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
         cells = re.findall(r"<td>([^<]*)</td>", row)
         assert float(cells[2]) == pytest.approx(stream.window(0, 60).mean(), abs=1e-4)  # the mean rate
         assert cells[5:9] == ["0", "0", "0", "1.000"]  # bad pixels, by isolation, and the gain
+
+
+@pytest.mark.parametrize("width", [320, 390, 1400])
+def test_the_report_fits_a_phone(fitted: Path, tmp_path: Path, width: int) -> None:
+    with browser(tmp_path / "profile") as page:
+        page.show((fitted / REPORT).as_uri(), "document.readyState == 'complete'", width=width, height=2000)
+        assert page.value("document.documentElement.scrollWidth") <= width
+        widest = "Math.max(...[...document.querySelectorAll('img, video')].map(e => e.getBoundingClientRect().right))"
+        assert page.value(widest) <= width
+        assert page.value("document.querySelector('.scroll').scrollWidth") > 320, "a table keeps its width and scrolls"
+        assert page.value("document.querySelector('.scroll tr:last-child').offsetHeight") < 60, "on one line a row"
 
 
 def test_residuals_are_those_of_the_saved_model(fitted: Path, recorded: Path) -> None:
