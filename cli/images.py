@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,13 @@ from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.untrusted import MAX_GAIN
 from spike4dgs.cli.options import warn_of_size
+from spike4dgs.generators.recorder.resources import free_bytes
 from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_clip_images
 
 _WHITE = 99  # percentile of the pixels' rates that is shown white, where nothing says what white is
 _MOST_FPS = 1000.0
+_GATHERING = ("adaptive", "intervals")  # makers that hold all spikes of a clip
+_BYTES_A_SPIKE = 4
 
 
 def images(
@@ -64,6 +67,8 @@ def images(
     streams, white = _streams(path, dat_file, camera, allow_gaps)
     if not path.is_dir():
         warn_of_size(streams)
+    if method in _GATHERING:
+        _check_memory(method, streams)
     gain = radiance_gain or white or _white(list(streams.values()))
     source = "given" if radiance_gain else "the scene's" if white else f"what {100 - _WHITE} % of the pixels exceed"
     print(f"{method} images of {', '.join(streams)}; white is {gain:.4g} spikes per tick, {source}")
@@ -93,6 +98,19 @@ def _streams(
     if isinstance(opened, Scene):
         return {name: opened.stream(name) for name in cameras or opened.train}, opened.radiance_gain
     return {name: opened[name] for name in cameras or known}, None
+
+
+def _check_memory(method: str, streams: Mapping[str, SpikeStream]) -> None:
+    """Raise UserError where the spikes of a stream do not fit into memory."""
+    free = free_bytes()
+    for name, s in streams.items():
+        if 8 * s.packed.nbytes * _BYTES_A_SPIKE <= free:  # if every pixel fired at every tick
+            continue
+        if (need := _BYTES_A_SPIKE * int(total_counts(s).sum())) > free:
+            expected = f"{need / 1e9:.1f} GB of free memory for all spikes of {name}"
+            raise problem(
+                f"--method {method}", expected, f"{free / 1e9:.1f} GB", "take another method, or a shorter clip"
+            )
 
 
 def _white(streams: Sequence[SpikeStream]) -> float:

@@ -8,6 +8,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.exchange.dat import import_dat as import_streams
 from spike4dgs.benchmark.exchange.recording import Recording
+from spike4dgs.cli.options import warn_of_size
 
 
 def import_dat(
@@ -39,6 +40,7 @@ def import_dat(
             is the metre.
     """
     streams = import_streams(path, out, width=width, height=height, recording=recording, cameras=cameras)
+    warn_of_size(streams)
     for stream in streams.values():
         print(f"{stream.source}: {stream.n_ticks} ticks of {width}x{height}")
     kind = "a folder of streams without poses" if cameras is None else f"a scene of {len(streams)} training cameras"

@@ -17,7 +17,7 @@ from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.stream import open_stream
+from spike4dgs.benchmark.spikes.stream import open_stream, pack
 from spike4dgs.cli import main
 from spike4dgs.method.images import clip_images
 
@@ -178,6 +178,30 @@ def test_a_network_without_weights_says_what_it_needs(
     assert main(["images", str(dat), *SIZE, "--method", "msdi", "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert "expected weights of MSDI" in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("method", ["adaptive", "intervals", "tfi"])
+def test_a_clip_whose_spikes_do_not_fit_into_memory(
+    dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], method: str
+) -> None:
+    monkeypatch.setattr("spike4dgs.cli.images.free_bytes", lambda: 50_000)
+    arguments = ["images", str(dat), *SIZE, "--method", method, "--out", str(tmp_path / "out")]
+    if method == "tfi":
+        assert main(arguments) == 0
+        return
+    assert main(arguments) == 2
+    assert f"--method {method}: expected 0.0 GB of free memory for all spikes of clip" in capsys.readouterr().err
+
+
+def test_import_dat_warns_of_a_swapped_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    y, x = np.mgrid[:60, :96]
+    spikes = np.random.default_rng(0).random((100, 60, 96)) < 0.3 + 0.2 * np.sin(x / 9) * np.cos(y / 7)
+    (tmp_path / "clip.dat").write_bytes(pack(spikes).tobytes())
+    arguments = ["import-dat", str(tmp_path / "clip.dat"), "--rate-hz", "20000"]
+    assert main([*arguments, "--width", "60", "--height", "96", "--out", str(tmp_path / "wrong")]) == 0
+    assert capsys.readouterr().err.endswith("try --width 96 --height 60\n")
+    assert main([*arguments, "--width", "96", "--height", "60", "--out", str(tmp_path / "right")]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_the_real_recording_and_a_swapped_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
