@@ -18,7 +18,7 @@ from spike4dgs.benchmark.method import DEFAULT_BUDGET, Method, choose_device_for
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.release.scenes import track_folders
 from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
-from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.reports.console import Columns, make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
 from spike4dgs.benchmark.runs.record import Record
@@ -75,6 +75,7 @@ class FitChoice:
         budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
             error are always computed.
+        columns: Columns of the table on the terminal: short, or all metrics and costs. results.csv has all.
     """
 
     methods: tuple[str, ...] = ()
@@ -86,6 +87,7 @@ class FitChoice:
     device: str = "auto"
     budget: str = DEFAULT_BUDGET
     metrics: tuple[str, ...] = (AUTO,)
+    columns: Columns = "short"
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ def _run(
         out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
         cluster = (fits.workers, fits.scheduler)
         settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster)
-        runs.append(run_split(opened, methods, settings, console))
+        runs.append(run_split(opened, methods, settings, console, fits.columns))
     return runs
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
-from spike4dgs.benchmark.reports.console import make_console, results_table
+from spike4dgs.benchmark.runs.display import cell_summary, metrics_summary
 from spike4dgs.benchmark.runs.record import write_record
 from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.scene.scene import open_scenes
@@ -35,7 +35,12 @@ def score(
         allow_gaps: Accept recordings with gaps.
     """
     record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
-    make_console().print(results_table([record]))
+    name = record["method"]["name"]
+    for scene, cell in record["scenes"].items():
+        print(f"{name} on {scene}: {cell_summary(cell)}")
+    if len(record["scenes"]) > 1:
+        print(f"{name}, mean of {len(record['scenes'])} scenes: {metrics_summary(record['mean'])}")
     if out:
         write_record(out, record)
+        print(f"record with every metric: {out}")
     return 0

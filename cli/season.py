@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO
-from spike4dgs.benchmark.reports.console import make_console, results_table
+from spike4dgs.benchmark.reports.console import make_console, print_results
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.leaderboard.season import publish as public
@@ -151,7 +151,7 @@ def score(
     for line in refused:
         print(f"error: {line}", file=sys.stderr)
     results = read_results(seasons, read_season(seasons, number))
-    make_console().print(results_table([result.record for result in results]))
+    print_results(make_console(), [result.record for result in results])
     print(f"table: {table}; results: {table.parent / 'results'}")
     return 1 if refused else 0
 

@@ -246,3 +246,4 @@ _PERCEPTUAL = (
 
 METRICS: dict[str, Metric] = {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL, *SPIKE_METRICS)}
 PRIMARY = "psnr"  # what the leaderboard ranks by
+MAIN = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # what a short table or line shows

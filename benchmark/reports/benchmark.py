@@ -17,7 +17,7 @@ from rich.console import Console
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Method
-from spike4dgs.benchmark.reports.console import results_table
+from spike4dgs.benchmark.reports.console import Columns, print_results
 from spike4dgs.benchmark.reports.scatter import write_scatter
 from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.reports.sheet_video import write_sheet_video
@@ -37,7 +37,9 @@ class SplitRun:
     earlier: list[Record]
 
 
-def run_split(scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings, console: Console) -> SplitRun:
+def run_split(
+    scenes: Sequence[Scene], methods: Sequence[Method], settings: Settings, console: Console, columns: Columns = "short"
+) -> SplitRun:
     """Fit methods on scenes or resume them, print the table, and write table and images."""
     out = settings.out
     records = run_matrix(scenes, methods, settings, console)
@@ -45,7 +47,7 @@ def run_split(scenes: Sequence[Scene], methods: Sequence[Method], settings: Sett
     lines = [f"not in the table: {line}" for line in left_out]
     every = [*earlier, *records]
     _say(console, *lines)
-    console.print(results_table(every))
+    print_results(console, every, columns)
     _say(console, *_write_images(scenes, of_one_seed(every), settings))
     write_results(out / "results.csv", every)
     _say(console, f"images: {out}/sheet_*.png and {out}/scatter.png; values: {out}/results.csv")

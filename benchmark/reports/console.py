@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import stdev
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,45 +13,66 @@ from rich.table import Table
 
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.metric import Metric
-from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record
+
+SHORT = (*MAIN, "fit_seconds", "render_fps")  # columns by default
+WIDE = 240  # characters that hold every column
+Columns = Literal["short", "all"]
 
 
 def make_console() -> Console:
     """Return a console; where the output is no terminal, it is wide enough for the table."""
     console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=240)
+    return console if console.is_terminal else Console(highlight=False, width=WIDE)
 
 
-def results_table(records: Sequence[Record]) -> Table:
+def results_table(records: Sequence[Record], every_column: bool = False) -> Table:
     """Return all records as a table: one block per scene and one for the mean; the best value of a block is bold.
 
-    Records of a method that differ only in the seed are one row, with means and sample standard deviations. Metrics
-    that no scene of any record has are left out.
+    It has the columns `SHORT`, which fit 80 characters beside names of up to 30; with `every_column` all metrics that
+    any record has, and all costs. Records of a method that differ only in the seed are one row, with means and sample
+    standard deviations.
     """
     splits = ", ".join(sorted({r["dataset"]["split"] for r in records}))
-    cells = [cell for r in records for cell in r["scenes"].values()]
+    cells = cells_of(records)
     metrics = [m for m in METRICS.values() if any(c["metrics"][m.id] is not None for c in cells)]
-    lower = ", ".join(m.id for m in metrics if not m.higher_is_better)
+    costs = [key for key in COSTS if every_column or key in SHORT]
+    if not every_column:
+        metrics = [m for m in metrics if m.id in SHORT] or metrics  # a recording has other metrics than these
+    lower = ", ".join(m.title for m in metrics if not m.higher_is_better)
     caption = f"higher is better{f', except {lower}' if lower else ''}; a dash is a value that does not exist"
     methods = seeds_of_methods(records)
     if len(methods) < len(records):
         caption += "; mean ± standard deviation over the seeds, means of the costs"
-    table = Table(title=f"Results, split {splits}", caption=caption, box=None)
-    table.add_column("scene")
-    table.add_column("method")
+    table = Table(title=f"Results, split {splits}", caption=caption, box=None, padding=(0, 0, 0, 1))
+    table.add_column("method", no_wrap=True, overflow="fold")
     for m in metrics:
-        table.add_column(m.id.replace("_", "\n"), justify="right")
-    for title, _ in COSTS.values():
-        table.add_column(title.replace(", ", "\n"), justify="right")
+        table.add_column(_heading(m), justify="right")
+    for key in costs:
+        table.add_column(COSTS[key][0].replace(", ", "\n"), justify="right")
     scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
     for scene in scenes:
         named = [(m[0]["method"]["name"], [r["scenes"][scene] for r in m if scene in r["scenes"]]) for m in methods]
         rows = [_Row(name, [cell["metrics"] for cell in cells], cells) for name, cells in named if cells]
-        _add_block(table, scene, metrics, rows)
+        _add_block(table, scene, metrics, costs, rows)
     if len(scenes) > 1:
-        _add_block(table, "mean", metrics, [_Row(m[0]["method"]["name"], [r["mean"] for r in m]) for m in methods])
+        means = [_Row(m[0]["method"]["name"], [r["mean"] for r in m], cells_of(m)) for m in methods]
+        _add_block(table, f"mean of {len(scenes)} scenes", metrics, costs, means)
     return table
+
+
+def cells_of(records: Sequence[Record]) -> list[Cell]:
+    """Return the cells of all scenes of records."""
+    return [cell for r in records for cell in r["scenes"].values()]
+
+
+def print_results(console: Console, records: Sequence[Record], columns: Columns = "short") -> None:
+    """Print the table of records; with all columns it may be wider than the console."""
+    if columns == "all":
+        console.print(results_table(records, every_column=True), width=max(console.width, WIDE), soft_wrap=True)
+    else:
+        console.print(results_table(records))
 
 
 def seeds_of_methods(records: Sequence[Record]) -> list[list[Record]]:
@@ -93,18 +114,25 @@ class _Row:
         return "" if value is None else f"{value:.{digits}f}"
 
 
-def _add_block(table: Table, title: str, metrics: Sequence[Metric], rows: Sequence[_Row]) -> None:
+def _heading(metric: Metric) -> str:
+    """Return a metric's id on two lines."""
+    first, _, second = metric.id.partition("_")
+    return f"{first}\n{second}"
+
+
+def _add_block(table: Table, title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Sequence[_Row]) -> None:
     best: dict[str, float] = {}
     for m in metrics:
         known = [v for row in rows if (v := row.mean(m.id)) is not None]
         if known:
             best[m.id] = max(known) if m.higher_is_better else min(known)
+    table.add_row(f"[italic]{escape(title)}[/italic]")
     for i, row in enumerate(rows):
         texts = []
         for m in metrics:
             text = row.text(m)
             texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and row.mean(m.id) == best.get(m.id, "") else text)
-        costs = [row.cost(key, digits) for key, (_, digits) in COSTS.items()]
+        shown = [row.cost(key, COSTS[key][1]) for key in costs]
         failed = sorted({cell["status"] for cell in row.cells} - {"ok"})
-        shown = escape(row.name) + (f" [red]({', '.join(failed)})[/red]" if failed else "")
-        table.add_row(escape(title) if i == 0 else "", shown, *texts, *costs, end_section=i == len(rows) - 1)
+        name = f" {escape(row.name)}" + (f" [red]({', '.join(failed)})[/red]" if failed else "")
+        table.add_row(name, *texts, *shown, end_section=i == len(rows) - 1)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import Cell
 
 
@@ -66,12 +66,18 @@ class RunDisplay:
             note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
 
 
+def metrics_summary(values: Mapping[str, float | None]) -> str:
+    """Return the main metrics and their values as one line; all others where a recording has none of these."""
+    known = [k for k in METRICS if values.get(k) is not None]
+    shown = [k for k in MAIN if k in known] or known
+    return ", ".join(f"{k} {METRICS[k].format(values[k])}" for k in shown)
+
+
 def cell_summary(cell: Cell) -> str:
     """Return one line about a cell: its scores and costs, or why it has none."""
     if cell["status"] != "ok":
         return f"{cell['status']}: {cell['error']}"
-    ids = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
-    shown = [f"{k} {METRICS[k].format(cell['metrics'][k])}" for k in ids]
+    shown = [metrics_summary(cell["metrics"])]
     costs = [("fit", "fit_seconds", "s"), ("render", "render_fps", "images/s"), ("peak", "peak_memory_mb", "MB")]
     shown += [f"{name} {cell[k]:.1f} {unit}" for name, k, unit in costs if cell[k] is not None]
     return ", ".join(shown)
