@@ -13,7 +13,9 @@ A recipe overrides the numbers of its parts by name, PART.NAME:
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -121,12 +123,13 @@ class Model(Protocol):
 class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
-    Eight attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
+    Nine attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
     the data sets that learned parts have seen, `given`, which of `GIVEN` it uses (all if absent; tracks of the
     leaderboard withhold some), `refines_views`: its models have `refine` (see `refinement`), `description`, one line
     for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called before the clock of a fit
-    starts, `rasterizes`: False lets it run on a GPU without numba-cuda, and `oracle`: what the truth replaces in it (no
-    leaderboard takes its records).
+    starts, `rasterizes`: False lets it run on a GPU without numba-cuda, `oracle`: what the truth replaces in it (no
+    leaderboard takes its records), and `with_settings(overrides, name)`, which returns the method with other settings
+    for `run-benchmark --set`.
     """
 
     name: str
@@ -181,12 +184,46 @@ def find_packaged_methods() -> dict[str, Found]:
     return find_plugins(GROUP, "method", lambda name, method, source: check_protocol(method, source))
 
 
-def get_method(name: str) -> Method:
-    """Return the method called `name`. Raises UserError that lists the known names."""
-    methods = find_methods()
-    if name not in methods:
-        raise problem("method", f"one of {', '.join(sorted(methods))}", repr(name), "see `spike4dgs methods`")
-    return methods[name]
+def get_method(name: str, methods: Mapping[str, Method] | None = None) -> Method:
+    """Return the method called `name`; NAME[PART.SETTING=VALUE,...] is one with other settings.
+
+    `methods` are those to look among; all that are installed if left out. Raises UserError that lists the known names,
+    and for settings that the method does not have.
+    """
+    known = find_methods() if methods is None else methods
+    plain, bracket, inside = name.partition("[")
+    if plain not in known:
+        raise problem("method", f"one of {', '.join(sorted(known))}", repr(plain), "see `spike4dgs methods`")
+    return with_settings(known[plain], inside.removesuffix("]").split(",")) if bracket else known[plain]
+
+
+def with_settings(method: Method, settings: Sequence[str]) -> Method:
+    """Return a method with other settings, each PART.NAME=VALUE; its name states them: NAME[PART.NAME=VALUE,...].
+
+    Raises UserError where the method has no `with_settings` or no such setting, and for a value of another type.
+    """
+    overrides: dict[str, Any] = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals or not re.fullmatch(r"[A-Za-z0-9+._-]+", value):
+            raise problem("--set", "PART.NAME=VALUE, such as motion.lr_grid=0.005", repr(text), "correct it")
+        try:
+            overrides[name] = json.loads(value)
+        except json.JSONDecodeError:
+            overrides[name] = value  # a word
+    if not overrides:
+        return method
+    change = getattr(method, "with_settings", None)
+    if change is None:
+        fix = "choose a method that `spike4dgs methods NAME` shows settings of"
+        raise problem("--set", "a method that is made of settings", f"{method.name}, which has none", fix)
+    changed: Method = change(overrides, f"{method.name}[{','.join(settings)}]")
+    return changed
+
+
+def is_changed(name: str) -> bool:
+    """Return whether a method's name states settings that a user changed."""
+    return "[" in name
 
 
 def choose_device_for(methods: Iterable[Method], device: str) -> str:

@@ -13,6 +13,7 @@ from spike4dgs.benchmark.spikes.image_size import size_doubt
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 From = Annotated[str | None, arg(name="from")]  # where a release or a weight file is fetched from
+SetValues = Annotated[tuple[str, ...], arg(name="set", metavar="PART.NAME=VALUE ...")]  # settings of methods
 
 
 @dataclass(frozen=True)

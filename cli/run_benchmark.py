@@ -7,14 +7,22 @@ another split than the default one keeps all this in OUT/SPLIT/, and so does a t
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.method import DEFAULT_BUDGET, Method, choose_device_for, find_methods, make_budget
+from spike4dgs.benchmark.method import (
+    DEFAULT_BUDGET,
+    Method,
+    choose_device_for,
+    find_methods,
+    get_method,
+    make_budget,
+    with_settings,
+)
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.release.scenes import track_folders
 from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
@@ -26,7 +34,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.results import of_one_seed
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
-from spike4dgs.cli.options import From
+from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
 from spike4dgs.leaderboard.tracks import track_scenes
 
@@ -64,6 +72,7 @@ class FitChoice:
 
     Args:
         methods: Methods by name; all that are installed, or all rows of the table, if left out.
+        settings: Other settings, such as motion.lr_grid=0.005; rows are named by them, and stay off public tracks.
         out: Folder for predictions, results, images and logs; for another split than the default, OUT/SPLIT is.
         seed: Seed that every fit gets.
         seeds: Number of seeds, from that one up. The table shows means over them; what belongs to a further seed K
@@ -79,6 +88,7 @@ class FitChoice:
     """
 
     methods: tuple[str, ...] = ()
+    settings: SetValues = ()
     out: Path = Path("runs/benchmark")
     seed: int = 0
     seeds: int = 1
@@ -133,7 +143,7 @@ def run_benchmark(
         return _run_table(paper, choice, fits, entries)
     if choice.track is not None:
         scenes = track_folders(track_scenes(choice.track), choice.data, choice.source)
-    runs = _run(scenes, _choose_methods(fits.methods, None), (choice.split,), choice.allow_gaps, fits)
+    runs = _run(scenes, _choose_methods(fits, None), (choice.split,), choice.allow_gaps, fits)
     return _finish(runs, scenes, choice.allow_gaps, entries)
 
 
@@ -154,7 +164,7 @@ def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entr
     """Run the rows of a table of the paper, and write it with the published values."""
     scenes = table_scenes(paper, choice.data, choice.profile)
     splits = paper.splits if paper.splits and choice.split is None else (choice.split,)
-    runs = _run(scenes, _choose_methods(fits.methods, paper), splits, choice.allow_gaps, fits)
+    runs = _run(scenes, _choose_methods(fits, paper), splits, choice.allow_gaps, fits)
     rows = [[*(r for r in run.earlier if plain_name(r) in paper.rows), *run.records] for run in runs]
     shown = [(run.scenes, of_one_seed(records)) for run, records in zip(runs, rows, strict=True)]
     folder = fits.out if len(runs) > 1 else runs[0].settings.out
@@ -186,15 +196,14 @@ def _run(
     return runs
 
 
-def _choose_methods(names: tuple[str, ...], paper: PublishedTable | None) -> list[Method]:
-    """Return the methods by name; without names the rows of the table, or all that are installed."""
-    known: Mapping[str, Method] = find_methods()
-    names = names or (tuple(m for m in paper.rows if m in known) if paper else ())
-    if unknown := [m for m in names if m not in known]:
-        raise problem("--methods", f"names among {', '.join(sorted(known))}", ", ".join(unknown), "correct the names")
+def _choose_methods(fits: FitChoice, paper: PublishedTable | None) -> list[Method]:
+    """Return the methods by name, with the settings of --set; without names the table's rows, or all installed ones."""
+    known = find_methods()
+    names = fits.methods or (tuple(m for m in paper.rows if m in known) if paper else ())
     if not known:
         raise problem("--methods", "an installed method", "none", "install a package that registers one")
-    return [known[name] for name in dict.fromkeys(names or known)]
+    methods = [get_method(name, known) for name in dict.fromkeys(names or known)]
+    return [with_settings(method, fits.settings) for method in methods]
 
 
 def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool, entries: EntryChoice) -> int:

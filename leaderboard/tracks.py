@@ -20,7 +20,7 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
-from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.method import GIVEN, is_changed
 from spike4dgs.benchmark.runs.record import NOISY
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
@@ -28,6 +28,7 @@ FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
 RELEASE = "1"
 PUBLIC, LOCAL, ARCHIVE = "entries", "local", "archive"
 REVISION_DIGITS = 12  # of revisions in paths and messages
+CHANGED = "the method ran with other settings (--set); a track takes it as a recipe with a name of its own"
 _SCENE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _NAMED = 3  # scenes that a message names
 
@@ -148,10 +149,11 @@ def place_of(record: Mapping[str, Any]) -> Place:
     revision = short(dataset_revision(dataset))
     same = [t for t in release.tracks if t.scenes == dataset["scenes"] and t.split == dataset["split"]]
     given = set(record["method"].get("given", GIVEN))
-    if boards := tuple(t.name for t in same if not t.withheld & given):
+    changed = is_changed(record["method"]["name"])
+    if boards := tuple(t.name for t in same if not t.withheld & given and not changed):
         return Place(f"{PUBLIC}/{release.number}-{same[0].name}@{revision}", boards, "")
     more = f"+{len(ids) - 1}" if len(ids) > 1 else ""
-    return Place(f"{LOCAL}/{ids[0]}{more}@{revision}", (), why_local(dataset, release, same))
+    return Place(f"{LOCAL}/{ids[0]}{more}@{revision}", (), CHANGED if changed else why_local(dataset, release, same))
 
 
 def why_local(dataset: Mapping[str, Any], release: Release, same: list[Track]) -> str:

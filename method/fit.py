@@ -87,7 +87,7 @@ class RecipeMethod:
     """
 
     def __init__(self, recipe: Recipe, parts: Parts, description: str = "") -> None:
-        self.name, self.recipe = recipe.name, recipe
+        self.name, self.recipe, self.parts = recipe.name, recipe, parts
         self.images = _part(parts.images, recipe, "images")
         self.initialization = _part(parts.initialization, recipe, "initialization")
         _part({**parts.motion, **parts.algorithms}, recipe, "motion")
@@ -112,6 +112,18 @@ class RecipeMethod:
         if learned := self.images.learned():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
         self._warm: set[str] = set()  # the devices whose kernels are compiled
+
+    def with_settings(self, overrides: Mapping[str, Any], name: str) -> RecipeMethod:
+        """Return the same recipe with other settings, by names PART.NAME, under another name.
+
+        Raises UserError for an unknown part or setting, and for a value of another type.
+        """
+        settings = {**self.recipe.settings, **overrides}
+        changed = RecipeMethod(replace(self.recipe, name=name, settings=settings), self.parts, self.description)
+        if changed.settings == self.settings:
+            fix = "choose another value, or leave it out"
+            raise problem(name, "a setting that differs from the recipe's", ", ".join(overrides), fix)
+        return changed
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views; see `benchmark.method.Method`.

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
+from rich.segment import Segments
 from rich.table import Table
 
 from spike4dgs.benchmark.metrics.measure import mean
@@ -45,7 +46,7 @@ def results_table(records: Sequence[Record], every_column: bool = False) -> Tabl
     methods = seeds_of_methods(records)
     if len(methods) < len(records):
         caption += "; mean ± standard deviation over the seeds, means of the costs"
-    table = Table(title=f"Results, split {splits}", caption=caption, box=None, padding=(0, 0, 0, 1))
+    table = Table(title=f"Results, split {splits}", caption=caption, box=None, padding=(0, 0, 0, 1), pad_edge=False)
     table.add_column("method", no_wrap=True, overflow="fold")
     for m in metrics:
         table.add_column(_heading(m), justify="right")
@@ -70,7 +71,9 @@ def cells_of(records: Sequence[Record]) -> list[Cell]:
 def print_results(console: Console, records: Sequence[Record], columns: Columns = "short") -> None:
     """Print the table of records; with all columns it may be wider than the console."""
     if columns == "all":
-        console.print(results_table(records, every_column=True), width=max(console.width, WIDE), soft_wrap=True)
+        options = console.options.update(width=max(console.width, WIDE))
+        for line in console.render_lines(results_table(records, every_column=True), options, pad=False):
+            console.print(Segments(line), soft_wrap=True)
     else:
         console.print(results_table(records))
 

@@ -138,15 +138,16 @@ def test_load_finds_the_functions() -> None:
     assert cli.load("score") is score
 
 
-def test_score_prints_a_table_and_writes_a_record(
+def test_score_prints_a_line_for_each_scene_and_writes_a_record(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     expected = run(tmp_path / "out", [small_scene], CountMethod())[0]
     predictions = str(tmp_path / "out/predictions/counts/pattern-0")
     capsys.readouterr()
     assert main(["score", predictions, str(small_scene), "--out", str(tmp_path / "r.json")]) == 0
-    text = capsys.readouterr().out
-    assert "counts" in text and f"{expected['mean']['psnr']:.2f}" in text and "dynamic" in text
+    line, written = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"counts on pattern-0: psnr {expected['mean']['psnr']:.2f}, ssim ") and "fit " in line
+    assert written.endswith("r.json")
     assert read_record(tmp_path / "r.json")["scenes"] == expected["scenes"]
 
 

@@ -6,27 +6,47 @@ from types import SimpleNamespace
 
 import pytest
 from dummy_methods import CountMethod
+from rich.console import Console
 
 from spike4dgs.baselines.recipes import POSED, RECIPES
 from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.method import find_methods
-from spike4dgs.cli import main
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import find_methods, get_method, with_settings
+from spike4dgs.benchmark.runs.record import check_method_name
+from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.cli import main, methods
+from spike4dgs.method.settings import as_dict
 
 METHODS = find_methods()
 
 
-def test_every_installed_method_has_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("columns", [80, 100])
+def test_every_installed_method_has_one_line_that_fits_the_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(methods, "make_console", lambda: Console(width=columns, highlight=False))
     assert main(["methods"]) == 0
-    header, *lines = capsys.readouterr().out.splitlines()
-    assert header.split() == ["method", "images", "initialization", "motion", "supervision", "package", "description"]
-    found = {line.split()[0]: line for line in lines}
-    assert len(found) == len(lines) and list(METHODS) == [name for name in found if name in METHODS]
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= columns and not any("\N{HORIZONTAL ELLIPSIS}" in line for line in lines)
+    found = {line.split()[0]: line for line in lines[3:-1]}
+    assert list(METHODS) == [name for name in found if name in METHODS]
     for recipe in (*RECIPES, *POSED):
         parts = [recipe.images, recipe.initialization, recipe.motion, recipe.supervision]
-        assert found[recipe.name].split()[1:6] == [*parts, "spike4dgs"]
-        assert METHODS[recipe.name].description in found[recipe.name]
-    assert found["nearest-view"].split()[1:5] == ["tfp", "-", "-", "-"]
-    assert found["nearest-view"].endswith("the nearest training camera's image, without any reconstruction")
+        assert found[recipe.name].split()[1:] == parts
+    assert found["nearest-view"].split()[1:] == ["tfp", "-", "-", "-"]
+
+
+def test_a_recipe_is_described_with_its_settings_and_their_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["methods", "spike4dgs-x"]) == 0
+    text = capsys.readouterr().out
+    assert METHODS["spike4dgs-x"].description in text and "given beside streams" in text
+    found = {line.split()[0]: " ".join(line.split()[1:]) for line in text.splitlines() if "." in line.split()[0]}
+    settings = METHODS["spike4dgs-x"].settings
+    assert {f"{part}.{name}" for part, values in as_dict(settings).items() for name in values} <= set(found)
+    assert found["density.prune_opacity"] == "0.005 fainter ones are removed"
+    assert found["motion.lr_coefficients"].startswith("0.007 * of the polynomials")
+    assert main(["methods", "spike4dgs-y"]) == 2
+    assert main(["methods", "nearest-view"]) == 0
 
 
 def test_descriptions_tell_methods_apart() -> None:
@@ -42,6 +62,43 @@ def test_a_method_of_another_package_is_named_with_it(
     entry = SimpleNamespace(name="a", value="a:M", dist=package, load=lambda: {"counts": CountMethod()})
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     assert main(["methods"]) == 0
-    (line,) = capsys.readouterr().out.splitlines()[1:]
-    assert line.split(maxsplit=7)[:7] == ["counts", "-", "-", "-", "-", "theirs", "2.1"]
-    assert line.endswith("Steps towards equal weights of the training views, with a checkpoint after every step.")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].split() == ["theirs", "2.1"] and lines[3].split() == ["counts", "-", "-", "-", "-"]
+    assert main(["methods", "counts"]) == 0
+    first = "counts: Steps towards equal weights of the training views, with a checkpoint after every step."
+    assert capsys.readouterr().out.splitlines()[0] == first
+
+
+SET = "motion.lr_grid=0.005"
+
+
+def test_a_method_with_other_settings_has_them_in_its_name_and_parameters() -> None:
+    plain, changed = METHODS["tfp+4dgs"], get_method(f"tfp+4dgs[{SET},density.refine_every=50]")
+    assert changed.name == f"tfp+4dgs[{SET},density.refine_every=50]" and plain.name == "tfp+4dgs"
+    assert changed.params["settings"]["motion"] == plain.params["settings"]["motion"] | {"lr_grid": 0.005}
+    assert changed.params["settings"]["density"]["refine_every"] == 50
+    assert with_settings(plain, (SET, "density.refine_every=50")).params == changed.params
+    check_method_name(changed.name)
+    check_method_name(changed.name + SUFFIX)
+
+
+@pytest.mark.parametrize(
+    ("method", "setting", "message"),
+    [
+        ("tfp+4dgs", "motion.lr_grids=1", "expected settings among motion.*found 'motion.lr_grids'"),
+        ("tfp+4dgs", "lr_grid=1", "expected settings named PART.NAME"),
+        ("tfp+4dgs", "motion.lr_grid", "--set: expected PART.NAME=VALUE"),
+        ("tfp+4dgs", "motion.lr_grid=many", "expected motion.lr_grid as float, found 'many'"),
+        ("tfp+4dgs", "motion.lr_grid=../x", "--set: expected PART.NAME=VALUE"),
+        ("nearest-view", SET, "expected a method that is made of settings, found nearest-view"),
+    ],
+)
+def test_settings_that_a_method_does_not_have_are_refused(method: str, setting: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        with_settings(METHODS[method], (setting,))
+
+
+def test_a_setting_of_the_recipes_own_value_is_refused() -> None:
+    value = METHODS["tfp+4dgs"].params["settings"]["motion"]["lr_grid"]
+    with pytest.raises(UserError, match="expected a setting that differs"):
+        get_method(f"tfp+4dgs[motion.lr_grid={value}]")

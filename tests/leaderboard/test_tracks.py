@@ -98,6 +98,8 @@ def test_anything_else_is_local_and_says_why() -> None:
     assert place_of(record_of({"car-0-small": known})).why == "no track of release 1 has exactly these scenes"
     paper = place_of(record_of({"car-0-paper": "0" * 64}))
     assert paper.why == "outdoor-paper of release 1 takes no entries yet"
+    changed = place_of({**record_of(scenes), "method": {"name": "m[a.b=1]", "seed": 0}})
+    assert not changed.is_public and "--set" in changed.why
     assert len({p.folder for p in (other, paper, place_of(record_of(scenes, split="corner")))}) == 3
 
 

@@ -11,7 +11,7 @@ from dummy_methods import CountMethod, run
 from matplotlib import colormaps
 from rich.console import Console
 
-from spike4dgs.benchmark.reports.console import results_table, seeds_of_methods
+from spike4dgs.benchmark.reports.console import Columns, print_results, seeds_of_methods
 from spike4dgs.benchmark.reports.error_map import choose_scale, error_image, error_levels, scale_name
 from spike4dgs.benchmark.runs.record import missing_cell
 
@@ -46,11 +46,23 @@ def test_errors_beyond_every_scale_have_the_widest_and_scales_have_names() -> No
     assert names == [f"error \N{MULTIPLICATION SIGN}{k}" for k in (1, 3, 10, 30)]
 
 
-def printed(records: list[dict[str, Any]]) -> str:
-    console = Console(width=240)
+def printed(records: list[dict[str, Any]], width: int = 240, columns: Columns = "short") -> str:
+    console = Console(width=width)
     with console.capture() as capture:
-        console.print(results_table(records))
+        print_results(console, records, columns)
     return capture.get()
+
+
+def test_the_short_table_fits_a_terminal_and_cuts_no_name(small_scene: Path, tmp_path: Path) -> None:
+    name = "spike4dgs-x+self-calibrated2"
+    (record,) = run(tmp_path, [small_scene], CountMethod(name), metrics=("psnr", "ssim"))
+    for width in (80, 100):
+        text = printed([record], width)
+        assert max(map(len, text.splitlines())) <= width and "\N{HORIZONTAL ELLIPSIS}" not in text
+        (row,) = (line.split() for line in text.splitlines() if name in line)
+        assert row[1] == f"{record['mean']['psnr']:.2f}" and "pattern-0" in text
+    assert "temporal" not in text
+    assert "temporal" in printed([record], 80, "all") and name in printed([record], 80, "all")
 
 
 def test_a_seed_that_failed_leaves_no_mean(small_scene: Path, tmp_path: Path) -> None:
