@@ -29,7 +29,7 @@ from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
 from spike4dgs.benchmark.reports.console import Columns, make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
-from spike4dgs.benchmark.runs.record import Record
+from spike4dgs.benchmark.runs.record import Record, of_scenes
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.results import of_one_seed
 from spike4dgs.benchmark.runs.run import Settings
@@ -84,6 +84,7 @@ class FitChoice:
         budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
             error are always computed.
+        refit: Fit anew also where OUT holds predictions of the same method, code, settings, scene, seed and budget.
         columns: Columns of the table on the terminal: short, or all metrics and costs. results.csv has all.
     """
 
@@ -97,6 +98,7 @@ class FitChoice:
     device: str = "auto"
     budget: str = DEFAULT_BUDGET
     metrics: tuple[str, ...] = (AUTO,)
+    refit: bool = False
     columns: Columns = "short"
 
 
@@ -166,7 +168,11 @@ def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entr
     splits = paper.splits if paper.splits and choice.split is None else (choice.split,)
     runs = _run(scenes, _choose_methods(fits, paper), splits, choice.allow_gaps, fits)
     rows = [[*(r for r in run.earlier if plain_name(r) in paper.rows), *run.records] for run in runs]
-    shown = [(run.scenes, of_one_seed(records)) for run, records in zip(runs, rows, strict=True)]
+    ids = {path.name for path in scenes}
+    shown = [
+        (run.scenes, of_one_seed([of_scenes(record, ids) for record in records]))
+        for run, records in zip(runs, rows, strict=True)
+    ]
     folder = fits.out if len(runs) > 1 else runs[0].settings.out
     worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
     write_paper_table(paper, in_every_split(shown), worlds, select_metrics(fits.metrics).metrics, folder)
@@ -191,7 +197,7 @@ def _run(
         opened = open_scenes(scenes, allow_gaps, split)
         out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
         cluster = (fits.workers, fits.scheduler)
-        settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster)
+        settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster, fits.refit)
         runs.append(run_split(opened, methods, settings, console, fits.columns))
     return runs
 
@@ -214,7 +220,7 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
         folders = {out / "results" / f"{name}.json": out / "predictions" / name for out, name in names}
         refused += submit_all(
             {result: folder if folder.is_dir() else None for result, folder in folders.items()},
-            scenes=scenes,
+            scenes=_with_neighbours(scenes, run),
             leaderboard=entries.leaderboard or run.settings.out / "leaderboard",
             replace=entries.replace or entries.leaderboard is None,
             allow_gaps=allow_gaps,
@@ -224,6 +230,13 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed or refused else 0
+
+
+def _with_neighbours(scenes: tuple[Path, ...], run: SplitRun) -> tuple[Path, ...]:
+    """Return scene folders and, of the scenes that records keep of earlier runs, those that lie beside them."""
+    kept = dict.fromkeys(scene for record in run.records for scene in record["scenes"])
+    missing = [scenes[0].parent / scene for scene in kept if scene not in {s.id for s in run.scenes}]
+    return (*scenes, *(path for path in missing if path.is_dir()))
 
 
 def plain_name(record: Record) -> str:

@@ -27,6 +27,7 @@ from spike4dgs.benchmark.environment import (
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Progress, check_protocol, training_for
+from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
 from spike4dgs.benchmark.runs.record import PROTOCOL
@@ -67,9 +68,11 @@ class Job:
 
     @property
     def key(self) -> str:
-        """The content key under which predictions are found again."""
+        """The content key under which predictions are found again; it covers the code of other packages' methods."""
+        code = code_of(self.method)
         return sha256_json(
             {
+                **({"code": code} if code else {}),
                 "method": replace(self.info, given=None).as_dict(),
                 "harness": harness()["version"],
                 "scene": self.scene.id,
@@ -92,6 +95,34 @@ def is_done(job: Job, folder: Path) -> bool:
     except UserError:
         return False  # damaged since: made again
     return predictions.info.key == job.key
+
+
+def why_not_kept(job: Job, folder: Path) -> str | None:
+    """Return why whole predictions that lie in `folder` are of another fit than this job's; None without such."""
+    try:
+        info = open_predictions(folder, job.scene.targets).info
+    except UserError:
+        return None
+    if info.key is None or info.key == job.key:
+        return None
+    mine, theirs = job.info.as_dict(), info.method.as_dict()
+    now: dict[str, Any] = {
+        **{k: mine[k] for k in ("version", "seed", "trained_on")},
+        "settings": mine["params"],
+        "revision of the scene": job.scene.revision,
+        "split": job.scene.split,
+        "budget": job.budget.label,
+        "device": device_type(job.device),
+    }
+    then: dict[str, Any] = {
+        **{k: theirs[k] for k in ("version", "seed", "trained_on")},
+        "settings": theirs["params"],
+        "revision of the scene": info.scene_revision,
+        "split": info.split,
+        "budget": info.budget,
+        "device": device_type(info.device or ""),
+    }
+    return "another " + (", ".join(k for k in now if now[k] != then[k]) or "code of the method")
 
 
 @dataclass(frozen=True)

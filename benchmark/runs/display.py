@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -44,8 +44,8 @@ class RunDisplay:
         self._console.print(text, highlight=False, markup=False)
 
     @contextmanager
-    def cell(self, title: str) -> Iterator[ShownCell]:
-        """Show one cell, and yield the callables to which it reports."""
+    def cell(self, title: str, notes: Sequence[str] = ()) -> Iterator[ShownCell]:
+        """Show one cell with notes about it, and yield the callables to which it reports."""
         task = self._bars.add_task(title, total=None)
         label = f"[{self._done + 1}/{self._cells}] {title}"
         self.say(label)
@@ -57,6 +57,8 @@ class RunDisplay:
         def note(text: str) -> None:
             self.say(f"    {text}")
 
+        for text in notes:
+            note(text)
         yield ShownCell(progress, note)
         self._done += 1
         self._bars.remove_task(task)

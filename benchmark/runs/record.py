@@ -7,12 +7,12 @@ and a scene without a value makes the mean null, never smaller.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.metrics.measure import Values, mean, scene_means
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -93,6 +93,47 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
     }
     check_record(record, f"the record of {method.name}")
     return record
+
+
+def with_earlier_scenes(record: Record, path: Path) -> Record:
+    """Return a record with the cells of further scenes that the record at `path` has of the same method and split.
+
+    A record of another version, seed or other parameters, one with another protocol, and a file that is none are
+    without effect.
+    """
+    try:
+        earlier = read_record(path)
+    except UserError:
+        return record
+    same = all(earlier[key] == record[key] for key in ("method", "protocol"))
+    same = same and earlier["harness"]["version"] == record["harness"]["version"]
+    added = {scene: cell for scene, cell in earlier["scenes"].items() if scene not in record["scenes"]}
+    if not same or not added or earlier["dataset"]["split"] != record["dataset"]["split"]:
+        return record
+    return _with_cells(record, {**added, **record["scenes"]}, earlier)
+
+
+def of_scenes(record: Record, scenes: Collection[str]) -> Record:
+    """Return a record of some of its scenes."""
+    return _with_cells(record, {scene: cell for scene, cell in record["scenes"].items() if scene in scenes}, record)
+
+
+def _with_cells(record: Record, cells: Mapping[str, Cell], other: Record) -> Record:
+    """Return a record with other cells, whose scenes are of `record` or else of `other`."""
+    revisions = {**other["dataset"]["scenes"], **record["dataset"]["scenes"]}
+    sensors = {**other.get("sensors", {}), **record.get("sensors", {})}
+    dataset = {
+        **record["dataset"],
+        "name": "+".join(sorted(cells)),
+        "scenes": {scene: revisions[scene] for scene in cells},
+    }
+    return {
+        **record,
+        "dataset": dataset,
+        "sensors": {scene: sensors[scene] for scene in cells if scene in sensors},
+        "scenes": dict(cells),
+        "mean": dataset_means(cells),
+    }
 
 
 def dataset_means(cells: Mapping[str, Cell]) -> Values:

@@ -13,6 +13,8 @@ and scores everything.
 
 from __future__ import annotations
 
+import shutil
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +24,21 @@ from rich.console import Console
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, write_text
-from spike4dgs.benchmark.method import Budget, Method
+from spike4dgs.benchmark.method import Budget, Method, no_progress
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job
+from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job, why_not_kept
 from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
 from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
-from spike4dgs.benchmark.runs.record import Cell, Record, build_record, check_method_name, missing_cell, write_record
+from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.runs.record import (
+    Cell,
+    Record,
+    build_record,
+    check_method_name,
+    missing_cell,
+    with_earlier_scenes,
+    write_record,
+)
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.remote_cell import SharedFolder, fit_order, make_order, store
 from spike4dgs.benchmark.runs.score import open_for, score_scene
@@ -46,6 +57,7 @@ class Settings:
     seeds: int = 1  # seed, seed + 1, ...
     workers: int = 1
     scheduler: str | None = None
+    refit: bool = False  # also where predictions are there
 
     def folder(self, seed: int) -> Path:
         """Return the folder that keeps what comes of a seed."""
@@ -63,6 +75,7 @@ class Place:
 
     job: Job
     out: Path
+    refit: bool = False
 
     @property
     def title(self) -> str:
@@ -89,9 +102,19 @@ class Place:
         """The file for the traceback of a failure."""
         return self.out / "logs" / f"{self.job.method.name}__{self.job.scene.id}.log"
 
-    def is_done(self) -> bool:
-        """Return whether all predictions are there, whole and undamaged."""
-        return all(is_done(self.job, folder) for folder in self.folders)
+    def is_done(self, shown: ShownCell) -> bool:
+        """Return whether all predictions are there, whole and undamaged, and say what becomes of those that are."""
+        if self.refit:
+            shutil.rmtree(self.work, ignore_errors=True)
+            shown.note("fitted anew (--refit)")
+            return False
+        if all(is_done(self.job, folder) for folder in self.folders):
+            made = open_predictions(self.folders[0], self.job.scene.targets).info.created
+            shown.note(f"kept: predictions of {made}, of the same method, code, settings, scene, seed and budget")
+            return True
+        if why := why_not_kept(self.job, self.folders[0]):
+            shown.note(f"replaces predictions with {why}")
+        return False
 
 
 def run_matrix(
@@ -113,7 +136,7 @@ def run_matrix(
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
     places = [
-        Place(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed))
+        Place(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed), settings.refit)
         for seed in range(settings.seed, settings.seed + settings.seeds)
         for method in methods
         for scene in scenes
@@ -149,9 +172,7 @@ def _run_cells(
 def fit_here(place: Place, shown: ShownCell) -> Failure | None:
     """Fit in this process, or keep what is there; return the failure of the method, if it failed."""
     try:
-        if place.is_done():
-            shown.note("predictions are there")
-        else:
+        if not place.is_done(shown):
             run_job(place.job, place.folders, place.model, place.work, shown.progress, shown.note)
     except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
         return failure_of(e)
@@ -165,10 +186,10 @@ def _spread(
     folder = SharedFolder(out.absolute(), uuid4().hex)
     write_text(folder.token_file, folder.token)
     settled: dict[int, Failure | None] = {}
-    orders = {}
+    orders, notes = {}, defaultdict[int, list[str]](list)
     for k, place in enumerate(places):
         try:
-            if place.is_done():
+            if place.is_done(ShownCell(no_progress, notes[k].append)):
                 settled[k] = None
             else:
                 orders[k] = make_order(place.job, folder, place.work)
@@ -177,14 +198,12 @@ def _spread(
     arrivals = run(fit_order, list(orders.values()))
     display.say(f"{len(orders)} cells go to workers and appear as they come back")
     for k, failure in settled.items():
-        with display.cell(places[k].title) as shown:
-            if failure is None:
-                shown.note("predictions are there")
+        with display.cell(places[k].title, notes[k]) as shown:
             yield k, _settle(places[k], failure, selection, shown)
     sent = list(orders)
     for position, result in arrivals:
         k = sent[position]
-        with display.cell(places[k].title) as shown:
+        with display.cell(places[k].title, notes[k]) as shown:
             if result == WORKERS_DIED:
                 result = Failure("failed", "its workers died one after another (out of memory?)", WORKERS_DIED)
             if not isinstance(result, Failure):
@@ -222,7 +241,9 @@ def _write_records(
     for info, cells in zip(place.job.variants, zip(*rows, strict=True), strict=True):
         by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
         record = build_record(info, scenes, by_scene, device)
-        write_record(place.out / "results" / f"{info.name}.json", record)
+        path = place.out / "results" / f"{info.name}.json"
+        record = with_earlier_scenes(record, path)
+        write_record(path, record)
         records.append(record)
     return records
 

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import importlib
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,13 +16,18 @@ import dummy_methods
 import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
+from rich.console import Console
+from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import FitRequest
+from spike4dgs.benchmark.method import FitRequest, get_method
 from spike4dgs.benchmark.runs.cell import FitClock
+from spike4dgs.benchmark.runs.method_code import code_of
+from spike4dgs.benchmark.runs.record import check_record, of_scenes
+from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.images import read_exr
-from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
 
 
@@ -30,6 +38,61 @@ def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_p
     assert run(tmp_path / "out", [small_scene], again)[0]["scenes"] == records[0]["scenes"]
     assert again.fits == 0
     assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
+
+
+def test_what_is_kept_and_what_is_replaced_says_why_and_refit_fits_anew(small_scene: Path, tmp_path: Path) -> None:
+    def notes(*methods: Any, **settings: Any) -> str:
+        console = Console(file=(text := io.StringIO()), width=200)
+        run_matrix([open_scene(small_scene)], methods, Settings(tmp_path / "out", **settings), console)
+        return text.getvalue()
+
+    assert "kept" not in notes(CountMethod()) and "kept: predictions of 2" in notes(CountMethod())
+    assert "replaces predictions with another settings" in notes(CountMethod(extra=1))
+    assert "replaces predictions with another seed, settings" in notes(CountMethod(), seed=2)
+    again = CountMethod()
+    assert "fitted anew (--refit)" in notes(again, seed=2, refit=True) and again.fits == 1
+
+
+def test_edited_code_of_a_plug_in_is_fitted_and_scored_anew(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A package whose helper module changes, installed again in the same version."""
+    package = tmp_path / "edited_plug_in"
+    package.mkdir()
+    (package / "__init__.py").write_text(
+        "from dummy_methods import CountMethod\nfrom .model import LEVEL\n"
+        "class Method(CountMethod):\n"
+        "    def fit(self, scene, request):\n"
+        "        model = super().fit(scene, request)\n"
+        "        model.image = model.image * LEVEL\n"
+        "        return model\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    scores = []
+    for level in (1.0, 0.5, 0.5):
+        (package / "model.py").write_text(f"LEVEL = {level}  # of the images\n")
+        for name in [m for m in sys.modules if m.startswith("edited_plug_in")]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        shutil.rmtree(package / "__pycache__", ignore_errors=True)
+        method = importlib.import_module("edited_plug_in").Method()
+        scores.append((run(tmp_path / "out", [small_scene], method)[0]["mean"]["psnr"], method.fits))
+    assert [fits for _, fits in scores] == [1, 1, 0] and scores[0] != scores[1] and scores[1][0] == scores[2][0]
+
+
+def test_a_method_of_this_package_has_no_code_in_its_key() -> None:
+    assert code_of(get_method("tfp+4dgs")) == {} and list(code_of(CountMethod())) == ["dummy_methods"]
+
+
+def test_one_scene_run_again_keeps_the_cells_of_the_others(small_scene: Path, tmp_path: Path) -> None:
+    other = write_small_scene(tmp_path / "other", seed=1)
+    (both,) = run(tmp_path / "out", [small_scene, other], CountMethod())
+    (again,) = run(tmp_path / "out", [other], CountMethod())
+    assert again["scenes"] == both["scenes"] and again["dataset"] == both["dataset"] and again["mean"] == both["mean"]
+    assert of_scenes(again, ["pattern-1"])["dataset"]["scenes"] == {"pattern-1": both["dataset"]["scenes"]["pattern-1"]}
+    (changed,) = run(tmp_path / "out", [other], CountMethod(extra=1))
+    assert list(changed["scenes"]) == ["pattern-1"], "cells of other parameters are no part of the record"
+    check_record(again, "again")
 
 
 class WarmingMethod(CountMethod):
@@ -74,8 +137,6 @@ def test_whatever_changes_the_result_changes_the_key(
 
 
 def test_another_revision_of_the_scene_is_another_key(tmp_path: Path) -> None:
-    from small_scenes import write_small_scene
-
     from spike4dgs.benchmark.scene.manifest import write_manifest
 
     scene = write_small_scene(tmp_path / "scene")
