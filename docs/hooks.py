@@ -1,9 +1,8 @@
-"""MkDocs hooks of the docs site: find the package's sources, include files, list modules."""
+"""MkDocs hooks of the docs site: find the package's sources, include files, list public names."""
 
 from __future__ import annotations
 
 import ast
-import os
 import posixpath
 import re
 import sys
@@ -22,11 +21,10 @@ PAGES = {  # files outside docs/ that have a page on the site
     "method/msdi/README.md": "docs/methods/msdi_card.md",
     "baselines/images/spk2img/README.md": "docs/methods/spk2img_card.md",
 }
-_TEXT_ONLY = "    options: {members: false, show_root_heading: false, show_root_toc_entry: false}\n"
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
-_MODULES = re.compile(r"^<!-- modules of (\w+) -->$", re.MULTILINE)
+_API = re.compile(r"^<!-- api spike4dgs\.(\w+)\.([\w.]+)((?: \w+)*) -->$", re.MULTILINE)
 
 
 def on_startup(**kwargs: Any) -> None:
@@ -55,10 +53,10 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand `<!-- include FILE [SECTION] -->`, `<!-- names of ROOM -->` and `<!-- modules of ROOM -->`."""
+    """Expand `<!-- include FILE [SECTION] -->`, `<!-- names of ROOM -->` and `<!-- api MODULE [NAMES] -->`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
-    return _MODULES.sub(lambda found: module_list(found[1]), markdown)
+    return _API.sub(lambda found: api(found[1], found[2], tuple(found[3].split())), markdown)
 
 
 def included(name: str, section: str | None, page: str) -> str:
@@ -86,21 +84,25 @@ def included(name: str, section: str | None, page: str) -> str:
 
 
 def name_table(room: str) -> str:
-    """Return a table of the names that a room exports: each with a link and the first line of its docstring."""
+    """Return a table of the names that a room exports: each with a link and the first paragraph of its docstring."""
     rows = ["| name | |", "|---|---|"]
     for module, names in _exports(room):
-        path = ROOT / room / module.replace(".", "/")
-        source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
-        documented = {
-            node.name: (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
-            for node in ast.parse(source).body
-            if isinstance(node, ast.FunctionDef | ast.ClassDef)
-        }
         for name in names:
-            text, target = documented.get(name), f"spike4dgs.{room}.{module}"
-            link = f"[{target}.{name}]" if text else f"(#{target})" if path.is_dir() else f"[{target}]"
-            rows.append(f"| [`{name}`]{link} | {text or f'defined in `{target}`'} |")
+            rows.append(f"| [`{name}`][spike4dgs.{room}.{name}] | {_summary(f'spike4dgs.{room}.{module}', name)} |")
     return "\n".join(rows)
+
+
+def _summary(module: str, name: str) -> str:
+    """Return the first paragraph of a name's docstring, where it is defined; of its module's for a table of data."""
+    path = ROOT.joinpath(*module.split(".")[1:])
+    tree = ast.parse((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8"))
+    text = ast.get_docstring(tree)
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module and name in [alias.name for alias in node.names]:
+            return _summary(node.module, name)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
+            text = ast.get_docstring(node)
+    return (text or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
 
 
 def _exports(room: str) -> list[tuple[str, tuple[str, ...]]]:
@@ -111,20 +113,14 @@ def _exports(room: str) -> list[tuple[str, tuple[str, ...]]]:
     return []
 
 
-def module_list(room: str) -> str:
-    """Return the mkdocstrings blocks of all public modules of a room, folder by folder."""
-    blocks = []
-    for folder, folders, files in os.walk(ROOT / room):
-        folders[:] = sorted(name for name in folders if name != "__pycache__" and _has_source(Path(folder) / name))
-        package = ".".join(["spike4dgs", *Path(folder).relative_to(ROOT).parts])
-        if package.count(".") > 1:
-            blocks.append(f"## `{package}` {{ #{package} }}\n\n::: {package}\n{_TEXT_ONLY}")
-        for name in sorted(files):
-            module = name.removesuffix(".py")
-            if name.endswith(".py") and not module.startswith("__"):
-                blocks.append(f"::: {package}.{module}\n")
-    return "\n".join(blocks)
-
-
-def _has_source(folder: Path) -> bool:
-    return any(folder.glob("*.py"))
+def api(room: str, module: str, names: tuple[str, ...]) -> str:
+    """Return the import line and the mkdocstrings blocks of a module's names; without names, of those the room exports."""
+    package = f"spike4dgs.{room}"
+    if names:
+        package = f"{package}.{module}"
+    else:
+        names = dict(_exports(room)).get(module, ())
+        if not names:
+            raise PluginError(f"{package} exports nothing of {module}: name what the page shows")
+    blocks = [f"```python\nfrom {package} import {', '.join(names)}\n```\n"]
+    return "\n".join([*blocks, *(f"::: {package}.{name}\n" for name in names)])

@@ -123,6 +123,18 @@ def test_the_commands_are_all_described() -> None:
     assert not missing
 
 
+@pytest.mark.parametrize("room", ["benchmark", "generators", "method", "baselines", "leaderboard"])
+def test_every_exported_module_is_in_the_reference(room: str) -> None:
+    exports = re.findall(
+        rf"^    from (spike4dgs\.{room}\.[\w.]+) import", (ROOT / room / "__init__.py").read_text(), re.M
+    )
+    shown = [
+        m for page in (DOCS / "api").rglob("*.md") for m in re.findall(r"^<!-- api (\S+) -->$", page.read_text(), re.M)
+    ]
+    assert exports
+    assert [module for module in exports if shown.count(module) != 1] == []
+
+
 def test_the_citation_is_complete() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert {"cff-version", "message", "title", "authors", "version", "license"} <= citation.keys()
