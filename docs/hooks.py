@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import json
 import posixpath
 import re
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,15 @@ from mkdocs.exceptions import PluginError
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard", "cli", "studies")
 SOURCES = ROOT / "build" / "docs" / "spike4dgs"  # links to the rooms, under the name that they are imported by
+TABLES = ROOT / "docs" / "results" / "tables"
+HEADLINE = (  # columns of the home page's table: key of a cell, title, format
+    ("psnr", "PSNR, dB", ".2f"),
+    ("psnr_dynamic", "PSNR where things move, dB", ".2f"),
+    ("ssim", "SSIM", ".4f"),
+    ("flip", "FLIP (less is better)", ".3f"),
+    ("fit_seconds", "fit, s", ".0f"),
+    ("render_fps", "images/s", ".0f"),
+)
 PAGES = {  # files outside docs/ that have a page on the site
     "CONTRIBUTING.md": "docs/contributing.md",
     "CHANGELOG.md": "docs/changelog.md",
@@ -24,6 +35,7 @@ PAGES = {  # files outside docs/ that have a page on the site
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
+_HEADLINE = re.compile(r"^<!-- headline -->$", re.MULTILINE)
 _API = re.compile(r"^<!-- api spike4dgs\.(\w+)\.([\w.]+)((?: \w+)*) -->$", re.MULTILINE)
 
 
@@ -43,6 +55,13 @@ def on_startup(**kwargs: Any) -> None:
     sys.path[:] = [path for path in sys.path if not (Path(path) / "spike4dgs").is_file()]
 
 
+def on_config(config: Any, **kwargs: Any) -> None:
+    """Link the repository if the package's metadata name it."""
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"].get("urls", {})
+    config.repo_url = urls.get("Repository")
+    config.repo_name = posixpath.basename(config.repo_url.rstrip("/")) if config.repo_url else None
+
+
 def on_post_build(config: Any, **kwargs: Any) -> None:
     """Write the leaderboard's page into the site, from the committed entries."""
     from spike4dgs.leaderboard.page.rows import gather
@@ -53,8 +72,9 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand `<!-- include FILE [SECTION] -->`, `<!-- names of ROOM -->` and `<!-- api MODULE [NAMES] -->`."""
+    """Expand the comments `include FILE [SECTION]`, `names of ROOM`, `api MODULE [NAMES]` and `headline`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
+    markdown = _HEADLINE.sub(lambda found: headline(), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
     return _API.sub(lambda found: api(found[1], found[2], tuple(found[3].split())), markdown)
 
@@ -81,6 +101,27 @@ def included(name: str, section: str | None, page: str) -> str:
         return f"]({target}{'#' + anchor if anchor else ''})"
 
     return _LINK.sub(moved, text)
+
+
+def headline() -> str:
+    """Return the home page's table: means over the scenes of tables 1 and 2, of our rows and the best of each kind."""
+    tables = [json.loads((TABLES / f"table{number}" / "table.json").read_text(encoding="utf-8")) for number in (1, 2)]
+    cells: dict[str, list[dict[str, Any]]] = {}
+    for row in (row for table in tables for row in table["rows"]):
+        cells.setdefault(row["method"], []).extend(row["scenes"].values())
+    rows = {name: tuple(_mean(found, key) for key, _, _ in HEADLINE) for name, found in cells.items()}
+    kinds = [["spike4dgs-x"], ["spike4dgs"], [n for n in rows if "+" in n], [n for n in rows if n.startswith("dy-")]]
+    chosen = sorted((max(kind, key=lambda name: rows[name][0]) for kind in kinds), key=lambda name: -rows[name][0])
+    lines = ["| method | " + " | ".join(title for _, title, _ in HEADLINE) + " |", "|---" * (1 + len(HEADLINE)) + "|"]
+    for name in chosen:
+        values = [format(value, form) for value, (_, _, form) in zip(rows[name], HEADLINE, strict=True)]
+        lines.append(f"| `{name}` | " + " | ".join(values) + " |")
+    return "\n".join(lines)
+
+
+def _mean(cells: list[dict[str, Any]], key: str) -> float:
+    values = [cell["values"][key]["value"] if key in cell["values"] else cell[key] for cell in cells]
+    return sum(values) / len(values)
 
 
 def name_table(room: str) -> str:
@@ -114,7 +155,7 @@ def _exports(room: str) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def api(room: str, module: str, names: tuple[str, ...]) -> str:
-    """Return the import line and the mkdocstrings blocks of a module's names; without names, of those the room exports."""
+    """Return the import line and mkdocstrings' blocks of a module's names; without names, of those the room exports."""
     package = f"spike4dgs.{room}"
     if names:
         package = f"{package}.{module}"
