@@ -74,6 +74,8 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
     """Expand the comments `include FILE [SECTION]`, `names of ROOM`, `api MODULE [NAMES]` and `headline`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
+    if page.file.src_uri.startswith("results/tables/"):
+        markdown += table_images(page.file.src_uri)
     markdown = _HEADLINE.sub(lambda found: headline(), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
     return _API.sub(lambda found: api(found[1], found[2], tuple(found[3].split())), markdown)
@@ -101,6 +103,13 @@ def included(name: str, section: str | None, page: str) -> str:
         return f"]({target}{'#' + anchor if anchor else ''})"
 
     return _LINK.sub(moved, text)
+
+
+def table_images(page: str) -> str:
+    """Return a section with the images in the folder of a table's page: the plots, then a sheet for each scene."""
+    files = [f for f in sorted((ROOT / "docs" / page).parent.iterdir()) if f.suffix in (".webp", ".png")]
+    shown = [f"### {f.stem.replace('_', ' ').capitalize()}\n\n[![{f.stem}]({f.name})]({f.name})\n" for f in files]
+    return "\n".join(["\n\n## Images\n\nSelect an image to see it in full size.\n", *shown]) if shown else ""
 
 
 def headline() -> str:
