@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import json
 import posixpath
 import re
@@ -35,6 +36,7 @@ PAGES = {  # files outside docs/ that have a page on the site
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
+_RECIPES = re.compile(r"^<!-- recipes of (\w+) -->$", re.MULTILINE)
 _HEADLINE = re.compile(r"^<!-- headline -->$", re.MULTILINE)
 _API = re.compile(r"^<!-- api spike4dgs\.(\w+)\.([\w.]+)((?: \w+)*) -->$", re.MULTILINE)
 
@@ -72,11 +74,13 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand the comments `include FILE [SECTION]`, `names of ROOM`, `api MODULE [NAMES]` and `headline`."""
+    """Expand the comments `include FILE [SECTION]`, `names of ROOM`, `recipes of ROOM`, `api MODULE` and `headline`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
     if page.file.src_uri.startswith("results/tables/"):
         markdown += table_images(page.file.src_uri)
+        page.meta["search"] = {"boost": 0.2}  # a table has every word of a method's or scene's name
     markdown = _HEADLINE.sub(lambda found: headline(), markdown)
+    markdown = _RECIPES.sub(lambda found: recipe_table(found[1]), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
     return _API.sub(lambda found: api(found[1], found[2], tuple(found[3].split())), markdown)
 
@@ -133,6 +137,18 @@ def _mean(cells: list[dict[str, Any]], key: str) -> float:
     return sum(values) / len(values)
 
 
+def recipe_table(room: str) -> str:
+    """Return a table of the methods that a room lists: the parts of each, and what it is given."""
+    methods = importlib.import_module(f"spike4dgs.{room}").METHODS
+    rows = ["| name | images | initialization | motion | supervision | given |", "|---|---|---|---|---|---|"]
+    for name, method in methods.items():
+        recipe = getattr(method, "recipe", None)
+        parts = [getattr(recipe, part, "") for part in ("images", "initialization", "motion", "supervision")]
+        given = ", ".join(getattr(method, "given", ()))
+        rows.append(f"| `{name}` | " + " | ".join(f"`{part}`" if part else "" for part in parts) + f" | {given} |")
+    return "\n".join(rows)
+
+
 def name_table(room: str) -> str:
     """Return a table of the names that a room exports: each with a link and the first paragraph of its docstring."""
     rows = ["| name | |", "|---|---|"]
@@ -172,5 +188,6 @@ def api(room: str, module: str, names: tuple[str, ...]) -> str:
         names = dict(_exports(room)).get(module, ())
         if not names:
             raise PluginError(f"{package} exports nothing of {module}: name what the page shows")
+    names = tuple(sorted(names, key=lambda name: name[0].isupper()))  # functions, then classes and tables
     blocks = [f"```python\nfrom {package} import {', '.join(names)}\n```\n"]
     return "\n".join([*blocks, *(f"::: {package}.{name}\n" for name in names)])
