@@ -168,11 +168,10 @@ def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entr
     splits = paper.splits if paper.splits and choice.split is None else (choice.split,)
     runs = _run(scenes, _choose_methods(fits, paper), splits, choice.allow_gaps, fits)
     rows = [[*(r for r in run.earlier if plain_name(r) in paper.rows), *run.records] for run in runs]
-    ids = {path.name for path in scenes}
-    shown = [
-        (run.scenes, of_one_seed([of_scenes(record, ids) for record in records]))
-        for run, records in zip(runs, rows, strict=True)
-    ]
+    shown = []
+    for run, records in zip(runs, rows, strict=True):
+        ids = {scene.id for scene in run.scenes}  # not those of earlier runs
+        shown.append((run.scenes, of_one_seed([of_scenes(record, ids) for record in records])))
     folder = fits.out if len(runs) > 1 else runs[0].settings.out
     worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
     write_paper_table(paper, in_every_split(shown), worlds, select_metrics(fits.metrics).metrics, folder)

@@ -35,7 +35,7 @@ def score(
         allow_gaps: Accept recordings with gaps.
     """
     record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
-    name = record["method"]["name"]
+    name = record["method"]["name"] + (f", split {split}," if split else "")
     for scene, cell in record["scenes"].items():
         print(f"{name} on {scene}: {cell_summary(cell)}")
     if len(record["scenes"]) > 1:
