@@ -184,6 +184,11 @@ COMMANDS: dict[str, Command] = {
         "check a release: a host's limits, its index, every byte",
         "release check releases/1",
     ),
+    "release fingerprint": Command(
+        "spike4dgs.cli.release:fingerprint",
+        "write small files by which scenes made on other processors are recognised",
+        "release fingerprint data/car-0-small --out leaderboard/releases/1",
+    ),
     "verify": Command(
         "spike4dgs.cli.verify:verify",
         "check every file of a scene against its manifest",

@@ -1,4 +1,4 @@
-"""`release pack` and `release check`: make a release of scenes, and check one before it is uploaded."""
+"""`release pack`, `release check` and `release fingerprint`: make a release of scenes, check it, and know it again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release.check import find_problems
+from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fingerprint
 from spike4dgs.benchmark.release.index import Release, read_release
 from spike4dgs.benchmark.release.pack import pack as pack_scenes
 from spike4dgs.benchmark.release.source import size_text
@@ -60,6 +62,20 @@ def check(folder: Positional[Path]) -> int:
         _console().print(_costs(release))
         print(f"{folder}: good; release.json has sha256 {release.sha256}")
     return 2 if problems else 0
+
+
+def fingerprint(scenes: Positional[tuple[Path, ...]], *, out: Path) -> int:
+    """Write the fingerprint of scenes, by which those that another processor made are recognised.
+
+    Args:
+        scenes: Scene folders of a release.
+        out: Folder of the fingerprints, OUT/SCENE.npz.
+    """
+    for scene in open_scenes(scenes, allow_gaps=True):
+        path = out / f"{scene.id}.npz"
+        write_fingerprint(path, make_fingerprint(scene))
+        print(f"{path}: {size_text(path.stat().st_size)}, sha256 {sha256_file(path)}")
+    return 0
 
 
 def _console() -> Console:

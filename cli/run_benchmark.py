@@ -36,7 +36,7 @@ from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
-from spike4dgs.leaderboard.tracks import track_scenes
+from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def run_benchmark(
             raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
         return _run_table(paper, choice, fits, entries)
     if choice.track is not None:
-        scenes = track_folders(track_scenes(choice.track), choice.data, choice.source)
+        scenes = track_folders(track_scenes(choice.track), choice.data, choice.source, is_equivalent)
     runs = _run(scenes, _choose_methods(fits, None), (choice.split,), choice.allow_gaps, fits)
     return _finish(runs, scenes, choice.allow_gaps, entries)
 
@@ -194,6 +194,8 @@ def _run(
     budget, console, runs = make_budget(fits.budget), make_console(), []
     for split in splits:
         opened = open_scenes(scenes, allow_gaps, split)
+        if not runs and (line := release_line(opened)):
+            console.print(line, highlight=False, markup=False)
         out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
         cluster = (fits.workers, fits.scheduler)
         settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster, fits.refit)

@@ -22,10 +22,10 @@ from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
-from spike4dgs.benchmark.runs.record import COSTS, is_complete
+from spike4dgs.benchmark.runs.record import COSTS, Record, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry, read_entries
-from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of
+from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, on_release, place_of
 
 SCHEMA = "spike4dgs-leaderboard/2"
 FILES = {PUBLIC: BOARD, LOCAL: "local.json", ARCHIVE: "archive.json"}
@@ -102,8 +102,8 @@ def _board(facts: Mapping[str, Any], entries: Mapping[str, Entry], ranked: bool 
     record = next(iter(entries.values()))["record"]
     return {
         **facts,
-        "dataset": record["dataset"],
-        "revision": dataset_revision(record["dataset"]),
+        "dataset": on_release(record["dataset"]),
+        "revision": dataset_revision(on_release(record["dataset"])),
         "protocol": record["protocol"],
         "rows": rank_entries(entries, ranked),
     }
@@ -144,7 +144,7 @@ def flags_of(entry: Mapping[str, Any]) -> list[str]:
     for scene, cell in sorted(record["scenes"].items()):
         for flag in _of_truth(truth.get(scene)):
             found.setdefault(flag, []).append(scene)
-        revision, psnr = record["dataset"]["scenes"][scene], cell["metrics"]["psnr"]
+        revision, psnr = on_release(record["dataset"])["scenes"][scene], cell["metrics"]["psnr"]
         ceiling = release.ceiling_db(scene, revision) or truth.get(scene, {}).get("ceiling_db")
         if psnr is not None and ceiling is not None and psnr > ceiling:
             found.setdefault(CEILING, []).append(f"{scene} has {psnr:.1f} of {ceiling:.1f} dB")
@@ -192,6 +192,7 @@ def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
         "status": {scene: cell["status"] for scene, cell in first["scenes"].items()},
         "given": first["method"].get("given", list(GIVEN)),
         "trained_on": first["method"]["trained_on"],
+        **({"equivalent": equivalent} if (equivalent := _equivalent(records)) else {}),
         "costs": {
             cost: {
                 "claimed": mean(_of_scenes(cost, r["scenes"]) for r in records),
@@ -204,6 +205,12 @@ def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
             "verifier": sorted({_code(c["by"]["harness"]) for c in checks if c["by"]}),
         },
     }
+
+
+def _equivalent(records: Sequence[Record]) -> dict[str, float]:
+    """Return the share of spike bits by which the scenes of some records differ from the release's, by scene."""
+    found = [(scene, of["bits"]) for r in records for scene, of in r["dataset"].get("equivalent", {}).items()]
+    return {scene: max(bits for name, bits in found if name == scene) for scene, _ in found}
 
 
 def _of_scenes(cost: str, cells: Mapping[str, Mapping[str, Any]]) -> float | None:
@@ -225,7 +232,9 @@ def standing(boards: Mapping[str, Mapping[str, Any]], path: str) -> str:
             ranked = sum(row["rank"] is not None for row in board["rows"])
             for row in (r for r in board["rows"] if path in r["entries"]):
                 rank = f"rank {row['rank']} of {ranked}" if row["rank"] else f"not ranked ({reason(row)})"
-                found.append(f"{rank} on {board_name(board, folder, file['release'])}")
+                made = ", ".join(f"{scene} {bits:.3%}" for scene, bits in row.get("equivalent", {}).items())
+                other = f", on equivalent scenes (bits that differ: {made})" if made else ""
+                found.append(f"{rank} on {board_name(board, folder, file['release'])}{other}")
     return "; ".join(found) or "not listed"
 
 

@@ -34,7 +34,7 @@ from spike4dgs.leaderboard.entry import (
     write_entry,
 )
 from spike4dgs.leaderboard.rank import FILES, standing, write_boards
-from spike4dgs.leaderboard.tracks import LOCAL, place_of
+from spike4dgs.leaderboard.tracks import LOCAL, place_of, with_equivalents
 from spike4dgs.leaderboard.truth_check import SecondRenderings, no_renderings
 from spike4dgs.leaderboard.verify import verify_record
 
@@ -170,6 +170,7 @@ def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
     check_numbers(record, result)
     entry_path(record)  # names that cannot be file names are refused before the work
     opened = open_scenes(files.scenes, files.allow_gaps, record["dataset"]["split"]) if files.scenes else []
+    record = with_equivalents(record, opened)
     missing = _reason_not_to_verify(record, files.predictions, opened)
     if files.refit and missing:
         raise problem("--refit", "predictions and scenes of a scored record", missing, "give them")

@@ -1,17 +1,20 @@
 """The tracks of a release: frozen lists of scenes with their revisions, and the place of a record among them.
 
     leaderboard/releases/1.json       the tracks
-    leaderboard/releases/SHA256SUMS   the file's hash: a release does not change
+    leaderboard/releases/1/SCENE.npz  the fingerprint of a scene
+    leaderboard/releases/SHA256SUMS   the files' hashes: a release does not change
 
-A record of exactly a track's scenes, revisions and split is public. Its folder is that of the first such track; its
-method is on the boards of all of them that withhold nothing it was given. Any other record is local.
+A record of exactly a track's scenes, revisions and split is public. So is one of equivalent scenes, which a processor
+that rounds otherwise made: their fingerprints say so, and the record gets the release's revisions and the share of
+bits that differ. The folder of a public record is that of the first such track; its method is on the boards of all of
+them that withhold nothing it was given. Any other record is local.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -21,7 +24,9 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.method import GIVEN, is_changed
-from spike4dgs.benchmark.runs.record import NOISY
+from spike4dgs.benchmark.release.fingerprint import Match, compare, read_fingerprint
+from spike4dgs.benchmark.runs.record import NOISY, Record
+from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
@@ -31,6 +36,7 @@ REVISION_DIGITS = 12  # of revisions in paths and messages
 CHANGED = "the method ran with other settings (--set); a track takes it as a recipe with a name of its own"
 _SCENE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _NAMED = 3  # scenes that a message names
+_FROZEN = "restore the file: a release does not change, what is new goes into the next one"
 
 
 @dataclass(frozen=True)
@@ -89,18 +95,78 @@ class Place:
 @cache
 def read_release(folder: Path, number: str) -> Release:
     """Read a release. Raises UserError where its file is damaged, or is not the one that was frozen."""
-    path, sums = folder / f"{number}.json", folder / "SHA256SUMS"
+    path = folder / f"{number}.json"
     data = read_json(path, f"release {number} of the leaderboard")
-    fix = "restore the file: a release does not change, what is new goes into the next one"
-    check_schema(data, load_schema("spike4dgs.leaderboard", "release.schema.json"), path, fix)
-    listed = sums.read_text(encoding="utf-8").splitlines() if sums.is_file() else []
-    if f"{(found := hashlib.sha256(path.read_bytes()).hexdigest())}  {path.name}" not in listed:
-        raise problem(path, f"the bytes whose hash {sums.name} lists", f"sha256 {found[:16]}...", fix)
+    check_schema(data, load_schema("spike4dgs.leaderboard", "release.schema.json"), path, _FROZEN)
+    _check_frozen(folder, path)
     tracks = tuple(
         Track(name, t["title"], t["status"] == "announced", t["split"], frozenset(t["withheld"]), t["scenes"])
         for name, t in data["tracks"].items()
     )
     return Release(data["release"], tracks, data["ceilings_db"])
+
+
+def _check_frozen(folder: Path, path: Path) -> None:
+    """Raise UserError unless SHA256SUMS lists the hash of a release's file."""
+    sums = folder / "SHA256SUMS"
+    listed = sums.read_text(encoding="utf-8").splitlines() if sums.is_file() else []
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if f"{found}  {path.relative_to(folder).as_posix()}" not in listed:
+        raise problem(path, f"the bytes whose hash {sums.name} lists", f"sha256 {found[:16]}...", _FROZEN)
+
+
+def match_release(scene: Scene) -> Match | None:
+    """Return how a scene compares with the current release's of the same id by its fingerprint.
+
+    None where that scene has the same revision, is in no release, or has no fingerprint there.
+    """
+    known = {name: revision for track in current_release().tracks for name, revision in track.scenes.items()}
+    path = FOLDER / RELEASE / f"{scene.id}.npz"
+    if known.get(scene.id, scene.revision) == scene.revision or not path.is_file():
+        return None
+    _check_frozen(FOLDER, path)
+    match = compare(scene, read_fingerprint(path))
+    return match if match.revision == known[scene.id] else None
+
+
+def is_equivalent(scene: Scene) -> bool:
+    """Return whether a scene differs from the release's by rounding alone."""
+    match = match_release(scene)
+    return match is not None and match.is_equivalent
+
+
+def with_equivalents(record: Record, scenes: Sequence[Scene]) -> Record:
+    """Return a record that names those of its scenes that are equivalent to the release's, as far as they are given."""
+    found = {}
+    for scene in scenes:
+        if record["dataset"]["scenes"].get(scene.id) == scene.revision and (match := match_release(scene)):
+            if match.is_equivalent:
+                found[scene.id] = {"revision": match.revision, "bits": match.bits}
+    dataset = {key: value for key, value in record["dataset"].items() if key != "equivalent"}
+    return {**record, "dataset": {**dataset, **({"equivalent": found} if found else {})}}
+
+
+def release_line(scenes: Sequence[Scene]) -> str | None:
+    """Return which of some scenes are those of the current release, in one line; None where it has none of them."""
+    known = {name: revision for track in current_release().tracks for name, revision in track.scenes.items()}
+    found: dict[str, list[str]] = {}
+    for scene in (s for s in scenes if known.get(s.id)):
+        match = match_release(scene)
+        if scene.revision == known[scene.id]:
+            found.setdefault("as released", []).append(scene.id)
+        elif match and match.is_equivalent:
+            found.setdefault("equivalent, by rounding", []).append(f"{scene.id} ({match.bits:.3%} of the bits differ)")
+        else:
+            why = match.reasons[0] if match else "no fingerprint to compare with"
+            found.setdefault("another scene, so on a local board", []).append(f"{scene.id} ({why})")
+    parts = [f"{kind}: {', '.join(names)}" for kind, names in found.items()]
+    return f"release {RELEASE}: {'; '.join(parts)}" if parts else None
+
+
+def on_release(dataset: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's dataset with the release's revisions of equivalent scenes."""
+    equal = {scene: found["revision"] for scene, found in dataset.get("equivalent", {}).items()}
+    return {"name": dataset["name"], "scenes": {**dataset["scenes"], **equal}, "split": dataset["split"]}
 
 
 def current_release() -> Release:
@@ -137,7 +203,7 @@ def place_of(record: Mapping[str, Any]) -> Place:
 
     Raises UserError where a scene's id cannot be part of a file name, and where the dataset's name is not its scenes'.
     """
-    dataset, release = record["dataset"], current_release()
+    dataset, release = on_release(record["dataset"]), current_release()
     ids = sorted(dataset["scenes"])
     for scene in ids:
         if not _SCENE_ID.fullmatch(scene):

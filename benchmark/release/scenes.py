@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from spike4dgs.benchmark.release.selection import Selection
 from spike4dgs.benchmark.release.source import ByteProgress, Source, find_source, size_text
 from spike4dgs.benchmark.release.transfer import Wanted, transfer
 from spike4dgs.benchmark.scene import manifest
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes import folder
 from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick, open_stream
@@ -203,10 +203,13 @@ def check_revisions(source: Source, release: Release, revisions: Mapping[str, st
             raise problem(source.address, f"{scene} in revision {revision}", found, "name another release")
 
 
-def track_folders(revisions: Mapping[str, str], data: Path, address: str | None) -> tuple[Path, ...]:
+def track_folders(
+    revisions: Mapping[str, str], data: Path, address: str | None, is_equivalent: Callable[[Scene], bool]
+) -> tuple[Path, ...]:
     """Return the folders DATA/SCENE of a track's scenes (id -> revision); what is missing is downloaded first.
 
-    Raises UserError where another revision of a scene is there, and where none can be downloaded.
+    Raises UserError where a scene of another revision is there that is not equivalent, and where none can be
+    downloaded.
     """
     missing = {}
     for scene, revision in revisions.items():
@@ -215,7 +218,7 @@ def track_folders(revisions: Mapping[str, str], data: Path, address: str | None)
             missing[scene] = revision
             continue
         opened = open_scene(root, allow_gaps=True)
-        if opened.revision != revision:
+        if opened.revision != revision and not is_equivalent(opened):
             fix = "choose another --data, or remove the folder, and the track's scene is downloaded"
             raise problem(root, f"revision {revision} of the track", opened.revision, fix)
         if not all((root / path).is_file() for path in opened.manifest.files):  # of a download of some parts

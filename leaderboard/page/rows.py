@@ -13,7 +13,16 @@ from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.leaderboard.entry import Entry, read_entries
 from spike4dgs.leaderboard.rank import make_boards, reason
-from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, place_of, short
+from spike4dgs.leaderboard.tracks import (
+    ARCHIVE,
+    LOCAL,
+    PUBLIC,
+    current_release,
+    dataset_revision,
+    on_release,
+    place_of,
+    short,
+)
 
 OWN = "own run"  # the label of a reader's records, beside those of entries
 
@@ -102,7 +111,7 @@ def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], entries: Ma
 
 def _boards_of(boards: list[Board], record: Record) -> Iterator[Board]:
     """Yield the boards that a record belongs to; one that has no entries yet is added."""
-    place, dataset = place_of(record), record["dataset"]
+    place, dataset = place_of(record), on_release(record["dataset"])
     names = place.tracks or (place.folder.partition("/")[2].partition("@")[0],)
     tracks = {t.name: t for t in current_release().tracks}
     for name in names:

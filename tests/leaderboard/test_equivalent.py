@@ -1,0 +1,125 @@
+"""Results of scenes that another processor made: on the track where they are equivalent, on a local board otherwise."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from submissions import board, edit, edit_with_ledger, enter, read, track, write_release
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fingerprint
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard import tracks
+from spike4dgs.leaderboard.tracks import current_release, match_release, release_line
+from spike4dgs.leaderboard.verify import verify_leaderboard
+
+SCENES = ("s0", "s1")
+
+
+def ship(done: Path, monkeypatch: pytest.MonkeyPatch, share: float) -> Path:
+    """Ship a release of the run's scenes, with `share` of the spike bits of the training views of s0 changed."""
+    data = done / "released"
+    for name in SCENES:
+        shutil.copytree(done / name, data / name)
+    for path in sorted((data / "s0/spikes").glob("cam_0[0-2].dat")):
+        bits = np.unpackbits(np.fromfile(path, np.uint8))
+        bits ^= np.random.default_rng(0).random(bits.shape) < share
+        np.packbits(bits).tofile(path)
+    write_manifest(data / "s0")
+    scenes = [open_scene(data / name) for name in SCENES]
+    folder = write_release(done / "releases", {"patterns": track({s.id: s.revision for s in scenes})})
+    for scene in scenes:
+        write_fingerprint(folder / f"1/{scene.id}.npz", make_fingerprint(scene))
+    names = ["1.json", *(f"1/{s.id}.npz" for s in scenes)]
+    lines = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+    (folder / "SHA256SUMS").write_text("".join(lines))
+    monkeypatch.setattr(tracks, "FOLDER", folder)
+    tracks.read_release.cache_clear()
+    return data
+
+
+def test_a_result_of_equivalent_scenes_is_on_the_track_and_says_so(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = ship(done, monkeypatch, 1e-4)
+    entry = read(enter(done))
+    assert "rank 1 of 1 on patterns (release 1" in (said := capsys.readouterr().out)
+    assert "on equivalent scenes (bits that differ: pattern-0 0.0" in said
+    dataset = entry["record"]["dataset"]
+    own, released = (open_scene(folder / "s0") for folder in (done, data))
+    assert dataset["scenes"]["pattern-0"] == own.revision
+    assert dataset["equivalent"].keys() == {"pattern-0"}
+    assert dataset["equivalent"]["pattern-0"]["revision"] == released.revision != own.revision
+    (found,) = board(done, "leaderboard")["boards"]
+    assert found["dataset"]["scenes"] == dict(current_release().tracks[0].scenes)
+    assert 0 < found["rows"][0]["equivalent"]["pattern-0"] < 1e-3
+    line = release_line([open_scene(done / name) for name in SCENES])
+    assert line is not None and "as released: pattern-1" in line and "equivalent, by rounding: pattern-0 (0.0" in line
+
+
+@pytest.mark.parametrize("folder", ["own", "released"])
+def test_it_is_scored_again_on_its_own_scenes_and_on_the_releases(
+    folder: str, done: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = ship(done, monkeypatch, 1e-4)
+    path = enter(done)
+    scenes = [(done if folder == "own" else data) / name for name in SCENES]
+    found = verify_leaderboard(done / "board", done / "out/predictions", scenes)
+    assert (found.scored, found.problems) == (1, ())
+
+    def better(entry: dict) -> None:
+        for values in entry["record"]["scenes"]["pattern-0"]["per_image"].values():
+            values["psnr"] += 0.5
+
+    edit_with_ledger(path, better)
+    found = verify_leaderboard(done / "board", done / "out/predictions", scenes)
+    assert any("mean" in problem or "psnr" in problem for problem in found.problems)
+
+
+def test_another_noise_is_on_a_local_board(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ship(done, monkeypatch, 0.1)
+    entry = read(enter(done))
+    assert "equivalent" not in entry["record"]["dataset"]
+    assert "revision" in board(done)["boards"][0]["why"]
+    match = match_release(open_scene(done / "s0"))
+    assert match is not None and not match.is_equivalent
+    line = release_line([open_scene(done / "s0")])
+    assert line is not None and "another scene, so on a local board: pattern-0 (" in line
+
+
+def test_a_record_cannot_claim_it(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = ship(done, monkeypatch, 0.1)
+    claim = {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
+    edit(done / "out/results/tfp+4dgs.json", lambda record: record["dataset"].update(equivalent=claim))
+    for verified in (False, True):
+        entry = read(enter(done, verified=verified, replace=True))
+        assert "equivalent" not in entry["record"]["dataset"]
+    assert not board(done, "leaderboard")["boards"]
+
+
+def test_an_entry_that_claims_it_fails_when_its_scenes_are_compared(
+    done: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = ship(done, monkeypatch, 0.1)
+    path = enter(done)
+    claim = {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
+    entry = read_json(path, "an entry")
+    entry["record"]["dataset"]["equivalent"] = claim
+    from spike4dgs.leaderboard.verify import verify_record
+
+    with pytest.raises(UserError, match="expected a scene that is equivalent to revision .*% of the spike bits differ"):
+        scenes = [open_scene(done / name) for name in SCENES]
+        verify_record(entry["record"], path, done / "out/predictions/tfp+4dgs", scenes)
+
+
+def test_a_fingerprint_that_was_exchanged_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ship(done, monkeypatch, 0.1)
+    write_fingerprint(tracks.FOLDER / "1/pattern-0.npz", make_fingerprint(open_scene(done / "s0")))
+    with pytest.raises(UserError, match=r"pattern-0\.npz: expected the bytes whose hash SHA256SUMS lists"):
+        match_release(open_scene(done / "s0"))
