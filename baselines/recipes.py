@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
+from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.radiance_field.fit import RADIANCE_FIELD
@@ -77,6 +78,12 @@ CALIBRATED = (
     Recipe("tfp+rig-flat+4dgs", "tfp", "rig", "hexplane", "pixel", FLAT),
 )
 
+# Images by networks that other people trained, with their weights.
+PUBLISHED = tuple(
+    Recipe(f"{maker.name}+{name}", maker.name, "rig", _MOTIONS[name], "pixel", _SPK2IMG[name])
+    for name, maker in product(("stg", "4dgs"), MAKERS)
+)
+
 # Table 4 from the given poses: only the supervision differs, from tfp+4dgs and from one another.
 SUPERVISED = tuple(
     Recipe(f"tfp+4dgs+{name}", "tfp", "rig", "hexplane", name) for name in ("spike", "pixel+spike", "spss")
@@ -111,6 +118,6 @@ POSED = (
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
 METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *CALIBRATED, *SUPERVISED, *POSED)},
+    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED)},
     "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
 }

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from tyro.conf import Positional
 
+from spike4dgs.baselines.images.published.makers import FILES as PUBLISHED
 from spike4dgs.baselines.starts.dust3r import weight_file
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file
@@ -15,7 +16,8 @@ from spike4dgs.benchmark.release.weights import fetch_weights
 from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightFile
 from spike4dgs.cli.options import From
 
-FILES = {"lpips": ALEXNET, "lpips-vgg": VGG16, "lpips-squeeze": SQUEEZENET, "metaiqa": METAIQA, "dust3r": weight_file()}
+OTHERS = {"lpips-vgg": VGG16, "lpips-squeeze": SQUEEZENET, "metaiqa": METAIQA, "dust3r": weight_file()}
+FILES = {"lpips": ALEXNET, **OTHERS, **PUBLISHED}
 
 
 def download_weights(names: Positional[tuple[str, ...]] = (), *, source: From = None, yes: bool = False) -> int:
@@ -24,7 +26,8 @@ def download_weights(names: Positional[tuple[str, ...]] = (), *, source: From = 
     Files go where metrics and methods look for them: the folder that SPIKE4DGS_WEIGHTS names, else torch hub's.
 
     Args:
-        names: lpips (AlexNet, of the tables), lpips-vgg, lpips-squeeze, metaiqa, dust3r; a list of all if left out.
+        names: lpips (AlexNet, of the tables), lpips-vgg, lpips-squeeze, metaiqa, dust3r, ssml, ssir, spikeclip,
+            scflow; a list of all if left out.
         source: Another folder to fetch the files from, such as a mirror: https://..., file://... or a path.
         yes: Accept the licences without being asked.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from spike4dgs.baselines.images.published.makers import MAKERS as PUBLISHED
 from spike4dgs.baselines.images.spk2img.maker import SPK2IMG
 from spike4dgs.baselines.images.tfi import TFI
 from spike4dgs.baselines.images.tfp import TFP
@@ -16,7 +17,8 @@ from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.images.msdi import MSDI
 
-IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)}
+OURS = (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)
+IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (*OURS, *PUBLISHED)}
 
 
 def make_image(name: str, stream: SpikeStream, tick: int, gain: float) -> Float32:

@@ -1,0 +1,1 @@
+"""Networks that other people trained, as image makers: SSML, SSIR, SpikeCLIP and SCFlow."""
