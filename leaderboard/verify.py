@@ -28,8 +28,8 @@ from spike4dgs.leaderboard.tracks import match_release
 from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings
 
 GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ
-# Of an equivalent scene's scores on the release: dB, and of other metrics relative. On `tiny` scenes with 8 and 16 lanes
-# the scores of an image by six methods differed by 0.0074 dB and 0.0017 at most.
+# Of an equivalent scene's scores on the release: dB, and of other metrics relative. On `tiny` scenes with 8 and with 16
+# lanes, the scores of an image by six methods differed by 0.0074 dB and 0.0017 at most.
 ELSEWHERE_DB, ELSEWHERE = 0.02, 5e-3
 
 

@@ -118,7 +118,7 @@ def test_all_are_listed_without_a_name(capsys: pytest.CaptureFixture[str]) -> No
     assert command() == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("lpips:", "lpips-vgg:", "metaiqa:", "dust3r:"))
-    assert text.count("licence:") == 5
+    assert text.count("licence:") == 9
 
 
 def test_the_known_addresses() -> None:
