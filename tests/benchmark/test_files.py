@@ -22,7 +22,6 @@ from spike4dgs.benchmark.files import atomic_path, write_json, writing
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.cli import main
 
 BIG = np.random.default_rng(0).random((200, 300)).astype(np.float32)
 
@@ -146,15 +145,6 @@ def test_a_run_says_so_before_any_work(small_scene: Path, tmp_path: Path) -> Non
     with pytest.raises(UserError, match="file/out: expected folders on the way"):
         run(tmp_path / "file/out", [small_scene], method)
     assert method.fits == 0
-
-
-def test_a_command_that_cannot_write_exits_with_2(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    assert main(["export-spikecv", str(small_scene), "--out", str(tmp_path / "file/out")]) == 2
-    shown = capsys.readouterr().err
-    assert shown.startswith("error: ") and shown.count("\n") == 1 and "not a directory" in shown
 
 
 def test_a_killed_writer_leaves_no_file_under_the_final_name(tmp_path: Path) -> None:

@@ -129,13 +129,6 @@ def test_a_huge_fit_time_blocks_nobody(done: Path) -> None:
         assert [item["entry"].rpartition("/")[2] for item in board(done)["refused"]] == ["rough.json"]
 
 
-def test_a_key_twice_is_refused(done: Path) -> None:
-    result = done / "out/results/tfp+4dgs.json"
-    result.write_text(result.read_text().replace('"schema"', '"command": "x", "schema"', 1))
-    with pytest.raises(UserError, match="twice"):
-        enter(done, verified=False)
-
-
 def test_a_ledger_line_without_its_entry_is_what_a_kill_leaves(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     release_of(done, monkeypatch)
     path = enter(done)

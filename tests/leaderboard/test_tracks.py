@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from submissions import edit, release_of, track, write_release
+from submissions import edit, track, write_release
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.leaderboard import tracks
@@ -136,11 +136,3 @@ def test_equal_paths_mean_equal_scenes_and_revisions(scenes: dict[str, str]) -> 
         changed = copy.deepcopy(scenes) | {scene: "2" * 64}
         assert place_of(record_of(changed)).folder != folder
     assert place_of(record_of(dict(reversed(scenes.items())))).folder == folder
-
-
-def test_a_release_of_the_tests_own(finished: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    import shutil
-
-    done = Path(shutil.copytree(finished, tmp_path / "run"))
-    release_of(done, monkeypatch)
-    assert {t.name for t in current_release().tracks} == {"patterns", "unposed"}

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, angle_deg, pose_errors, umeyama
+from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors, umeyama
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -88,28 +87,6 @@ def test_umeyama_gives_the_best_rotation_where_a_reflection_would_fit_better() -
         assert loss(near) >= loss(best)
 
 
-@pytest.mark.parametrize("points", [np.zeros((5, 3)), np.outer(np.arange(5.0), [1, 2, 3]), np.eye(3)[:2]])
-def test_points_that_determine_no_similarity_are_refused(points: np.ndarray) -> None:
-    with pytest.raises(UserError, match="not on one line"):
-        umeyama(points, points)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_points_that_are_not_finite_are_refused(value: float) -> None:
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    broken = np.where(np.eye(5, 3) > 0, value, points)
-    for source, target in ((points, broken), (broken, points)):
-        with pytest.raises(UserError, match="similarity: expected finite points"):
-            umeyama(source, target)
-
-
-def test_cameras_at_one_position_are_refused() -> None:
-    with pytest.raises(UserError, match="cameras at different positions"):
-        align_cameras(parallel(np.ones((3, 3))), parallel(np.ones((3, 3))))
-    with pytest.raises(UserError, match="two or more cameras"):
-        align_cameras(parallel(LINE[:1]), parallel(LINE[:1]))
-
-
 def test_a_transformed_camera_projects_transformed_points_to_the_same_pixels() -> None:
     there, points = random_sim3(5), np.random.default_rng(0).normal(size=(30, 3)) + [0, 5, 1]
     for c in RIGS["planar, turned"]:
@@ -118,13 +95,6 @@ def test_a_transformed_camera_projects_transformed_points_to_the_same_pixels() -
         assert np.allclose(uv, moved_uv, atol=1e-9) and np.allclose(moved_z, there.scale * z)
         back = there.inverse.camera(there.camera(c))
         assert np.allclose(back.w2c, c.w2c, atol=1e-12)
-
-
-@pytest.mark.parametrize("degrees", [0.0, 1e-7, 0.3, 90.0, 179.9999999])
-def test_angles_of_rotations(degrees: float) -> None:
-    axis = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
-    R = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix()
-    assert abs(angle_deg(R) - degrees) < 1e-9
 
 
 def test_one_wrong_camera_is_measured() -> None:

@@ -54,14 +54,6 @@ def opencv_ssim(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.fl
     return (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
 
 
-@pytest.mark.parametrize(("offset", "expected"), [(0.1, 20.0), (0.01, 40.0), (-0.1, 20.0), (0.5, 6.0206)])
-def test_psnr_of_a_constant_offset_is_the_closed_form(offset: float, expected: float) -> None:
-    truth = np.full((24, 40), 0.5)
-    values = measure(truth, truth + offset, region(), 1.0, "x")
-    assert values["psnr"] == pytest.approx(expected, abs=1e-4)
-    assert values["psnr_dynamic"] == pytest.approx(expected, abs=1e-4)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_values_equal_scikit_image_and_opencv(seed: int) -> None:
     truth, prediction = images(seed)
@@ -88,17 +80,6 @@ def test_dynamic_metrics_use_only_the_moving_region() -> None:
     assert values["psnr"] is not None and values["psnr"] < 20
     everywhere = measure(truth, outside, EVERYWHERE, 1.0, "x")
     assert everywhere["psnr_dynamic"] == pytest.approx(everywhere["psnr"])
-
-
-def test_radiance_is_clipped_to_white_and_black() -> None:
-    truth, prediction = images()
-    bright = np.where(truth > 0.6, 3.0, truth).astype(np.float32)
-    shown = np.where(truth > 0.6, 1.0, prediction).astype(np.float32)
-    negative = np.where(shown < 0.3, -2.0, shown).astype(np.float32)
-    assert measure(bright, shown, EVERYWHERE, 1.0, "x") == measure(np.minimum(bright, 1), shown, EVERYWHERE, 1.0, "x")
-    assert measure(bright, negative, EVERYWHERE, 1.0, "x") == measure(
-        bright, np.maximum(negative, 0), EVERYWHERE, 1.0, "x"
-    )
 
 
 @given(gain=st.floats(0.2, 5), seed=st.integers(0, 3))
@@ -185,12 +166,6 @@ def test_bad_images_are_refused(prediction: NDArray, moving: NDArray, message: s
     with pytest.raises(UserError, match="cam_01/000004.exr") as e:
         measure(np.zeros((24, 40)), prediction, moving, 1.0, "cam_01/000004.exr")
     assert message in str(e.value)
-
-
-def test_images_below_the_window_are_refused() -> None:
-    small = np.zeros((10, 40))
-    with pytest.raises(UserError, match="at least 11x11 pixels"):
-        measure(small, small, small > 1, 1.0, "x")
 
 
 def test_the_table_describes_every_metric_once() -> None:

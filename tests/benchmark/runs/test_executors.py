@@ -76,12 +76,6 @@ def test_unordered_results_come_as_they_end_with_their_positions(tmp_path):
         assert sum(map(len, shares)) <= len(mine), "workers share no core"
 
 
-def test_an_unordered_worker_that_dies_is_one_error():
-    with pytest.raises(UserError, match="a worker process.*run the same command again"):
-        with unordered_executor(2, None) as run:
-            list(run(die, [[1], [2], [3]]))
-
-
 def test_errors_of_tasks_come_through():
     with executor(2) as run, pytest.raises(UserError, match="Switch it on"):
         list(run(fail, [[1], [2]]))
@@ -99,13 +93,6 @@ def test_workers_end_with_a_run_that_is_given_up():
         time.sleep(0.05)
     else:
         pytest.fail("the worker still runs")
-
-
-def test_wrong_arguments_are_one_error():
-    with pytest.raises(UserError, match="--workers"), executor(0):
-        pass
-    with pytest.raises(UserError, match="one of them"), executor(2, "tcp://127.0.0.1:1"):
-        pass
 
 
 def test_a_scheduler_that_does_not_answer_is_one_error(monkeypatch):

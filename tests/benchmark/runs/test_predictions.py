@@ -178,11 +178,3 @@ def test_a_damaged_description_is_refused(folder: Path, text: str) -> None:
     (folder / INFO).write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(UserError, match=r"prediction\.json: expected a spike4dgs-prediction/1"):
         open_predictions(folder, TARGETS)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e6])
-def test_values_that_half_floats_cannot_hold_are_refused(tmp_path: Path, value: float) -> None:
-    bad = image(0)
-    bad[3, 4] = value
-    with pytest.raises(UserError, match="finite gray image"), PredictionWriter(tmp_path / "p") as writer:
-        writer.add(TARGETS[0], bad, 0.0)

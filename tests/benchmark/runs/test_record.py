@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import itertools
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -99,11 +98,6 @@ def test_one_missing_scene_is_never_left_out_of_the_denominator(record: Record) 
     assert set(dataset_means(cells).values()) == {None}
 
 
-def test_records_are_written_and_read(record: Record, tmp_path: Path) -> None:
-    write_record(tmp_path / "a" / "r.json", record)
-    assert read_record(tmp_path / "a" / "r.json") == record
-
-
 def change(path: str, value: Any) -> Callable[[Record], None]:
     def apply(record: Record) -> None:
         *parents, last = path.split("/")
@@ -160,15 +154,11 @@ def test_a_failed_cell_with_a_value_is_refused(record: Record) -> None:
         check_record(record, "r.json")
 
 
-def test_not_a_number_is_neither_written_nor_read(record: Record, tmp_path: Path) -> None:
-    path = tmp_path / "r.json"
+def test_not_a_number_is_not_written(record: Record, tmp_path: Path) -> None:
     record["method"]["params"] = {"rate": float("nan")}
     with pytest.raises(ValueError, match="Out of range float"):
-        write_record(path, record)
-    assert not path.exists()
-    path.write_text(json.dumps(record))
-    with pytest.raises(UserError, match="NaN is no JSON number"):
-        read_record(path)
+        write_record(tmp_path / "r.json", record)
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_and_foreign_files_are_named(tmp_path: Path) -> None:

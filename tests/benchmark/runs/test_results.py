@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -52,9 +51,3 @@ def test_without_pandas_one_line_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(UserError, match=r"the package pandas, found none; pip install 'spike4dgs\[pandas\]'"):
         records_to_dataframe(*records)
-
-
-def test_a_file_that_is_no_record_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "r.json").write_text(json.dumps({"schema": "x"}))
-    with pytest.raises(UserError, match="expected schema 'spike4dgs-result/1'"):
-        records_to_dataframe(tmp_path / "r.json")

@@ -242,10 +242,6 @@ def test_what_is_fitted_or_scored_changes_the_revision(full: Path) -> None:
     assert len(set(found.values())) == len(found), sorted(found.items(), key=lambda item: item[1])
 
 
-def test_the_split_that_a_scene_is_opened_with_does_not_matter(full: Path) -> None:
-    assert open_scene(full, split="corner").revision == open_scene(full).revision
-
-
 def test_a_manifest_without_contents_gives_the_same_revision(full: Path) -> None:
     with copied(full) as root:
         edit("manifest.json", lambda m: [facts.pop("content", None) for facts in m["files"].values()])(root)

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.scene.images import read_exr, read_mask, write_exr
+from spike4dgs.benchmark.scene.images import read_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.scene.writer import read_colmap
 
 
 def test_a_written_scene_is_read_back(small_scene: Path) -> None:
@@ -52,8 +52,9 @@ def test_training_holds_the_training_cameras_only(small_scene: Path) -> None:
 def test_the_colmap_model_has_the_same_cameras(small_scene: Path) -> None:
     scene = open_scene(small_scene)
     points = np.random.default_rng(0).normal(size=(20, 3))
-    for camera in read_colmap(small_scene / "sparse/0"):
-        assert np.abs(camera.project(points)[0] - scene.cameras[camera.id].project(points)[0]).max() < 0.01
+    for image in pycolmap.Reconstruction(str(small_scene / "sparse/0")).images.values():
+        expected = np.array([image.project_point(p) for p in points + [0, 5, 0]])
+        assert np.abs(scene.cameras[image.name].project(points + [0, 5, 0])[0] - expected).max() < 0.01
 
 
 def test_transforms_follow_nerfstudio(small_scene: Path) -> None:
@@ -111,6 +112,14 @@ def set_meta(**values: Any) -> Callable[[Path], None]:
     return edit_json("scene.json", lambda meta: meta.update(values))
 
 
+def add_target(**target: Any) -> Callable[[Path], None]:
+    return edit_json("targets.json", lambda data: data["targets"].append(target))
+
+
+def one_split(*train: str) -> Callable[[Path], None]:
+    return set_meta(splits={"center": {"train": list(train), "test": ["cam_03"]}})
+
+
 GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"}
 
 
@@ -122,11 +131,7 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
         (edit_bytes("scene.json", lambda b: b[:50]), "scene.json", "found damaged text"),
         (edit_bytes("scene.json", lambda b: b"\xff\xfe" + b), "scene.json", "found damaged text"),
         (edit_bytes("scene.json", lambda b: b"[1]"), "scene.json", "a JSON object), found list"),
-        (
-            edit_bytes("scene.json", lambda b: b'{"camera_angle_x": 0.7, "frames": []}'),
-            "scene.json",
-            "found schema None",
-        ),
+        (edit_bytes("scene.json", lambda b: b'{"frames": []}'), "scene.json", "found schema None"),
         (set_meta(schema="spike4dgs-scene/2"), "scene.json", "found schema 'spike4dgs-scene/2'"),
         (edit_json("scene.json", lambda m: m.pop("rate_hz")), "scene.json", "'rate_hz' is a required property"),
         (set_meta(rate_hz=0), "scene.json", "at rate_hz"),
@@ -136,17 +141,9 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
         (set_meta(sensor={"model": "x"}), "scene.json", "at sensor: 'rows_bottom_up' is a required property"),
         (set_meta(id="../other"), "scene.json", "at id"),
         (set_meta(default_split="left"), "scene.json", "expected default_split among the splits, found 'left'"),
-        (
-            set_meta(splits={"center": {"train": ["cam_00", "cam_03"], "test": ["cam_03"]}}),
-            "scene.json",
-            "expected split center of known, distinct cameras, found cam_03 in both parts",
-        ),
-        (
-            set_meta(splits={"center": {"train": ["cam_00", "cam_77"], "test": ["cam_03"]}}),
-            "scene.json",
-            "found cam_77 without pose or stream",
-        ),
-        (set_meta(splits={"center": {"train": [], "test": ["cam_03"]}}), "scene.json", "at splits/center/train"),
+        (one_split("cam_00", "cam_03"), "scene.json", "known, distinct cameras, found cam_03 in both parts"),
+        (one_split("cam_00", "cam_77"), "scene.json", "found cam_77 without pose or stream"),
+        (one_split(), "scene.json", "at splits/center/train"),
         (set_meta(gaps=[GAP]), "scene.json", "expected a recording without gaps, found 1 gap(s)"),
         (set_meta(gaps=[{"camera": "cam_01"}]), "scene.json", "at gaps/0"),
         (edit_json("scene.json", lambda m: m.update(title="x"), rehash=False), "scene.json", "expected"),
@@ -166,34 +163,14 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
             "transforms_train.json",
             "cam_01: expected a rotation matrix",
         ),
-        (
-            edit_json("transforms_train.json", lambda d: d["frames"].pop()),
-            "scene.json",
-            "cam_02 without pose or stream",
-        ),
+        (edit_json("transforms_train.json", lambda d: d["frames"].pop()), "scene.json", "cam_02 without pose"),
         (edit_json("transforms_train.json", lambda d: d.update(frames=5)), "transforms_train.json", "frames"),
         (edit_json("transforms_train.json", lambda d: d.update(frames=["a"])), "transforms_train.json", "frames"),
-        (edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03"})), "targets.json", "'tick'"),
-        (
-            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_09", "tick": 1})),
-            "targets.json",
-            "found cam_09 at tick 1",
-        ),
-        (
-            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03", "tick": TICKS})),
-            "targets.json",
-            f"found cam_03 at tick {TICKS}",
-        ),
-        (
-            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_00", "tick": 20})),
-            "targets.json",
-            "found cam_00 at tick 20",
-        ),
-        (
-            edit_json("targets.json", lambda d: d["targets"].append({"camera": "cam_03", "tick": 20})),
-            "targets.json",
-            "cam_03 at tick 20 twice",
-        ),
+        (add_target(camera="cam_03"), "targets.json", "'tick'"),
+        (add_target(camera="cam_09", tick=1), "targets.json", "found cam_09 at tick 1"),
+        (add_target(camera="cam_03", tick=TICKS), "targets.json", f"found cam_03 at tick {TICKS}"),
+        (add_target(camera="cam_00", tick=20), "targets.json", "found cam_00 at tick 20"),
+        (add_target(camera="cam_03", tick=20), "targets.json", "cam_03 at tick 20 twice"),
     ],
 )
 def test_a_scene_that_is_none_is_refused_in_one_line(
@@ -236,22 +213,11 @@ def read_everything(scene: Scene) -> None:
         scene.moving(t)
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda b: b[:-7], "expected whole ticks of 120 bytes (40x24)"),
-        (lambda b: b[:-120], "expected 80 ticks, found 79"),
-        (lambda b: b"", "found 0 bytes"),
-    ],
-)
-def test_a_truncated_stream_with_a_manifest_that_agrees_is_refused(
-    small_scene: Path, edit: Callable[[bytes], bytes], message: str
-) -> None:
-    edit_bytes("spikes/cam_02.dat", edit)(small_scene)
+def test_a_truncated_stream_with_a_manifest_that_agrees_is_refused(small_scene: Path) -> None:
+    edit_bytes("spikes/cam_02.dat", lambda b: b[:-120])(small_scene)
     write_manifest(small_scene)
-    with pytest.raises(UserError) as e:
+    with pytest.raises(UserError, match=r"spikes/cam_02\.dat: expected 80 ticks, found 79"):
         _ = open_scene(small_scene).training
-    assert "spikes/cam_02.dat" in str(e.value) and message in str(e.value)
 
 
 def test_gaps_can_be_accepted(small_scene: Path) -> None:
@@ -267,26 +233,7 @@ def test_any_change_changes_the_revision(small_scene: Path, tmp_path: Path) -> N
     assert open_scene(small_scene).revision != before
 
 
-def test_images_that_are_none_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.exr").write_bytes(b"not an image")
+def test_a_mask_that_is_no_image_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"not an image")
-    with pytest.raises(UserError, match=r"a\.exr: expected an EXR image, found damaged data"):
-        read_exr(tmp_path / "a.exr")
     with pytest.raises(UserError, match=r"a\.png: expected a mask image, found damaged data"):
         read_mask(tmp_path / "a.png")
-    image = np.random.default_rng(0).random((16, 20)).astype(np.float32)
-    write_exr(tmp_path / "b.exr", image, 5.0)
-    data = (tmp_path / "b.exr").read_bytes()
-    (tmp_path / "b.exr").write_bytes(data[: len(data) // 2])
-    with pytest.raises(UserError, match=r"b\.exr"):
-        read_exr(tmp_path / "b.exr")
-
-
-def test_colour_images_are_refused(tmp_path: Path) -> None:
-    import OpenEXR
-
-    rgb = np.zeros((16, 20, 3), np.float16)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"RGB": rgb}).write(str(tmp_path / "c.exr"))
-    with pytest.raises(UserError, match=r"expected a gray image \(channel Y\), found channels \['B', 'G', 'R'\]"):
-        read_exr(tmp_path / "c.exr")

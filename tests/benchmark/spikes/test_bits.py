@@ -32,21 +32,6 @@ def test_unpack_and_count_equal_numpy(n: int, width: int, height: int, flip: boo
     np.testing.assert_array_equal(counts[::-1] if flip else counts, expected.sum(0))
 
 
-@pytest.mark.parametrize("n", [254, 255, 256, 510, 511, 4000])
-@pytest.mark.parametrize("byte", [0, 255, 0b10010110])
-def test_counts_cross_the_limit_of_the_vertical_counter(n: int, byte: int) -> None:
-    packed = np.full((n, 5), byte, np.uint8)
-    expected = n * np.unpackbits(packed[0], count=37, bitorder="little").astype(int)
-    np.testing.assert_array_equal(bits.count_bits(packed, 37), expected)
-
-
-def test_the_longest_window_and_more_bytes_than_a_block() -> None:
-    ones = np.full((65535, 1), 255, np.uint8)
-    assert (bits.count_bits(ones, 8) == 65535).all()
-    packed = random_rows(300, 8 * 2500 + 3, 1, 5)
-    np.testing.assert_array_equal(bits.count_bits(packed, 20003), reference(packed, 20003, 1, False).sum(0)[0])
-
-
 def test_memory_maps_and_strided_rows(tmp_path: Path) -> None:
     packed = random_rows(30, 17, 5, 1)
     packed.tofile(tmp_path / "a.dat")
