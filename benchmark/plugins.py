@@ -27,20 +27,18 @@ def find_plugins(
     raises UserError for a value that cannot be used. Raises UserError where a name is used twice, and where a package
     cannot be imported or names no mapping.
     """
-    plugins: dict[str, Found] = {}
+    plugins, fix = dict[str, Found](), "repair or uninstall the package that registers it"
     for entry in sorted(entry_points(group=group), key=lambda e: e.name):
+        where = f"entry point {entry.name}"
         try:
             found = entry.load()
         except Exception as e:  # somebody else's package
-            fix = "repair or uninstall the package that registers it"
-            raise problem(f"entry point {entry.name}", entry.value, f"{type(e).__name__}: {e}", fix) from e
+            raise problem(where, entry.value, f"{type(e).__name__}: {e}", fix) from e
         if not isinstance(found, Mapping):
-            fix = "repair or uninstall the package that registers it"
             raise problem(source_of(entry), f"a mapping from {kind} name to {kind}", type(found).__name__, fix)
         for name, value in found.items():
             if name in plugins or name in taken:
-                found_twice = f"'{name}' twice"
-                raise problem(f"entry point {entry.name}", f"a new {kind} name", found_twice, "rename one of them")
+                raise problem(where, f"a new {kind} name", f"'{name}' twice", "rename one of them")
             check(name, value, source_of(entry))
             plugins[name] = Found(value, f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value)
     return plugins

@@ -30,7 +30,6 @@ from spike4dgs.benchmark.schemas import load_schema
 MAX_SIDE = 16384  # pixels of an image's width or height; cameras have a few hundred
 MAX_TICKS = 10**12  # of a clip: more than a year at 20 kHz
 MAX_HZ = 1e9  # ticks or frames per second
-MAX_SECONDS = 1e9  # of a fit or a clip: 30 years
 MAX_GAIN = 1e9  # spikes per tick of a pixel that sees white, and radiances
 MAX_LENGTH = 1e9  # metres or pixels, of poses and intrinsics
 _SHOWN = 60  # characters of a wrong value
@@ -96,10 +95,10 @@ def check_ids(names: Iterable[str], what: str, where: str | Path, fix: str = "re
             raise problem(where, f"ids of {what}s that differ in more than case", f"{other} and {name}", fix)
 
 
-def inside(root: Path, name: str, where: str | Path, fix: str = "restore the file") -> Path:
+def inside(root: Path, name: str, where: str | Path) -> Path:
     """Return the path `name` below `root`. Raises UserError where it is absolute, has `..`, or is no plain path."""
     if not _pattern("path").search(name):
-        raise problem(where, f"a path inside {root.name or root}", shown(name), fix)
+        raise problem(where, f"a path inside {root.name or root}", shown(name), "restore the file")
     return root / name
 
 
@@ -119,6 +118,8 @@ MOST_ARRAY_BYTES = 1 << 29  # of all arrays that are read from a file
 _AGAIN = "restore the file or make it again"
 _NUMBERS = "biufc"
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # as numpy writes
+_BROKEN = (zipfile.BadZipFile, zlib.error, LookupError, ValueError, TypeError, OverflowError, OSError, EOFError)
+_ODD = (RuntimeError, SyntaxError, tokenize.TokenError)  # such as an encrypted member, or one packed in another way
 
 
 @dataclass(frozen=True)
@@ -153,19 +154,7 @@ def read_npz(
             return {name: _array(file, name) for name in names}
     except FileNotFoundError:
         raise problem(path, what, "no such file", fix) from None
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        LookupError,
-        ValueError,
-        TypeError,
-        OverflowError,
-        OSError,
-        EOFError,
-        RuntimeError,  # an encrypted member; NotImplementedError: one packed in another way
-        SyntaxError,
-        tokenize.TokenError,
-    ) as e:
+    except (*_BROKEN, *_ODD) as e:
         raise problem(path, what, f"damaged data ({str(e)[:200]})", fix) from None
 
 
@@ -184,8 +173,7 @@ def _header(file: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype
 
 def _array(file: zipfile.ZipFile, name: str) -> NDArray[Any]:
     with file.open(f"{name}.npy") as f:
-        found: NDArray[Any] = npy.read_array(f, allow_pickle=False)
-    return found
+        return np.asarray(npy.read_array(f, allow_pickle=False))
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
@@ -193,20 +181,6 @@ def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
 
 
 MOST_YAML_BYTES = 1 << 16  # a camera takes some hundred; the parser reads some 30 kB a second
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """PyYAML's safe loader without aliases: a few of them can stand for more values than memory holds."""
-
-    maps: Collection[str] = ()  # foreign tags of maps
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("an alias, such as *name")
-        node = super().compose_node(parent, index)
-        if node.tag in self.maps and isinstance(node, yaml.MappingNode):
-            node.tag = "tag:yaml.org,2002:map"
-        return node
 
 
 def read_yaml(path: Path, what: str) -> Any:
@@ -226,12 +200,19 @@ def parse_yaml(text: str, maps: Collection[str] = ()) -> Any:
     Raises ValueError for bad syntax, aliases, other tags and values nested too deep.
     """
 
-    class Loader(_Loader):
-        pass
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+        """A safe loader without aliases: a few of them can stand for more values than memory holds."""
 
-    Loader.maps = maps
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError("an alias, such as *name")
+            node = super().compose_node(parent, index)
+            if node.tag in maps and isinstance(node, yaml.MappingNode):
+                node.tag = "tag:yaml.org,2002:map"
+            return node
+
     try:
-        return yaml.load(text, Loader)  # a safe loader
+        return yaml.load(text, Loader)
     except RecursionError:
         raise ValueError("values nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError, LookupError, TypeError, AttributeError) as e:

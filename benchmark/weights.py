@@ -121,30 +121,16 @@ class FoundWeights:
         return _sha256(self.path, status.st_size, status.st_mtime_ns)
 
 
-ALEXNET = WeightFile(
-    "alexnet-owt-7be5be79.pth",
-    244408911,
-    "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-    "AlexNet trunk of LPIPS",
-    f"{TORCHVISION}alexnet-owt-7be5be79.pth",
-    _TORCHVISION_LICENCE,
-)
-VGG16 = WeightFile(
-    "vgg16-397923af.pth",
-    553433881,
-    "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-    "VGG-16 trunk of LPIPS",
-    f"{TORCHVISION}vgg16-397923af.pth",
-    _TORCHVISION_LICENCE,
-)
-SQUEEZENET = WeightFile(
-    "squeezenet1_1-b8a52dc0.pth",
-    4958839,
-    "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
-    "SqueezeNet 1.1 trunk of LPIPS",
-    f"{TORCHVISION}squeezenet1_1-b8a52dc0.pth",
-    _TORCHVISION_LICENCE,
-)
+def _trunk(network: str, name: str, size: int, sha256: str) -> WeightFile:
+    return WeightFile(name, size, sha256, f"{network} trunk of LPIPS", TORCHVISION + name, _TORCHVISION_LICENCE)
+
+
+_ALEXNET_SHA256 = "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02"
+_VGG16_SHA256 = "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"
+_SQUEEZENET_SHA256 = "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b"
+ALEXNET = _trunk("AlexNet", "alexnet-owt-7be5be79.pth", 244408911, _ALEXNET_SHA256)
+VGG16 = _trunk("VGG-16", "vgg16-397923af.pth", 553433881, _VGG16_SHA256)
+SQUEEZENET = _trunk("SqueezeNet 1.1", "squeezenet1_1-b8a52dc0.pth", 4958839, _SQUEEZENET_SHA256)
 METAIQA = WeightFile(
     "metaiqa_resnet18.pth",
     None,  # several models of that name exist: the prior of TID2013 and KADID-10K, and fine-tuned ones
@@ -275,7 +261,6 @@ def unreadable(path: Path, expected: str, error: Exception, fix: str) -> UserErr
 
 
 def _given(variable: str) -> Path | None:
-    """The path in an environment variable, if it is set and not empty."""
     value = os.environ.get(variable)
     return Path(value).expanduser() if value else None
 

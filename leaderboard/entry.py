@@ -48,13 +48,10 @@ def check_folder(leaderboard: Path) -> None:
     """Raise UserError unless a folder is a leaderboard, or new, or empty; an empty path is the working folder."""
     if any((leaderboard / name).exists() for name in (*FOLDERS, BOARD)):
         return
-    if leaderboard == Path() or leaderboard.exists() and (not leaderboard.is_dir() or _visible(leaderboard)):
+    empty = not leaderboard.exists() or leaderboard.is_dir() and all(p.name[0] == "." for p in leaderboard.iterdir())
+    if leaderboard == Path() or not empty:
         found = "the working folder" if leaderboard == Path() else "something else"
         raise problem("--leaderboard", f"a leaderboard or a new folder at {leaderboard}", found, "name another folder")
-
-
-def _visible(folder: Path) -> bool:
-    return any(not p.name.startswith(".") for p in folder.iterdir())
 
 
 def file_name(record: Mapping[str, Any]) -> str:
@@ -79,11 +76,9 @@ def entry_path(record: Mapping[str, Any], archived: bool = False) -> str:
     if seed is not None and not 0 <= seed < 2**63:
         raise problem("method", "a seed from 0 up, of 64 bits", str(seed)[:40], "choose another seed")
     folder = place_of(record).folder
-    return (
-        f"{ARCHIVE}/{folder.partition('/')[2]}/{file_name(record)}.json"
-        if archived
-        else (f"{folder}/{file_name(record)}.json")
-    )
+    if archived:
+        folder = f"{ARCHIVE}/{folder.partition('/')[2]}"
+    return f"{folder}/{file_name(record)}.json"
 
 
 def read_entry(leaderboard: Path, path: str, ledger: Ledger) -> Entry:
@@ -192,12 +187,7 @@ def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, An
         if other != name and other.casefold() == name.casefold():
             fix = "rename the method: some file systems take the two for one"
             raise problem(path, "a name that differs by more than case", other, fix)
-    entry: Entry = {
-        "schema": SCHEMA,
-        "submitted": utc_now(),
-        "verification": dict(verification),
-        "record": record,
-    }
+    entry: Entry = {"schema": SCHEMA, "submitted": utc_now(), "verification": dict(verification), "record": record}
     if path.exists():
         try:
             old = read_entry(leaderboard, name, read_ledger(leaderboard))

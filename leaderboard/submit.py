@@ -52,10 +52,6 @@ class Refit:
     bit_equal: bool
     costs: Mapping[str, Mapping[str, float | None]]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
 
 def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Console) -> Refit:
     """Fit a record's method on its scenes with its seed, budget and device, and compare the scores.
@@ -83,7 +79,6 @@ def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Cons
 def _fit_scene(
     record: Record, claimed: Mapping[str, Any], method: Method, scene: Scene, out: Path, console: Console
 ) -> Mapping[str, Any]:
-    """Return the cell of a second fit on a scene."""
     wanted, where = record["method"], f"{record['method']['name']} on {scene.id}"
     if claimed["status"] != "ok" or claimed["budget"] is None or wanted["seed"] is None:
         fix = "submit without --refit"
@@ -164,7 +159,6 @@ def submit_all(
 
 
 def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
-    """Read a record and verify it as far as its files are given."""
     record = read_record(result)
     check_no_oracle(record, result)
     check_numbers(record, result)
@@ -185,8 +179,8 @@ def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
         "label": RE_FITTED if refit else RE_SCORED,
         "unverified": [m for m in METRICS if m in rescored.unverified],
         "by": {"when": utc_now(), "harness": harness(), "environment": environment("cpu")},
-        "truth": {scene: check.as_dict() for scene, check in rescored.truth.items()},
-        "refit": refit.as_dict() if refit else None,
+        "truth": {scene: asdict(check) for scene, check in rescored.truth.items()},
+        "refit": asdict(refit) if refit else None,
     }
     return Verified(record, verification, "")
 

@@ -72,7 +72,6 @@ def _write_cameras_and_poses(folder: Path, out: Path) -> None:
 
 
 def _binary_poses(data: bytes) -> bytes:
-    """Return the text of images.bin without the images' points."""
     parts, at = [data[:8]], 8
     for _ in range(int.from_bytes(data[:8], "little")):
         end = data.find(b"\0", at + _POSE_BYTES) + 1  # of the name

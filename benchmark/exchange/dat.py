@@ -60,7 +60,6 @@ def _cameras(path: Path, sources: dict[str, SpikeStream], size: tuple[int, int])
 
 
 def _copied(source: SpikeStream, target: Path) -> SpikeStream:
-    """Copy a stream, and return the copy."""
     with SpikeWriter(target, source.width, source.height) as writer:
         for start in range(0, source.n_ticks, _TICKS):
             writer.write(source.packed[start : start + _TICKS])

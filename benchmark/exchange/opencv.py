@@ -126,7 +126,6 @@ def _matrix(node: Values, keys: tuple[str, ...], name: str, path: Path) -> Float
 
 
 def _side(node: Values, name: str, path: Path) -> int | None:
-    """Return image_width or image_height where it is there."""
     value = node.get(name)
     try:
         return None if value is None else int(float(value))

@@ -48,12 +48,10 @@ def open_streams(path: Path, dat_file: DatFile = DAT_FILE, allow_gaps: bool = Fa
     """
     if path.is_dir():
         if given := [name for name, value in dat_file.options().items() if value is not None]:
-            raise problem(
-                ", ".join(given), "nothing for a folder, which states its own size", "values", "leave them out"
-            )
-        return (
-            open_stream_folder(path, allow_gaps) if (path / STREAM_FOLDER).is_file() else open_scene(path, allow_gaps)
-        )
+            expected = "nothing for a folder, which states its own size"
+            raise problem(", ".join(given), expected, "values", "leave them out")
+        is_streams = (path / STREAM_FOLDER).is_file()
+        return open_stream_folder(path, allow_gaps) if is_streams else open_scene(path, allow_gaps)
     if not path.exists():
         raise problem(path, "a stream file or a scene folder", "no such file", "check the path")
     width, height, rate_hz = dat_file.width, dat_file.height, dat_file.rate_hz

@@ -50,7 +50,6 @@ def flip(truth: UInt8, prediction: UInt8) -> float:
 
 
 def _linear_light() -> Float64:
-    """Return the linear light of the 256 levels of sRGB."""
     x = np.arange(256) / 255
     return np.asarray(np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
 
@@ -88,7 +87,6 @@ def _sensitivity() -> Float64:
 
 
 def _filtered_by_eye(image: Float64) -> Float64:
-    """Return linear light filtered by the eye's contrast sensitivity."""
     return np.clip(_filtered(image, _sensitivity(), _sensitivity()), 0, 1)
 
 

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
 
+import numpy as np
+
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.weights import WeightFile
 
 MAX_PSNR_DB = 100.0  # half-float images with any error at all stay far below it
+
+
+def psnr_db(squares: Float64) -> float:
+    """Return 10 log10(1 / MSE) of squared errors [N], in the unit of white."""
+    mse = float(np.mean(squares))
+    return min(-10 * math.log10(mse), MAX_PSNR_DB) if mse > 0 else MAX_PSNR_DB
 
 
 class Images(Enum):
@@ -37,8 +47,8 @@ class Metric:
     higher_is_better: bool
     implementation: str
     measure: Callable[[ImagePair], float | None]
-    unit: str
-    digits: int  # decimals shown to people; records keep the full value
+    unit: str = ""
+    digits: int = 4  # decimals shown to people; records keep the full value
     takes: Literal["linear", "srgb8", "spikes"] = "linear"
     images: Images = Images.EVERY
     weights: WeightFile | None = None  # a file that users bring; None: always computable

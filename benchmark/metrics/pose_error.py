@@ -91,9 +91,8 @@ def umeyama(source: Float64, target: Float64) -> Sim3:
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a / len(a))
     if len(a) < 3 or not s[1] > 1e-12 * s[0]:
-        raise problem(
-            "similarity", "at least 3 points that are not on one line", f"{len(a)} without", "add points or axes"
-        )
+        expected = "at least 3 points that are not on one line"
+        raise problem("similarity", expected, f"{len(a)} without", "add points or axes")
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     R = u @ np.diag(signs) @ vt
     scale = float(s @ signs / np.mean(np.sum(a * a, axis=1)))
@@ -117,9 +116,8 @@ def _skeleton(cameras: Sequence[Camera]) -> Float64:
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=-1)[np.triu_indices(len(cameras), 1)]
     reach = REACH * float(np.median(distances))
     if not reach > 1e-12 * max(1.0, float(np.abs(centers).max())):
-        raise problem(
-            "alignment", "cameras at different positions", "all at one position", "use cameras with a baseline"
-        )
+        expected, fix = "cameras at different positions", "use cameras with a baseline"
+        raise problem("alignment", expected, "all at one position", fix)
     axes = np.stack([c.R for c in cameras])  # [N, 3, 3], rows are the axes in world coordinates
     return np.concatenate([centers, (centers[:, None] + reach * axes).reshape(-1, 3)])
 

@@ -5,14 +5,11 @@ They need what a real array has: the camera's stream, and its recordings of ligh
 
 from __future__ import annotations
 
-import math
 from functools import partial
-
-import numpy as np
 
 from spike4dgs.benchmark.metrics.held_out_spikes import SPAN_WINDOW, TOLERANCE, WINDOWS
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
+from spike4dgs.benchmark.metrics.metric import Images, Metric, psnr_db
 
 
 def _spike_psnr(window: int, dynamic: bool, pair: ImagePair) -> float | None:
@@ -22,8 +19,7 @@ def _spike_psnr(window: int, dynamic: bool, pair: ImagePair) -> float | None:
     region = view.recorded.response.good & pair.moving if dynamic else view.recorded.response.good
     if not region.any():
         return None
-    mse = float(np.mean(view.count_error(window)[region] ** 2))
-    return min(-10 * math.log10(mse), MAX_PSNR_DB) if mse > 0 else MAX_PSNR_DB
+    return psnr_db(view.count_error(window)[region] ** 2)
 
 
 def _spike_deviance(dynamic: bool, pair: ImagePair) -> float | None:
@@ -64,8 +60,6 @@ def _deviance_row(dynamic: bool) -> Metric:
         higher_is_better=False,
         implementation="benchmark/metrics/held_out_spikes.py, span_deviance",
         measure=partial(_spike_deviance, dynamic),
-        unit="",
-        digits=4,
         takes="spikes",
         images=Images.RECORDED_MOVING if dynamic else Images.RECORDED,
         added_later=True,

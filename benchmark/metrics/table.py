@@ -15,15 +15,13 @@ JSON has no infinity: identical images, whose PSNR is infinite, count as `MAX_PS
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
-from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
+from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric, psnr_db
 from spike4dgs.benchmark.metrics.spike_rows import SPIKE_METRICS
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
 from spike4dgs.benchmark.weights import METAIQA
@@ -40,12 +38,7 @@ def _psnr(pair: ImagePair) -> float:
 def _psnr_dynamic(pair: ImagePair) -> float | None:
     if not pair.moving.any():
         return None
-    mse = float(np.mean((pair.truth[pair.moving] - pair.prediction[pair.moving]) ** 2))
-    return min(-10 * math.log10(mse), MAX_PSNR_DB) if mse > 0 else MAX_PSNR_DB
-
-
-def _ssim(pair: ImagePair) -> float:
-    return pair.ssim[0]
+    return psnr_db((pair.truth[pair.moving] - pair.prediction[pair.moving]) ** 2)
 
 
 def _ssim_dynamic(pair: ImagePair) -> float | None:
@@ -59,10 +52,6 @@ def _temporal_error(pair: ImagePair) -> float | None:
     pair.earlier.check_image()
     change = (pair.prediction - pair.earlier.prediction) - (pair.truth - pair.earlier.truth)
     return float(np.mean(np.abs(change))) / pair.since_ms
-
-
-def _lpips(net: str, pair: ImagePair) -> float:
-    return lpips(net, pair.truth8, pair.prediction8)
 
 
 def _flip(pair: ImagePair) -> float:
@@ -115,9 +104,7 @@ _BASE = (
         "data range 1, mean over the image",
         higher_is_better=True,
         implementation=_SSIM_CALL,
-        measure=_ssim,
-        unit="",
-        digits=4,
+        measure=lambda pair: pair.ssim[0],
     ),
     Metric(
         id="psnr_dynamic",
@@ -137,8 +124,6 @@ _BASE = (
         higher_is_better=True,
         implementation=_SSIM_CALL.replace("data_range=1)", "data_range=1, full=True)[1][moving].mean()"),
         measure=_ssim_dynamic,
-        unit="",
-        digits=4,
         images=Images.MOVING,
     ),
 )
@@ -163,9 +148,7 @@ def _lpips_metric(net: str, title: str) -> Metric:
         higher_is_better=False,
         implementation=f"benchmark/metrics/lpips.py; equals lpips 0.1.4, LPIPS(net='{net}'), "
         f"with the weights {TRUNKS[net].name}",
-        measure=partial(_lpips, net),
-        unit="",
-        digits=4,
+        measure=lambda pair: lpips(net, pair.truth8, pair.prediction8),
         takes="srgb8",
         weights=TRUNKS[net],
         tolerance=1e-4,  # float32 convolutions, summed in another order by every library
@@ -184,8 +167,6 @@ _PERCEPTUAL = (
         implementation="benchmark/metrics/flip.py; equals flip-evaluator 1.7, evaluate(truth, prediction, 'LDR'), "
         "gray as three channels",
         measure=_flip,
-        unit="",
-        digits=4,
         takes="srgb8",
     ),
     Metric(
@@ -196,7 +177,6 @@ _PERCEPTUAL = (
         implementation="benchmark/metrics/iqa/brisque.py; follows the authors' MATLAB release, "
         "not MATLAB's own brisque",
         measure=_brisque,
-        unit="",
         digits=2,
         takes="srgb8",
         blind=True,
@@ -209,7 +189,6 @@ _PERCEPTUAL = (
         higher_is_better=False,
         implementation="benchmark/metrics/iqa/niqe.py; follows the authors' MATLAB release, not MATLAB's own niqe",
         measure=_niqe,
-        unit="",
         digits=3,
         takes="srgb8",
         blind=True,
@@ -222,8 +201,6 @@ _PERCEPTUAL = (
         higher_is_better=True,
         implementation=f"benchmark/metrics/iqa/metaiqa.py with the user's {METAIQA.name}",
         measure=_metaiqa,
-        unit="",
-        digits=4,
         takes="srgb8",
         blind=True,
         weights=METAIQA,
@@ -239,7 +216,6 @@ _PERCEPTUAL = (
         "(milliseconds between them)",
         measure=_temporal_error,
         unit="1/ms",
-        digits=4,
         images=Images.LATER,
     ),
 )

@@ -64,7 +64,8 @@ def download(source: Source, release: Release, selection: Selection, out: Path, 
     """
     selection.check(release)
     scenes = selection.entries(release)
-    folders = tuple(_folder(out, scene, selection) for scene in scenes)
+    window = "" if selection.window_ms is None else "-{:g}-{:g}ms".format(*selection.window_ms)
+    folders = tuple(out / f"{scene.id}{window}" for scene in scenes)
     with locked(out / ".download.lock", out, "a folder that no other program downloads into"):
         total = sum(map(selection.bytes_of, scenes))
         _check_room(out, total - sum(map(_held_bytes, folders)))
@@ -78,19 +79,12 @@ def download(source: Source, release: Release, selection: Selection, out: Path, 
     return Report(folders, progress.done - progress.skipped, source.requests, progress.seconds)
 
 
-def _folder(out: Path, scene: SceneEntry, selection: Selection) -> Path:
-    if selection.window_ms is None:
-        return out / scene.id
-    return out / "{}-{:g}-{:g}ms".format(scene.id, *selection.window_ms)
-
-
 def _held_bytes(root: Path) -> int:
     """Return the room that files below a folder take; of a part with holes, without them."""
     return sum(path.stat().st_blocks * 512 for path in root.rglob("*") if path.is_file())
 
 
 def _check_room(out: Path, needed: int) -> None:
-    """Raise UserError where the disk has less room than the download takes."""
     free = shutil.disk_usage(out).free
     if needed > free:
         fix = "free some, choose another --out, or ask for fewer --scenes, --cameras or --parts"
@@ -134,7 +128,8 @@ class _Download:
         _claim(root, own.sha256)
         finished = root / manifest.NAME
         pending = finished if finished.exists() else root / _PENDING
-        self._transfer([Wanted(shard, m, pending if m is own else root / m.path) for shard, m in found])
+        wanted = [Wanted(shard, m, pending if m is own else root / m.path) for shard, m in found]
+        transfer(self.source, wanted, self.progress, self.workers)
         with writing(finished):
             os.replace(pending, finished)
             (root / _STARTED).unlink(missing_ok=True)
@@ -158,7 +153,7 @@ class _Download:
             if read_json(root / folder.NAME, "a description of streams").get("excerpt") != excerpt:
                 raise problem(root, "this window of the scene, or no folder", "something else", "choose another --out")
             wanted = [w for w in wanted if not w.path.is_file()]
-        self._transfer(wanted)
+        transfer(self.source, wanted, self.progress, self.workers)
         streams = {}
         for path in sorted(root.glob("*.dat")):
             size, order, gaps = (scene.width, scene.height), scene.rows_bottom_up, _gaps_in(scene, path.stem, ticks)
@@ -166,9 +161,6 @@ class _Download:
                 path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=len(ticks), gaps=gaps
             )
         folder.write_stream_folder(root, streams, {"excerpt": excerpt})
-
-    def _transfer(self, wanted: list[Wanted]) -> None:
-        transfer(self.source, wanted, self.progress, self.workers)
 
     def _members(self, scene: SceneEntry) -> Iterator[tuple[Shard, Member]]:
         """Yield the files that are asked of a scene, from the lists of those shards that hold some."""

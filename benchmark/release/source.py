@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Lock
-from types import TracebackType
 from typing import Any, TypeVar
 
 from rich.console import Console
@@ -55,9 +54,7 @@ class ByteProgress:
         self.started = self._said = time.monotonic()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.seconds = time.monotonic() - self.started
         self._bars.stop()
 
@@ -95,9 +92,6 @@ class Patience:
     longest_wait_s: float = 30.0
 
 
-PATIENCE = Patience()
-
-
 class Stopped(Exception):
     """Raised in a thread that works for a download that has failed elsewhere."""
 
@@ -105,7 +99,7 @@ class Stopped(Exception):
 class Source:
     """A folder behind an address. Threads may share it; `stop` ends their waits."""
 
-    def __init__(self, address: str, patience: Patience = PATIENCE) -> None:
+    def __init__(self, address: str, patience: Patience = Patience()) -> None:
         """Raises UserError where the address is of a kind that this machine cannot read."""
         self.address, self.patience, self.stop, self.requests = address.rstrip("/"), patience, Event(), 0
         self._lock = Lock()
@@ -188,13 +182,13 @@ class Source:
             raise Stopped
 
 
-def find_source(address: str | None, what: str, patience: Patience = PATIENCE) -> Source:
+def find_source(address: str | None, what: str) -> Source:
     """Return the source at an address, or at the one that SPIKE4DGS_RELEASE names. Raises UserError without either."""
     chosen = address or os.environ.get(VARIABLE)
     if not chosen:
         fix = f"there is no public server yet: add --from ADDRESS, set {VARIABLE}, or render with make-dataset"
         raise problem("--from", f"the address of {what}", "none", fix)
-    return Source(chosen, patience)
+    return Source(chosen)
 
 
 def _options(address: str) -> dict[str, Any]:

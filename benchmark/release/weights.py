@@ -36,7 +36,6 @@ def fetch_weights(source: Source, name: str, file: WeightFile) -> Path:
 
 
 def _append(source: Source, name: str, part: Path, size: int) -> None:
-    """Fetch the bytes that a part lacks."""
     with ByteProgress(f"downloading {name} ({size_text(size)})", size) as progress, writing(part):
         with open(part, "ab") as file:
             have = min(file.tell(), size)

@@ -118,7 +118,6 @@ class _Row:
 
 
 def _heading(metric: Metric) -> str:
-    """Return a metric's id on two lines."""
     first, _, second = metric.id.partition("_")
     return f"{first}\n{second}"
 

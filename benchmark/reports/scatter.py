@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_with_pdf
 from spike4dgs.benchmark.runs.record import Record
@@ -16,16 +18,7 @@ from spike4dgs.benchmark.runs.record import Record
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.transforms import Bbox
-
 
 SHOWN = ("psnr", "psnr_dynamic")
 LEAST_SECONDS = 1e-3  # a logarithm needs more than zero
@@ -119,7 +112,6 @@ def floor_of(values: Sequence[float], least: float) -> float | None:
 
 
 def _panel(axes: Axes, metric: str, points: Sequence[Point], markers: Mapping[str, str]) -> None:
-    """Draw one metric."""
     title, unit = METRICS[metric].title, METRICS[metric].unit
     axes.set(xscale="log", xlabel="fit time, s a scene", ylabel=f"{title}, {unit}")
     axes.grid(alpha=0.3)
@@ -139,9 +131,10 @@ def _panel(axes: Axes, metric: str, points: Sequence[Point], markers: Mapping[st
         axes.plot(point.x, point.y, "o", color=point.color, ms=9, mec="white", mew=0.7)
     labels, tips = [(p.x, p.y, p.label) for p in inside], []
     for point in far:
-        labels.append((*_edge(axes, point), _far_label(point, metric)))
-        axes.plot(*labels[-1][:2], "o", color=point.color, ms=6, mec="white", mew=0.7, clip_on=False)
-        tips.append(_arrow(axes, point))
+        place, tip = _arrow(axes, point)
+        labels.append((*place, _far_label(point, metric)))
+        axes.plot(*place, "o", color=point.color, ms=6, mec="white", mew=0.7, clip_on=False)
+        tips.append(tip)
     label_points(axes, labels, [*(xy for p in inside for xy in p.scenes.values()), *tips])
 
 
@@ -157,20 +150,14 @@ def _limits(axes: Axes, inside: Sequence[Point], timed: Sequence[Point], room: b
     axes.set_xticks([], minor=True)
 
 
-def _edge(axes: Axes, point: Point) -> tuple[float, float]:
-    """Return where a point beyond the axes is shown: inside their edge."""
-    x, y = axes.transAxes.inverted().transform(axes.transData.transform((point.x, point.y)))
-    return tuple(axes.transData.inverted().transform(axes.transAxes.transform((max(x, 0.045), max(y, 0.06)))))
-
-
-def _arrow(axes: Axes, point: Point) -> tuple[float, float]:
-    """Draw an arrow from a shown point towards where it is; return its tip."""
+def _arrow(axes: Axes, point: Point) -> list[tuple[float, float]]:
+    """Draw an arrow from inside the axes' edge towards a point beyond it; return where it begins, and its tip."""
     x, y = axes.transAxes.inverted().transform(axes.transData.transform((point.x, point.y)))
     start = (max(x, 0.045), max(y, 0.06))
     to = (start[0] - 0.04 * (x < start[0]), start[1] - 0.055 * (y < start[1]))
     style = {"arrowstyle": "-|>", "color": point.color, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9}
     axes.annotate("", to, xytext=start, xycoords="axes fraction", textcoords="axes fraction", arrowprops=style)
-    return tuple(axes.transData.inverted().transform(axes.transAxes.transform(to)))
+    return [tuple(axes.transData.inverted().transform(axes.transAxes.transform(end))) for end in (start, to)]
 
 
 def _far_label(point: Point, metric: str) -> str:
@@ -217,26 +204,15 @@ def label_points(axes: Axes, points: Sequence[tuple[float, float, str]], avoid: 
     marks = to_pixels([*((x, y) for x, y, _ in points), *avoid]) if points else np.empty((0, 2))
     placed: list[Bbox] = []
     for x, y, text in points:
-        label = axes.annotate(
-            text, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=7.5, annotation_clip=False
-        )
-        best = min(
-            (_cost(axes, label, place, placed, marks), n, place) for n, place in enumerate(_places())
-        )  # the first of equal ones
-        _put(label, best[2])
+        style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7.5, "annotation_clip": False}
+        label = axes.annotate(text, (x, y), xytext=(0, 0), **style)
+        places = itertools.product(RINGS, DIRECTIONS)  # the best first, and so the first of equal ones
+        best = min(places, key=lambda place: _cost(axes, label, place, placed, marks))
+        _put(label, best)
         placed.append(label.get_window_extent().padded(PAD))
-        if best[2][0] >= LED:
-            axes.annotate(
-                "", (x, y), xytext=label.get_position(), textcoords="offset points",
-                arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": "0.5", "shrinkB": 3}, annotation_clip=False,
-            )  # fmt: skip
-
-
-def _places() -> Iterator[tuple[float, float]]:
-    """Yield distance in points and direction in degrees, the best first."""
-    for ring in RINGS:
-        for direction in DIRECTIONS:
-            yield float(ring), float(direction)
+        if best[0] >= LED:
+            line = {"arrowstyle": "-", "linewidth": 0.5, "color": "0.5", "shrinkB": 3}
+            axes.annotate("", (x, y), xytext=label.get_position(), arrowprops=line, **style)
 
 
 def _put(label: Any, place: tuple[float, float]) -> None:
@@ -260,7 +236,6 @@ def _cost(axes: Axes, label: Any, place: tuple[float, float], placed: Sequence[B
 
 
 def _overlap(a: Bbox, b: Bbox) -> float:
-    """Return the area that two boxes share."""
     width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
     return float(max(width, 0.0) * max(height, 0.0))
 

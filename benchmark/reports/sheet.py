@@ -105,7 +105,6 @@ def make_sheet(panels: Panels) -> Figure:
 
 
 def _lay_out(panels: Panels, panel: tuple[float, float], height: float) -> _Page:
-    """Return an empty page, with room for the widest name."""
     scratch = new_figure((1, 1), None)
     lines = [line for name in ("ground truth", *panels.folders) for line in wrap_name(name, NAME)]
     widths = [text_width(scratch, line, fontsize=LARGE, weight="bold") for line in lines]
@@ -115,7 +114,6 @@ def _lay_out(panels: Panels, panel: tuple[float, float], height: float) -> _Page
 
 
 def _label(page: _Page, name: str | None, y: float) -> None:
-    """Write a row's name at its left."""
     lines = ["ground truth"] if name is None else wrap_name(name, NAME)
     for n, line in enumerate(lines):
         page.text(MARGIN, y + n * LINE, line, fontsize=LARGE, weight="bold")
@@ -139,7 +137,6 @@ def _truth(page: _Page, panels: Panels, y: float) -> None:
 
 
 def _whole(axes: Axes, panels: Panels, k: int) -> None:
-    """Show the whole picture with the crop's outline."""
     from matplotlib.patches import Rectangle
 
     box = panels.boxes[k]

@@ -102,7 +102,6 @@ def _name(name: str, width: int) -> list[str]:
 
 
 def _frame(panels: Panels, layout: Layout, ground: UInt8, k: int) -> UInt8:
-    """Return a frame [H, W, 3]: the ground with the images of one instant."""
     frame = ground.copy()
     for cell, name in enumerate([None, *panels.scored]):
         frame[layout.image(cell)] = _enlarged(panels.image(name, k), layout.zoom)[..., None]
@@ -155,7 +154,6 @@ def _ground(panels: Panels, layout: Layout) -> UInt8:
 
 
 def _speed(panels: Panels) -> str:
-    """Return how much slower than the scene the video is."""
     ticks = [t.tick for t in panels.targets]
     if len(ticks) < 2:
         return ""

@@ -105,24 +105,18 @@ def why_not_kept(job: Job, folder: Path) -> str | None:
         return None
     if info.key is None or info.key == job.key:
         return None
-    mine, theirs = job.info.as_dict(), info.method.as_dict()
-    now: dict[str, Any] = {
-        **{k: mine[k] for k in ("version", "seed", "trained_on")},
-        "settings": mine["params"],
-        "revision of the scene": job.scene.revision,
-        "split": job.scene.split,
-        "budget": job.budget.label,
-        "device": device_type(job.device),
+    mine, theirs, scene = job.info, info.method, job.scene
+    differs = {
+        "version": mine.version != theirs.version,
+        "seed": mine.seed != theirs.seed,
+        "trained_on": mine.trained_on != theirs.trained_on,
+        "settings": mine.params != theirs.params,
+        "revision of the scene": scene.revision != info.scene_revision,
+        "split": scene.split != info.split,
+        "budget": job.budget.label != info.budget,
+        "device": device_type(job.device) != device_type(info.device or ""),
     }
-    then: dict[str, Any] = {
-        **{k: theirs[k] for k in ("version", "seed", "trained_on")},
-        "settings": theirs["params"],
-        "revision of the scene": info.scene_revision,
-        "split": info.split,
-        "budget": info.budget,
-        "device": device_type(info.device or ""),
-    }
-    return "another " + (", ".join(k for k in now if now[k] != then[k]) or "code of the method")
+    return "another " + (", ".join(what for what, other in differs.items() if other) or "code of the method")
 
 
 @dataclass(frozen=True)
@@ -187,7 +181,7 @@ def _predict(
     job: Job, method: MethodInfo, model: Model, cameras: Mapping[str, Camera], fit_seconds: float, folder: Path
 ) -> None:
     """Render the targets as `cameras` see them into a predictions folder."""
-    render_seconds = 0.0
+    render_seconds, size = 0.0, getattr(model, "size_bytes", None)
     with PredictionWriter(folder) as writer:
         for target in job.scene.targets:
             camera, t_us = cameras[target.camera], job.scene.t_us(target.tick)
@@ -206,7 +200,7 @@ def _predict(
                 fit_seconds=fit_seconds,
                 render_fps=len(job.scene.targets) / render_seconds,
                 peak_memory_mb=peak_memory_mb(job.device),
-                model_mb=_megabytes(model),
+                model_mb=None if size is None else int(size) / 1e6,
                 environment=environment(job.device),
                 harness=harness(),
                 key=job.key,
@@ -232,11 +226,6 @@ def _provenance(job: Job, fit_seconds: float) -> Provenance:
         harness=harness(),
         created=utc_now(),
     )
-
-
-def _megabytes(model: Model) -> float | None:
-    size = getattr(model, "size_bytes", None)
-    return None if size is None else int(size) / 1e6
 
 
 def _render(model: Model, camera: Camera, t_us: float, where: str) -> NDArray[np.float32]:

@@ -50,7 +50,10 @@ def unordered_executor(workers: int, scheduler: str | None, task_travels_once: b
     travels once to the workers of a cluster would be lost with the last of them. Raises UserError as `executor` does,
     and, while running, where the scheduler is lost.
     """
-    _check(workers, scheduler)
+    if workers < 1:
+        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
+    if scheduler is not None and workers != 1:
+        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
     if scheduler is not None:
         with _cluster(scheduler) as client:
             yield lambda task, chunks: _on_cluster(client, task, chunks, task_travels_once)
@@ -58,13 +61,6 @@ def unordered_executor(workers: int, scheduler: str | None, task_travels_once: b
         yield lambda task, chunks: enumerate(here(task, chunks))
     else:
         yield lambda task, chunks: _in_processes(task, chunks, workers)
-
-
-def _check(workers: int, scheduler: str | None) -> None:
-    if workers < 1:
-        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
-    if scheduler is not None and workers != 1:
-        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
 
 
 def here(task: Callable[[C], R], chunks: Iterable[C]) -> Iterator[R]:
@@ -145,20 +141,17 @@ def _work(chunk: Any) -> Any:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Any]:
-    """Yield the client of a scheduler that has workers."""
     try:
         from distributed import Client
     except ImportError:
-        raise problem(
-            "--scheduler", "the package distributed", "none", "pip install 'spike4dgs[cluster]' here and on the workers"
-        ) from None
+        fix = "pip install 'spike4dgs[cluster]' here and on the workers"
+        raise problem("--scheduler", "the package distributed", "none", fix) from None
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as e:
         reason = str(e).splitlines()[0] if str(e) else type(e).__name__
-        raise problem(
-            "--scheduler", f"a dask scheduler at {address}", reason, "start it, or correct the address"
-        ) from None
+        expected, fix = f"a dask scheduler at {address}", "start it, or correct the address"
+        raise problem("--scheduler", expected, reason, fix) from None
     with client:
         if not client.scheduler_info()["workers"]:
             raise problem("--scheduler", f"workers at {address}", "none", "start some: dask worker ADDRESS")

@@ -19,7 +19,6 @@ from spike4dgs.benchmark.metrics.held_out_spikes import (
 )
 from spike4dgs.benchmark.metrics.image_pair import Image
 from spike4dgs.benchmark.metrics.measure import Selection
-from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -71,7 +70,7 @@ def open_cameras(scene: Scene, targets: Sequence[Target], selection: Selection) 
     No stream is read where the selection has no metric of spikes.
     """
     cameras: Cameras = {}
-    if not any(_of_spikes(m) for m in selection.metrics):
+    if not any(m.takes == "spikes" for m in selection.metrics):
         return cameras, selection
     for name in dict.fromkeys(t.camera for t in targets):
         camera = scene.cameras[name]
@@ -85,12 +84,8 @@ def open_cameras(scene: Scene, targets: Sequence[Target], selection: Selection) 
 
 def without_truth(selection: Selection) -> Selection:
     """Return the selection without the metrics that compare with the truth."""
-    compared = [m.id for m in selection.metrics if not (_of_spikes(m) or m.blind)]
+    compared = [m.id for m in selection.metrics if m.takes != "spikes" and not m.blind]
     return selection.without(compared, "the scene has no ground truth")
-
-
-def _of_spikes(metric: Metric) -> bool:
-    return metric.takes == "spikes"
 
 
 def view_of(

@@ -16,7 +16,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -195,9 +194,7 @@ class PredictionWriter:
             write_bytes(self._part / name, data)
         self._finished = True
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._finished and kind is None:
             shutil.rmtree(self.root, ignore_errors=True)
             self._part.rename(self.root)

@@ -135,7 +135,7 @@ def from_nerfstudio(id: str, frame: Mapping[str, Any], where: str = "transforms"
     """
     check_ids([id], "camera", where)
     try:
-        m = np.array([_numbers(row, 4) for row in _rows(frame["transform_matrix"], 4)]) @ _OPENGL
+        m = np.array([_numbers(row, 4) for row in _listed(frame["transform_matrix"], 4)]) @ _OPENGL
         fx, fy = (positive(frame[k], MAX_LENGTH) for k in ("fl_x", "fl_y"))
         cx, cy = _numbers([frame[k] for k in ("cx", "cy")], 2)
         width, height = (whole(frame[k], 1, MAX_SIDE) for k in ("w", "h"))
@@ -150,14 +150,14 @@ def from_nerfstudio(id: str, frame: Mapping[str, Any], where: str = "transforms"
     return camera
 
 
-def _rows(values: Any, count: int) -> list[Any]:
+def _listed(values: Any, count: int) -> list[Any]:
     if not isinstance(values, list) or len(values) != count:
         raise ValueError(f"{shown(values)} is no list of {count}")
     return values
 
 
 def _numbers(values: Any, count: int) -> list[float]:
-    return [number(value, -MAX_LENGTH, MAX_LENGTH) for value in _rows(values, count)]
+    return [number(value, -MAX_LENGTH, MAX_LENGTH) for value in _listed(values, count)]
 
 
 def border(camera: Camera) -> Float64:
@@ -215,26 +215,14 @@ def mitsuba_sensor(camera: Camera) -> dict[str, Any]:
         fix = "render with Mitsuba's LLVM or CUDA variant, see `spike4dgs doctor`"
         raise problem(f"camera {camera.id}", "a pinhole for Mitsuba's sensor", "lens distortion", fix)
     if abs(camera.fx - camera.fy) > 1e-9 * camera.fx:
-        raise problem(
-            f"camera {camera.id}", "fx = fy", f"{camera.fx} and {camera.fy}", "use square pixels for rendering"
-        )
+        found = f"{camera.fx} and {camera.fy}"
+        raise problem(f"camera {camera.id}", "fx = fy", found, "use square pixels for rendering")
     return {
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
         "principal_point_offset_x": 0.5 - camera.cx / camera.width,
         "principal_point_offset_y": 0.5 - camera.cy / camera.height,
     }
-
-
-def from_mitsuba(
-    id: str, to_world: Float64, x_fov: float, offset: tuple[float, float], size: tuple[int, int]
-) -> Camera:
-    """Return the camera of Mitsuba's `to_world` [4, 4], `x_fov` (degrees), principal point offsets, (width, height)."""
-    width, height = size
-    f = 0.5 * width / np.tan(np.radians(x_fov) / 2)
-    m = np.asarray(to_world, dtype=np.float64) @ _MITSUBA
-    R = m[:3, :3].T
-    return Camera(id, width, height, f, f, width * (0.5 - offset[0]), height * (0.5 - offset[1]), R, -R @ m[:3, 3])
 
 
 def read_cameras(root: Path) -> dict[str, Camera]:

@@ -45,11 +45,13 @@ def write_exr(path: Path, image: Float32, t_us: float) -> None:
     Gray [H, W] becomes the channel Y. RGB [H, W, 3] becomes R, G, B and their `gray` Y, so that `read_exr` reads both.
     Raises UserError for values that are not finite or that half floats cannot hold.
     """
-    if not _is_image(image) or not np.isfinite(image).all() or np.abs(image).max(initial=0) > 65504:
+    is_image = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if not is_image or not np.isfinite(image).all() or np.abs(image).max(initial=0) > 65504:
         found = f"shape {image.shape}, range {np.min(image):g} to {np.max(image):g}"
         kind = "RGB" if image.ndim == 3 else "gray"
         raise problem(path, f"a finite {kind} image within +-65504", found, "correct the method that rendered it")
-    channels = {"Y": image} if image.ndim == 2 else {**_split("RGB", image), "Y": gray(image)}
+    colours = {} if image.ndim == 2 else {c: image[..., i] for i, c in enumerate("RGB")}
+    channels = colours | {"Y": image if image.ndim == 2 else gray(image)}
     _write_channels(path, {name: values.astype(np.float16) for name, values in channels.items()}, t_us)
 
 
@@ -88,23 +90,12 @@ def write_geometry(path: Path, depth: Float32, ids: NDArray[np.uint32], flow: Fl
     _write_channels(path, {**channels, "id": ids.astype(np.uint32)}, t_us)
 
 
-def read_geometry(path: Path, shape: Shape | None = None) -> Geometry:
-    """Read the file that `write_geometry` wrote.
-
-    Raises UserError where it is missing, damaged, not of that `shape` (if given) or lacks a channel.
-    """
+def read_geometry(path: Path) -> Geometry:
+    """Read the file that `write_geometry` wrote. Raises UserError where it is missing, damaged or lacks a channel."""
     names = ("Z", "id", "flow.x", "flow.y")
-    found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again", shape)
+    found = _read_channels(path, names, f"geometry (channels {', '.join(names)})", "make the scene again", None)
     flow = np.stack([found["flow.x"], found["flow.y"]], axis=-1)
     return Geometry(found["Z"].astype(np.float32), found["id"].astype(np.uint32), flow.astype(np.float32))
-
-
-def _is_image(image: NDArray[Any]) -> bool:
-    return image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-
-
-def _split(names: str, image: Float32) -> dict[str, Float32]:
-    return {name: image[..., i] for i, name in enumerate(names)}
 
 
 def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: float) -> None:
@@ -116,9 +107,8 @@ def _write_channels(path: Path, channels: Mapping[str, NDArray[Any]], t_us: floa
         try:
             file.write(str(part))
         except RuntimeError as e:  # what the system said is in the text only
-            raise problem(
-                path, "a file that can be written", str(e), "free some disk space, or choose another folder"
-            ) from e
+            fix = "free some disk space, or choose another folder"
+            raise problem(path, "a file that can be written", str(e), fix) from e
 
 
 def read_channels(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,11 +1,7 @@
 """Recordings of other sensors in a scene folder: frames of a conventional camera, events of an event camera.
 
-Frames of a conventional camera: the files of one camera, and their reader.
-
 conventional/CAMERA/TICK.png is the mean radiance over an exposure that begins at that tick, as 8-bit sRGB: gray [H, W],
 or RGB [H, W, 3]. scene.json states the frame rate and the exposure time. A clip shorter than one exposure has no frame.
-
-Events of an event camera: the file of one camera, and its reader.
 
 events/CAMERA.npz holds one entry per event in the arrays t (int64, microseconds from the start of the clip), x and y
 (uint16, column and row, row 0 at the top) and p (uint8, 1: brighter, 0: darker), in order of time. scene.json states
@@ -18,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +26,7 @@ from spike4dgs.benchmark.scene.images import decode_srgb, read_png
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.untrusted import Expected, read_npz
 
+T = TypeVar("T")
 _DIGITS = 15  # of a tick
 
 
@@ -85,11 +82,10 @@ class Frames(Sequence[Frame]):
 def find_frames(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]) -> dict[str, Frames]:
     """Return the frames, unread, of those of `cameras` that have some. `meta`: scene.json."""
     found: dict[str, Frames] = {}
-    facts: Mapping[str, Any] = meta.get("conventional", {})
-    for camera in cameras if facts else ():
+    for camera in cameras if meta.get("conventional") else ():
         own = files.only(f"conventional/{camera}/")
         if ticks := tuple(sorted(_tick(files, name) for name in own.files)):
-            fps, exposure_s = (_fact(files, facts, key) for key in ("fps", "exposure_s"))
+            fps, exposure_s = (_fact(files, meta, "conventional", key) for key in ("fps", "exposure_s"))
             size = int(meta["height"]), int(meta["width"])
             found[camera] = Frames(camera, ticks, size, float(meta["rate_hz"]), fps, exposure_s * 1e6, own)
     return found
@@ -101,18 +97,27 @@ def _tick(files: Manifest, name: str) -> int:
     return int(stem)
 
 
-def _fact(files: Manifest, facts: Mapping[str, Any], key: str) -> float:
-    if key not in facts:
-        raise problem(files.root / "scene.json", f"conventional/{key}", "no such key", "make the scene again")
-    return float(facts[key])
+def _fact(files: Manifest, meta: Mapping[str, Any], sensor: str, key: str) -> float:
+    if key not in meta[sensor]:
+        raise problem(files.root / "scene.json", f"{sensor}/{key}", "no such key", "make the scene again")
+    return float(meta[sensor][key])
 
 
 def frames_of(found: Mapping[str, Frames], camera: str, where: Path | str) -> Frames:
     """Return the frames of a camera. Raises UserError where there are none."""
+    fix = "use a scene that has conventional/ and is longer than one exposure"
+    return _of_camera(found, camera, "frames of a conventional camera", where, fix)
+
+
+def events_of(found: Mapping[str, EventStream], camera: str, where: Path | str) -> EventStream:
+    """Return the events of a camera. Raises UserError where there are none."""
+    return _of_camera(found, camera, "events of an event camera", where, "use a scene that has events/")
+
+
+def _of_camera(found: Mapping[str, T], camera: str, what: str, where: Path | str, fix: str) -> T:
     if camera not in found:
-        fix = "use a scene that has conventional/ and is longer than one exposure"
         names = f"those of {', '.join(found)}" if found else "none"
-        raise problem(where, f"frames of a conventional camera at {camera}", names, fix)
+        raise problem(where, f"{what} at {camera}", names, fix)
     return found[camera]
 
 
@@ -145,7 +150,13 @@ class EventStream:
         """All events. Raises UserError where the file is damaged or holds events outside the clip or the image."""
         path = self.files.path(f"events/{self.camera}.npz")
         found = read_events(path)
-        self._check(found, path)
+        size = {"t": self.n_ticks * 1e6 / self.rate_hz, "x": self.width, "y": self.height, "p": 2}
+        for name, column in found._asdict().items():
+            outside = len(column) and not (column.min() >= 0 and column.max() < size[name])
+            if column.shape != (len(found.t),) or outside:
+                raise problem(path, f"{name} of every event in [0, {size[name]:g})", "other values", _AGAIN)
+        if (np.diff(found.t) < 0).any():
+            raise problem(path, "events in order of time", "an earlier one after a later one", _AGAIN)
         return found
 
     @property
@@ -162,38 +173,16 @@ class EventStream:
         """Return the number of events."""
         return len(self.events.t)
 
-    def _check(self, found: Events, path: Path) -> None:
-        for name, column, stop in (
-            ("t", found.t, self.n_ticks * 1e6 / self.rate_hz),
-            ("x", found.x, self.width),
-            ("y", found.y, self.height),
-            ("p", found.p, 2),
-        ):
-            if column.shape != (len(found.t),) or len(column) and not (column.min() >= 0 and column.max() < stop):
-                raise problem(path, f"{name} of every event in [0, {stop:g})", "other values", _AGAIN)
-        if (np.diff(found.t) < 0).any():
-            raise problem(path, "events in order of time", "an earlier one after a later one", _AGAIN)
-
 
 def find_events(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]) -> dict[str, EventStream]:
     """Return the events, unread, of those of `cameras` that have some. `meta`: scene.json."""
     found: dict[str, EventStream] = {}
-    facts: Mapping[str, Any] = meta.get("events", {})
-    for camera in cameras if facts else ():
+    for camera in cameras if meta.get("events") else ():
         if (name := f"events/{camera}.npz") in files.files:
-            if "threshold" not in facts:
-                raise problem(files.root / "scene.json", "events/threshold", "no such key", "make the scene again")
             size, clock = (int(meta["width"]), int(meta["height"])), (float(meta["rate_hz"]), int(meta["n_ticks"]))
-            found[camera] = EventStream(camera, *size, *clock, float(facts["threshold"]), files.only(name))
+            threshold = _fact(files, meta, "events", "threshold")
+            found[camera] = EventStream(camera, *size, *clock, threshold, files.only(name))
     return found
-
-
-def events_of(found: Mapping[str, EventStream], camera: str, where: Path | str) -> EventStream:
-    """Return the events of a camera. Raises UserError where there are none."""
-    if camera not in found:
-        names = f"those of {', '.join(found)}" if found else "none"
-        raise problem(where, f"events of an event camera at {camera}", names, "use a scene that has events/")
-    return found[camera]
 
 
 def write_events(path: Path, found: Events) -> None:

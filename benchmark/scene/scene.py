@@ -239,9 +239,8 @@ def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = N
     targets = _read_targets(root / "targets.json", meta)
     chosen = meta["default_split"] if split is None else split
     if chosen not in targets:
-        raise problem(
-            root / "scene.json", f"a split among {', '.join(meta['splits'])}", repr(chosen), "name one of them"
-        )
+        expected = f"a split among {', '.join(meta['splits'])}"
+        raise problem(root / "scene.json", expected, repr(chosen), "name one of them")
     scene = Scene(root, meta, cameras, chosen, targets[chosen], manifest)
     refuse_gaps(scene.gaps, root / "scene.json", allow_gaps)
     return scene

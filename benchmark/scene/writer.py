@@ -185,7 +185,6 @@ def write_colmap(
 
 
 def _colmap_lens(camera: Camera) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's camera model and its coefficients."""
     if not camera.distortion:
         return "PINHOLE", ()
     k1, k2, p1, p2, k3 = camera.distortion
@@ -202,22 +201,6 @@ def colmap_distortion(camera: Any) -> Distortion | None:
     if model == "OPENCV" or (model == "FULL_OPENCV" and not any(params[9:])):
         return make_distortion(params[4:9])
     return None
-
-
-def read_colmap(folder: Path) -> tuple[Camera, ...]:
-    """Return the cameras of a COLMAP model that `write_colmap` wrote, one per registered image, named by the image."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction(str(folder))
-    cameras = []
-    for image in model.images.values():
-        c = model.cameras[image.camera_id]
-        pose = image.cam_from_world()
-        K = c.calibration_matrix()
-        values = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
-        cameras.append(Camera(image.name, c.width, c.height, *values, R, t, colmap_distortion(c) or ()))
-    return tuple(sorted(cameras, key=lambda c: c.id))
 
 
 # What a scene may hold beside its streams and descriptions: a path and a sentence for README.md.

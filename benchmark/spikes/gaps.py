@@ -66,12 +66,8 @@ def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:
     if gaps and not allow_gaps:
         g = gaps[0]
         found = f"{len(gaps)} gap(s), the first: {g.camera} from tick {g.first_tick}, {g.ticks} ticks ({g.reason})"
-        raise problem(
-            path,
-            "a recording without gaps",
-            found,
-            "pass --allow-gaps, where the command takes it, to read it all the same",
-        )
+        fix = "pass --allow-gaps, where the command takes it, to read it all the same"
+        raise problem(path, "a recording without gaps", found, fix)
 
 
 def present(gaps: Iterable[Gap], n_ticks: int) -> NDArray[np.bool_]:

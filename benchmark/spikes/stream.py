@@ -11,7 +11,6 @@ import mmap
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,6 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import writing
 from spike4dgs.benchmark.spikes.gaps import Gap
-
-T = TypeVar("T", bound=np.generic)
 
 
 def bytes_per_tick(width: int, height: int) -> int:
@@ -68,18 +65,14 @@ class SpikeStream:
         self._check(start, stop)
         if stop - start > 65535:
             raise problem("window", "at most 65535 ticks", f"{stop - start}", "add up shorter windows")
-        return self._upright(
-            count_bits(self.packed[start:stop], self.width * self.height).reshape(self.height, self.width)
-        )
+        counts = count_bits(self.packed[start:stop], self.width * self.height).reshape(self.height, self.width)
+        return counts[::-1] if self.rows_bottom_up else counts
 
     def release(self) -> None:
         """Give back the memory of a mapped file's pages; what is read again comes from the file again."""
         mapped = self.packed.base
         if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)
-
-    def _upright(self, images: NDArray[T]) -> NDArray[T]:
-        return images[..., ::-1, :] if self.rows_bottom_up else images
 
     def _check(self, start: int, stop: int) -> None:
         if not 0 <= start <= stop <= self.n_ticks:

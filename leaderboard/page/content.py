@@ -68,7 +68,6 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
 
 
 def _stated_sensor(board: Board, scene: str) -> str:
-    """Return what the records say of a scene's sensor."""
     return _distinct(r["sensors"][scene] for row in board.rows for r in row.records if scene in r.get("sensors", {}))
 
 

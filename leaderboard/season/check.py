@@ -68,7 +68,6 @@ def _check_results(season: Season, seasons: Path) -> str:
 
 
 def _check_pack(scene: HiddenScene, scenes: Path | None) -> str:
-    """Check a scene's tar."""
     path = None if scenes is None else scenes / f"{scene.id}.tar"
     if path is None or not path.is_file():
         return f"not checked: {scene.id}.tar, whose sha256 is {scene.pack_sha256}"
@@ -118,7 +117,6 @@ def _open_checked(folder: Path, scene: HiddenScene, season: Season) -> Scene:
 
 
 def _check_scores(name: str, season: Season, seasons: Path, scenes: Path | None, predictions: Path | None) -> str:
-    """Score the predictions of a result again and compare."""
     path = result_path(seasons, season.season, name)
     if scenes is None or predictions is None or not (predictions / name).is_dir():
         return f"not checked: the scores of {name}, which take --scenes and --predictions with {name}/"

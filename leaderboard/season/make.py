@@ -53,7 +53,9 @@ def make_season(
     with locked(secret / ".lock", secret, "a folder in which nobody else makes a season"):
         drawn = _opening(number, worlds, profile, secret)
         if is_announced(seasons, number):
-            _check_same(read_season(seasons, number), drawn, season_folder(seasons, number))
+            if (committed := read_season(seasons, number).opening_sha256) != drawn.sha256:
+                where, expected = season_folder(seasons, number), f"the commitment {drawn.sha256[:16]}... of --secret"
+                raise problem(where, expected, f"{committed[:16]}...", "choose another number or --secret")
             return False
         for seed in drawn.scenes:
             make_scene(seed, scene_folder(secret, seed.scene).parent)
@@ -69,7 +71,8 @@ def make_season(
                 fit_seed=fit_seed,
                 opening_sha256=drawn.sha256,
                 harness=drawn.harness,
-                rendered_on=_rendered_on(scenes),
+                # Elsewhere the last bits of a rendering may differ.
+                rendered_on={**scenes[0].meta["source"].get("versions", {}), "cpu": cpu_name()},
                 scenes=tuple(_commit(*pair, secret) for pair in zip(drawn.scenes, scenes, strict=True)),
             ),
         )
@@ -104,13 +107,6 @@ def _opening(number: int, worlds: Sequence[str], profile: str, secret: Path) -> 
     return drawn
 
 
-def _check_same(season: Season, drawn: Opening, where: Path) -> None:
-    """Raise UserError unless the season's commitment is that of the opening."""
-    if season.opening_sha256 != drawn.sha256:
-        expected = f"the commitment {drawn.sha256[:16]}... of --secret"
-        raise problem(where, expected, f"{season.opening_sha256[:16]}...", "choose another number or --secret")
-
-
 def _commit(seed: Seed, scene: Scene, secret: Path) -> HiddenScene:
     """Write a scene's training part and both tars; return the commitments to them."""
     part = write_training_part(scene, training_folder(secret, scene.id))
@@ -124,8 +120,3 @@ def _commit(seed: Seed, scene: Scene, secret: Path) -> HiddenScene:
         training_revision=part.revision,
         training_pack_sha256=pack_scene(part, pack_file(secret, scene.id, training=True)),
     )
-
-
-def _rendered_on(scenes: Sequence[Scene]) -> dict[str, str]:
-    """Return the versions that made the scenes, and the CPU: elsewhere the last bits of a rendering may differ."""
-    return {**scenes[0].meta["source"].get("versions", {}), "cpu": cpu_name()}

@@ -121,7 +121,6 @@ def read_results(seasons: Path, season: Season) -> list[Result]:
 
 
 def _order(result: Result) -> tuple[bool, float, str]:
-    """Return the key by which results are ranked."""
     value = result.record["mean"][PRIMARY] if is_complete(result.record) else None
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
     return value is None, sign * (value or 0.0), result.name

@@ -88,6 +88,5 @@ def _cut(image: Float64, side: int) -> Float64:
 
 @cache
 def _pristine() -> tuple[Float64, Float64]:
-    """Return mean [36] and covariance [36, 36] of the pristine photographs."""
     values = load_parameters("niqe")
     return values["mu"].ravel(), values["cov"]
