@@ -73,13 +73,18 @@ def _pattern(kind: str) -> re.Pattern[str]:
     return re.compile(load_schema("spike4dgs.benchmark", "common.schema.json")["$defs"][kind]["pattern"])
 
 
+def matches(kind: str, text: str) -> bool:
+    """Return whether a text has the form of `$defs/KIND` of common.schema.json: id, method, path, ..."""
+    return bool(_pattern(kind).search(text))
+
+
 def is_id(name: str) -> bool:
     """Return whether a name may be that of a scene, a camera or a split.
 
     >>> is_id("car-0-small"), is_id("../car"), is_id("")
     (True, False, False)
     """
-    return bool(_pattern("id").search(name))
+    return matches("id", name)
 
 
 def check_ids(names: Iterable[str], what: str, where: str | Path, fix: str = "rename it") -> None:
@@ -97,7 +102,7 @@ def check_ids(names: Iterable[str], what: str, where: str | Path, fix: str = "re
 
 def inside(root: Path, name: str, where: str | Path) -> Path:
     """Return the path `name` below `root`. Raises UserError where it is absolute, has `..`, or is no plain path."""
-    if not _pattern("path").search(name):
+    if not matches("path", name):
         raise problem(where, f"a path inside {root.name or root}", shown(name), "restore the file")
     return root / name
 

@@ -13,7 +13,6 @@ them that withhold nothing it was given. Any other record is local.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -28,13 +27,13 @@ from spike4dgs.benchmark.release.fingerprint import Match, compare, read_fingerp
 from spike4dgs.benchmark.runs.record import NOISY, Record
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.untrusted import is_id
 
 FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
 RELEASE = "1"
 PUBLIC, LOCAL, ARCHIVE = "entries", "local", "archive"
 REVISION_DIGITS = 12  # of revisions in paths and messages
 CHANGED = "the method ran with other settings (--set); a track takes it as a recipe with a name of its own"
-_SCENE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _NAMED = 3  # scenes that a message names
 _FROZEN = "restore the file: a release does not change, what is new goes into the next one"
 
@@ -206,7 +205,7 @@ def place_of(record: Mapping[str, Any]) -> Place:
     dataset, release = on_release(record["dataset"]), current_release()
     ids = sorted(dataset["scenes"])
     for scene in ids:
-        if not _SCENE_ID.fullmatch(scene):
+        if not is_id(scene):
             fix = "correct the scene's id and score again"
             raise problem("the record's dataset", "scene ids of letters, digits and . _ -", repr(scene[:120]), fix)
     if dataset["name"] != "+".join(ids):

@@ -6,7 +6,6 @@ and a scene without a value makes the mean null, never smaller.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.untrusted import matches
 
 IDEAL, PARTLY, NOISY, RECORDED = "ideal", "partly noisy", "noisy", "recorded"
 SENSORS = (IDEAL, PARTLY, NOISY, RECORDED)  # as in result.schema.json
@@ -175,8 +175,7 @@ def check_form(record: Record, where: str | Path) -> None:
 
 def check_method_name(name: str) -> None:
     """Raise UserError unless a method's name can be part of file names."""
-    schema = load_schema("spike4dgs.benchmark", "common.schema.json")["$defs"]["method"]
-    if not re.search(schema["pattern"], name):
+    if not matches("method", name):
         raise problem("method", "a name of letters, digits and + . _ -", repr(name), "rename the method")
 
 

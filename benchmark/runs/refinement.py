@@ -19,7 +19,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene
 
 SUFFIX = ".refined"
-MAX_TICKS = 200  # of the image: at 20 kHz 10 ms
+MAX_MS = 10.0  # of the image
 
 
 class Refinable(Protocol):
@@ -38,7 +38,7 @@ def refined_cameras(model: Refinable, scene: Scene) -> dict[str, Camera]:
     cameras = {}
     for name in scene.test:
         targets = [t for t in scene.targets if t.camera == name]
-        start, stop = free_ticks([t.tick for t in targets], scene.n_ticks)
+        start, stop = free_ticks([t.tick for t in targets], scene.n_ticks, round(scene.rate_hz * MAX_MS * 1e-3))
         image = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
         background = ~np.any([scene.moving(t) for t in targets], axis=0)
         if not background.any():
@@ -49,8 +49,8 @@ def refined_cameras(model: Refinable, scene: Scene) -> dict[str, Camera]:
     return cameras
 
 
-def free_ticks(ticks: Sequence[int], n_ticks: int) -> tuple[int, int]:
-    """Return the longest stretch [start, stop) of the clip without any of `ticks`, its middle part if it is very long.
+def free_ticks(ticks: Sequence[int], n_ticks: int, most: int) -> tuple[int, int]:
+    """Return the longest stretch [start, stop) of the clip without any of `ticks`, or `most` ticks in its middle.
 
     Raises UserError where every tick is taken.
     """
@@ -58,5 +58,5 @@ def free_ticks(ticks: Sequence[int], n_ticks: int) -> tuple[int, int]:
     length, start = max((b - a - 1, -a - 1) for a, b in zip(edges, edges[1:], strict=False))
     if length < 1:
         raise problem("refinement", "ticks that are not scored", "none", "leave some ticks out of the targets")
-    spare = max(0, length - MAX_TICKS) // 2
-    return spare - start, spare - start + min(length, MAX_TICKS)
+    spare = max(0, length - most) // 2
+    return spare - start, spare - start + min(length, most)

@@ -70,7 +70,7 @@ def predictions_folder(out: Path, method: str, scene: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Place:
+class JobFiles:
     """A job, and where a run keeps what comes of it."""
 
     job: Job
@@ -135,8 +135,8 @@ def run_matrix(
     for scene in scenes:
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
-    places = [
-        Place(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed), settings.refit)
+    jobs = [
+        JobFiles(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed), settings.refit)
         for seed in range(settings.seed, settings.seed + settings.seeds)
         for method in methods
         for scene in scenes
@@ -145,81 +145,81 @@ def run_matrix(
     records: dict[int, list[Record]] = {}
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(console, len(places)) as display,
+        RunDisplay(console, len(jobs)) as display,
     ):
-        for k, cells in _run_cells(places, settings, selection, display):
+        for k, cells in _run_cells(jobs, settings, selection, display):
             found[k] = cells
             first = k - k % len(scenes)  # of the cells of one record
             if all(n in found for n in range(first, first + len(scenes))):
                 rows = [found[first + n] for n in range(len(scenes))]
-                records[first] = _write_records(places[first], scenes, rows, settings)
+                records[first] = _write_records(jobs[first], scenes, rows, settings)
     return [record for first in sorted(records) for record in records[first]]
 
 
 def _run_cells(
-    places: Sequence[Place], settings: Settings, selection: Selection, display: RunDisplay
+    jobs: Sequence[JobFiles], settings: Settings, selection: Selection, display: RunDisplay
 ) -> Iterator[tuple[int, list[Cell]]]:
     """Run or resume the cells, here or by workers. Yield their positions and the cells of their variants."""
     if settings.workers == 1 and settings.scheduler is None:
-        for k, place in enumerate(places):
-            with display.cell(place.title) as shown:
-                yield k, _settle(place, fit_here(place, shown), selection, shown)
+        for k, files in enumerate(jobs):
+            with display.cell(files.title) as shown:
+                yield k, _settle(files, fit_here(files, shown), selection, shown)
     else:
         with unordered_executor(settings.workers, settings.scheduler) as run:
-            yield from _spread(places, settings.out, run, selection, display)
+            yield from _spread(jobs, settings.out, run, selection, display)
 
 
-def fit_here(place: Place, shown: ShownCell) -> Failure | None:
+def fit_here(files: JobFiles, shown: ShownCell) -> Failure | None:
     """Fit in this process, or keep what is there; return the failure of the method, if it failed."""
     try:
-        if not place.is_done(shown):
-            run_job(place.job, place.folders, place.model, place.work, shown.progress, shown.note)
+        if not files.is_done(shown):
+            run_job(files.job, files.folders, files.model, files.work, shown.progress, shown.note)
     except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
         return failure_of(e)
     return None
 
 
 def _spread(
-    places: Sequence[Place], out: Path, run: RunUnordered, selection: Selection, display: RunDisplay
+    jobs: Sequence[JobFiles], out: Path, run: RunUnordered, selection: Selection, display: RunDisplay
 ) -> Iterator[tuple[int, list[Cell]]]:
     """Fit by workers. While they work, the cells that need none are scored."""
     folder = SharedFolder(out.absolute(), uuid4().hex)
     write_text(folder.token_file, folder.token)
     settled: dict[int, Failure | None] = {}
     orders, notes = {}, defaultdict[int, list[str]](list)
-    for k, place in enumerate(places):
+    for k, files in enumerate(jobs):
         try:
-            if place.is_done(ShownCell(no_progress, notes[k].append)):
+            if files.is_done(ShownCell(no_progress, notes[k].append)):
                 settled[k] = None
             else:
-                orders[k] = make_order(place.job, folder, place.work)
+                orders[k] = make_order(files.job, folder, files.work)
         except Exception as e:  # a method that cannot travel
             settled[k] = failure_of(e)
     arrivals = run(fit_order, list(orders.values()))
     display.say(f"{len(orders)} cells go to workers and appear as they come back")
     for k, failure in settled.items():
-        with display.cell(places[k].title, notes[k]) as shown:
-            yield k, _settle(places[k], failure, selection, shown)
+        with display.cell(jobs[k].title, notes[k]) as shown:
+            yield k, _settle(jobs[k], failure, selection, shown)
     sent = list(orders)
     for position, result in arrivals:
         k = sent[position]
-        with display.cell(places[k].title, notes[k]) as shown:
+        with display.cell(jobs[k].title, notes[k]) as shown:
             if result == WORKERS_DIED:
                 result = Failure("failed", "its workers died one after another (out of memory?)", WORKERS_DIED)
             if not isinstance(result, Failure):
-                store(result, places[k].folders, places[k].model)
+                store(result, jobs[k].folders, jobs[k].model)
                 for line in result.notes:
                     shown.note(line)
             failure = result if isinstance(result, Failure) else None
-            yield k, _settle(places[k], failure, selection, shown)
+            yield k, _settle(jobs[k], failure, selection, shown)
 
 
-def _settle(place: Place, failure: Failure | None, selection: Selection, shown: ShownCell) -> list[Cell]:
+def _settle(files: JobFiles, failure: Failure | None, selection: Selection, shown: ShownCell) -> list[Cell]:
     """Score what a cell left, or write why there is nothing. Return the cells of the job's variants."""
-    job, log = place.job, place.log
+    job, log = files.job, files.log
     if failure is None:
         try:
-            cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in place.folders]
+            cells = [score_scene(open_for(folder, job.scene), job.scene, selection) for folder in files.folders]
             log.unlink(missing_ok=True)
         except Exception as e:  # such as damaged images
             failure = failure_of(e)
@@ -233,15 +233,15 @@ def _settle(place: Place, failure: Failure | None, selection: Selection, shown: 
 
 
 def _write_records(
-    place: Place, scenes: Sequence[Scene], rows: Sequence[Sequence[Cell]], settings: Settings
+    files: JobFiles, scenes: Sequence[Scene], rows: Sequence[Sequence[Cell]], settings: Settings
 ) -> list[Record]:
-    """Write the records of a method's variants with the seed of `place`; `rows` has their cells of each scene."""
+    """Write the records of a method's variants with the seed of `files`; `rows` has their cells of each scene."""
     records = []
     device = settings.device if settings.scheduler is None else "cpu"  # of this process, which scored
-    for info, cells in zip(place.job.variants, zip(*rows, strict=True), strict=True):
+    for info, cells in zip(files.job.variants, zip(*rows, strict=True), strict=True):
         by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
         record = build_record(info, scenes, by_scene, device)
-        path = place.out / "results" / f"{info.name}.json"
+        path = files.out / "results" / f"{info.name}.json"
         record = with_earlier_scenes(record, path)
         write_record(path, record)
         records.append(record)

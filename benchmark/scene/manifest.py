@@ -6,7 +6,6 @@ bytes; `identity.verify` decodes them too and checks what the manifest says of t
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -15,10 +14,10 @@ from typing import Any
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_file, write_json
 from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
+from spike4dgs.benchmark.untrusted import matches
 
 NAME = "manifest.json"
 _SCHEMA = "spike4dgs-manifest/1"
-_DIGEST = re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -71,13 +70,11 @@ class Manifest:
             except UserError as e:
                 yield str(e)
 
-    def _entry(self, name: str) -> tuple[int, str]:
-        if name not in self.files:
-            raise problem(self.root / name, f"a file that {NAME} lists", "no entry", "make or import the scene again")
-        return self.files[name]
-
     def _check(self, name: str) -> None:
-        path, (size, digest) = self.root / name, self._entry(name)
+        path = self.root / name
+        if name not in self.files:
+            raise problem(path, f"a file that {NAME} lists", "no entry", "make or import the scene again")
+        size, digest = self.files[name]
         if not path.is_file():
             raise problem(path, f"a file of {size} bytes", "no such file", "restore it or make the scene again")
         if (found := path.stat().st_size) != size:
@@ -133,7 +130,7 @@ def read_manifest(root: Path) -> Manifest:
         if not _is_inside(name):
             raise problem(path, "paths inside the scene folder", repr(name), "do not use this scene")
     for name, digest in recorded.items():
-        if not _DIGEST.fullmatch(digest):
+        if not matches("sha256", digest):
             raise problem(path, f"64 hex digits as the content of {name}", repr(digest), "restore the file")
     return Manifest(root, files, recorded)
 

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
-from spike4dgs.benchmark.runs.run import Place, Settings, fit_here
+from spike4dgs.benchmark.runs.run import JobFiles, Settings, fit_here
 from spike4dgs.benchmark.runs.score import score_predictions
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -38,11 +38,11 @@ def predict_all(scenes: Sequence[Scene], methods: Sequence[Method], settings: Se
         RunDisplay(make_console(), len(scenes) * len(methods)) as display,
     ):
         for method, scene in product(methods, scenes):
-            place = Place(Job(method, scene, settings.seed, settings.device, settings.budget), settings.out)
+            files = JobFiles(Job(method, scene, settings.seed, settings.device, settings.budget), settings.out)
             with display.cell(f"{method.name} on {scene.id}") as shown:
-                if failure := fit_here(place, shown):
-                    write_text(place.log, failure.traceback)
-                    shown.note(f"{failure.status}: {failure.reason} (see {place.log})")
+                if failure := fit_here(files, shown):
+                    write_text(files.log, failure.traceback)
+                    shown.note(f"{failure.status}: {failure.reason} (see {files.log})")
                     failed.add(method.name)
     return failed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,22 +18,22 @@ from spike4dgs.benchmark.runs.predictions import read_info
 from spike4dgs.benchmark.scene.scene import open_scene
 
 
+def register(monkeypatch: pytest.MonkeyPatch, *names: str, load: Callable[[], dict[str, CountMethod]]) -> None:
+    entries = [SimpleNamespace(name=n, value=f"{n}.recipes:METHODS", dist=None, load=load) for n in names]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: entries)
+
+
 def test_a_package_that_cannot_be_imported_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load() -> None:
+    def load() -> dict[str, CountMethod]:
         raise ImportError("no libfoo")
 
-    entry = SimpleNamespace(name="theirs", value="theirs.recipes:METHODS", load=load)
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+    register(monkeypatch, "theirs", load=load)
     with pytest.raises(UserError, match="entry point theirs: expected theirs.recipes:METHODS, found ImportError"):
         recipes.find_methods()
 
 
 def test_one_name_in_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load() -> dict[str, CountMethod]:
-        return {"same": CountMethod("same")}
-
-    entries = [SimpleNamespace(name=n, value=f"{n}:METHODS", dist=None, load=load) for n in "ab"]
-    monkeypatch.setattr(plugins, "entry_points", lambda group: entries)
+    register(monkeypatch, "a", "b", load=lambda: {"same": CountMethod("same")})
     with pytest.raises(UserError, match="entry point b: expected a new method name, found 'same' twice"):
         recipes.find_methods()
 

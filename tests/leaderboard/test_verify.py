@@ -65,8 +65,6 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
         (lambda r: r["dataset"]["scenes"].update({"pattern-0": "1" * 64}), "expected scene revision 1111111111111111"),
         (lambda r: r["mean"].update(psnr=99.0), "expected psnr ="),
         (lambda r: r["scenes"]["pattern-0"]["per_image"].pop("cam_03/000020"), "the mean of its parts"),
-        (lambda r: r["method"].update(name="../../evil"), "at method/name"),
-        (lambda r: r["method"].update(name="a/b"), "at method/name"),
         (lambda r: r.update(surprise=1), "'surprise' was unexpected"),
     ],
 )

@@ -247,19 +247,12 @@ def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
         (["--cameras", "large.yaml"], "large.yaml: expected 40x24 pixels for cam_00, as the streams have, found 8x8"),
         (["--cameras", "part.yaml"], "expected camera_model, intrinsics, distortion_model, distortion_coeffs"),
         (["--cameras", "cut"], "cut: expected a whole COLMAP model, found a damaged one"),
-        (
-            ["--cameras", "greedy"],
-            "greedy: expected a whole COLMAP model, found a damaged one (images.bin ends",
-        ),
+        (["--cameras", "greedy"], "greedy: expected a whole COLMAP model, found a damaged one (images.bin ends"),
         (["--cameras", "others"], "others: expected a camera for each stream, found none for cam_00 (it has a, b, c)"),
     ],
 )
 def test_bad_input_is_one_line(
-    tmp_path: Path,
-    change: list[str],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path, change: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_streams(Path("in"), ["cam_00"])

@@ -51,12 +51,6 @@ def test_import_of_any_size_and_length(
         assert (root / "out/cam.dat").read_bytes() == (root / "cam/a.dat").read_bytes()
 
 
-def test_rows_stored_top_down(tmp_path: Path) -> None:
-    spikes = random_spikes(9, 5, 11)
-    import_spikecv(write_spikecv(tmp_path / "cam", spikes), tmp_path / "out", Recording(1.0, rows_top_down=True))
-    np.testing.assert_array_equal(open_stream_folder(tmp_path / "out")["cam"].window(0, 9), spikes[:, ::-1])
-
-
 def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export-spikecv", str(small_scene), "--out", str(tmp_path / "spikecv")]) == 0
     assert "not in SpikeCV's format: 20000 ticks per second" in capsys.readouterr().out

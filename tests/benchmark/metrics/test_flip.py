@@ -101,12 +101,7 @@ def test_the_largest_difference_is_that_of_green_and_blue() -> None:
 
 @pytest.mark.parametrize(
     "images",
-    [
-        (IMAGE, IMAGE[:-1]),
-        (IMAGE / 255, IMAGE / 255),
-        (IMAGE[..., None], IMAGE[..., None]),
-        (IMAGE[:0], IMAGE[:0]),
-    ],
+    [(IMAGE, IMAGE[:-1]), (IMAGE / 255, IMAGE / 255), (IMAGE[..., None], IMAGE[..., None]), (IMAGE[:0], IMAGE[:0])],
 )
 def test_other_images_are_refused(images: tuple[NDArray, NDArray]) -> None:
     with pytest.raises(UserError, match="FLIP: expected two 8-bit gray images of one size, found"):

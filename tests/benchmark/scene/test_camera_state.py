@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from spike4dgs.benchmark.scene.camera_state import Clock, local_tick, local_ticks, local_window
 
 
-@given(
-    offset=st.floats(-100, 100),
-    drift=st.floats(-1000, 1000),
-    tick=st.floats(0, 2_000_000),
-)
+@given(offset=st.floats(-100, 100), drift=st.floats(-1000, 1000), tick=st.floats(0, 2_000_000))
 def test_shared_undoes_local(offset: float, drift: float, tick: float) -> None:
     clock = Clock(offset, drift)
     assert abs(clock.shared(clock.local(tick)) - tick) < 1e-6

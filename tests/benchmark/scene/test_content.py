@@ -220,8 +220,7 @@ OTHER: dict[str, Change] = {
     "light of the calibration": edit("scene.json", lambda m: m["calibration"].update(flat_radiance=0.75)),
     "order of rows": edit("scene.json", lambda m: m["sensor"].update(rows_bottom_up=False)),
     "a gap": edit(
-        "scene.json",
-        lambda m: m.update(gaps=[{"camera": "cam_00", "first_tick": 3, "ticks": 2, "reason": "usb"}]),
+        "scene.json", lambda m: m.update(gaps=[{"camera": "cam_00", "first_tick": 3, "ticks": 2, "reason": "usb"}])
     ),
     "lens": edit("transforms_train.json", lambda t: [f.update(k1=0.01) for f in t["frames"]]),
     "an image less": lambda root: (root / "images/cam_00/000030.exr").unlink(),

@@ -8,15 +8,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.benchmark.scene.lens import (
-    distort,
-    fold_radius,
-    inside,
-    make_distortion,
-    nearest,
-    resample,
-    undistort,
-)
+from spike4dgs.benchmark.scene.lens import distort, fold_radius, inside, make_distortion, nearest, resample, undistort
 
 BARREL = make_distortion([-0.2, 0.03, 0.001, -0.001, 0.0])
 LENSES = st.tuples(

@@ -144,6 +144,7 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
         (one_split("cam_00", "cam_03"), "scene.json", "known, distinct cameras, found cam_03 in both parts"),
         (one_split("cam_00", "cam_77"), "scene.json", "found cam_77 without pose or stream"),
         (one_split(), "scene.json", "at splits/center/train"),
+        (set_meta(splits={"../evil": {"train": ["cam_00"], "test": []}}), "scene.json", "'../evil' does not match"),
         (set_meta(gaps=[GAP]), "scene.json", "expected a recording without gaps, found 1 gap(s)"),
         (set_meta(gaps=[{"camera": "cam_01"}]), "scene.json", "at gaps/0"),
         (edit_json("scene.json", lambda m: m.update(title="x"), rehash=False), "scene.json", "expected"),

@@ -10,11 +10,7 @@ from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.training_bursts import (
-    open_bursts,
-    open_folder,
-    write_bursts,
-)
+from spike4dgs.benchmark.scene.training_bursts import open_bursts, open_folder, write_bursts
 
 
 def test_bursts_survive_as_half_floats(tmp_path: Path) -> None:

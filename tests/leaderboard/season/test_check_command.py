@@ -87,24 +87,13 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
     assert "render other bytes" in capsys.readouterr().err
 
 
-def seed_text(over: Made) -> None:
-    change_json(over.public / OPENING_NAME, lambda d: d["scenes"][0].update(seed="1"))
-
-
-def salt(over: Made) -> None:
-    change_json(over.public / OPENING_NAME, lambda d: d.update(salt="0" * 64))
+def changed(name: str, change: Callable[[Any], object]) -> Callable[[Made], None]:
+    """Change a public JSON file of the season."""
+    return lambda over: change_json(over.public / name, change)
 
 
 def other_opening(over: Made) -> None:
     (over.public / OPENING_NAME).write_text(draw_opening(NUMBER, ("car", "turntable"), "tiny").text)
-
-
-def committed_world(over: Made) -> None:
-    change_json(over.public / "season.json", lambda d: d["scenes"][0].update(world="van"))
-
-
-def committed_code(over: Made) -> None:
-    change_json(over.public / "season.json", lambda d: d["harness"].update(commit="0" * 40))
 
 
 def stream(over: Made) -> None:
@@ -135,10 +124,6 @@ def source_seed(over: Made) -> None:
     write_manifest(over.root / "scenes" / SCENE)
 
 
-def committed_training_part(over: Made) -> None:
-    change_json(over.public / "season.json", lambda d: d["scenes"][0].update(training_revision="0" * 64))
-
-
 def tar(over: Made) -> None:
     with open(over.root / "scenes" / f"{SCENE}.tar", "ab") as file:
         file.write(b"0")
@@ -158,17 +143,6 @@ def value(over: Made) -> None:
     write_table(over.seasons, over.season)
 
 
-def mean(over: Made) -> None:
-    change_json(over.public / "results/counts.json", lambda d: d["record"]["mean"].update(psnr=60.0))
-
-
-def other_scenes(over: Made) -> None:
-    def edit(data: Any) -> None:
-        data["record"]["dataset"]["scenes"][SCENE] = "0" * 64
-
-    change_json(over.public / "results/counts.json", edit)
-
-
 def table(over: Made) -> None:
     path = over.public / "table.md"
     path.write_text(path.read_text().replace("counts", "others"))
@@ -184,29 +158,35 @@ def predictions(over: Made) -> None:
     shutil.copytree(over.root / "runs/predictions/rough", folder)
 
 
-@pytest.mark.parametrize(
-    ("forge", "message"),
-    [
-        (seed_text, "as committed"),
-        (salt, "as committed"),
-        (other_opening, "as committed"),
-        (committed_world, "as in season.json"),
-        (committed_code, "as in season.json"),
-        (stream, "cam_04.dat: expected sha256"),
-        (stream_and_manifest, "expected revision"),
-        (truth_behind_an_honest_manifest, "the manifest claims another content"),
-        (source_seed, "as revealed"),
-        (committed_training_part, "expected a training part of revision 0000"),
-        (tar, f"{SCENE}.tar: expected sha256"),
-        (value, "as computed from the files"),
-        (mean, "the mean of its parts"),
-        (other_scenes, "expected scores of the committed"),
-        (table, "expected the table of the results"),
-        (missing_row, "expected the table of the results"),
-        (predictions, "expected predictions"),
-    ],
-    ids=lambda f: getattr(f, "__name__", ""),
-)
+COUNTS = "results/counts.json"
+FORGED: dict[str, tuple[Callable[[Made], None], str]] = {
+    "seed": (changed(OPENING_NAME, lambda d: d["scenes"][0].update(seed="1")), "as committed"),
+    "salt": (changed(OPENING_NAME, lambda d: d.update(salt="0" * 64)), "as committed"),
+    "other opening": (other_opening, "as committed"),
+    "world": (changed("season.json", lambda d: d["scenes"][0].update(world="van")), "as in season.json"),
+    "code": (changed("season.json", lambda d: d["harness"].update(commit="0" * 40)), "as in season.json"),
+    "stream": (stream, "cam_04.dat: expected sha256"),
+    "stream and manifest": (stream_and_manifest, "expected revision"),
+    "truth": (truth_behind_an_honest_manifest, "the manifest claims another content"),
+    "source's seed": (source_seed, "as revealed"),
+    "training part": (
+        changed("season.json", lambda d: d["scenes"][0].update(training_revision="0" * 64)),
+        "expected a training part of revision 0000",
+    ),
+    "tar": (tar, f"{SCENE}.tar: expected sha256"),
+    "value": (value, "as computed from the files"),
+    "mean": (changed(COUNTS, lambda d: d["record"]["mean"].update(psnr=60.0)), "the mean of its parts"),
+    "other scenes": (
+        changed(COUNTS, lambda d: d["record"]["dataset"]["scenes"].update({SCENE: "0" * 64})),
+        "expected scores of the committed",
+    ),
+    "table": (table, "expected the table of the results"),
+    "missing row": (missing_row, "expected the table of the results"),
+    "predictions": (predictions, "expected predictions"),
+}
+
+
+@pytest.mark.parametrize(("forge", "message"), FORGED.values(), ids=FORGED)
 def test_every_forged_part_is_caught(
     forge: Callable[[Made], None], message: str, over: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
