@@ -49,12 +49,8 @@ def flip(truth: UInt8, prediction: UInt8) -> float:
     return float(np.mean(colour**exponent))
 
 
-def _linear_light() -> Float64:
-    x = np.arange(256) / 255
-    return np.asarray(np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
-
-
-_LINEAR = _linear_light()
+_LEVEL = np.arange(256) / 255  # of sRGB, and its linear light
+_LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
 
 
 def _filtered(image: Float64, rows: Float64, columns: Float64) -> Float64:

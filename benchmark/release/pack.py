@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -76,19 +77,16 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int) -> Rel
         scenes = [_with_counts(scene, out / _COUNTED / scene.id) for scene in scenes]
         samples = [sample for scene in scenes for sample in _samples(scene)]
         shards = list(_in_shards(samples, shard_bytes))
-        names = [_shard_name(name, i) for i in range(len(shards))]
+        names = [f"shards/{i // _SHARDS_PER_FOLDER:03d}/spike4dgs-{name}-{i:05d}.tar" for i in range(len(shards))]
         _refuse_others(out, [*names, *map(index_of, names)])
         total = sum(file.bytes for sample in samples for file in sample.files)
         written = []
         with ByteProgress("packing", total) as progress:
             for shard_name, held in zip(names, shards, strict=True):
                 files = [file for sample in held for file in sample.files]
-                shard = find_shard(out, shard_name, files)
-                if shard is None:
-                    shard = write_shard(out, shard_name, files, progress.advance)
-                else:
+                if shard := find_shard(out, shard_name, files):
                     progress.skip(sum(file.bytes for file in files))
-                written.append(shard)
+                written.append(shard or write_shard(out, shard_name, files, progress.advance))
         _write_descriptions(out, name, scenes, shards, written)
         shutil.rmtree(out / _COUNTED, ignore_errors=True)
     return read_release(out)
@@ -141,10 +139,6 @@ def _in_shards(samples: Iterable[_PlannedSample], shard_bytes: int) -> Iterator[
         yield held
 
 
-def _shard_name(release: str, number: int) -> str:
-    return f"shards/{number // _SHARDS_PER_FOLDER:03d}/spike4dgs-{release}-{number:05d}.tar"
-
-
 def _refuse_others(out: Path, shards: Sequence[str]) -> None:
     """Raise UserError where `out` holds files that this release has not, such as those of another one."""
     ours = {*shards, index.NAME, SUMS, *card.NAMES}
@@ -161,10 +155,10 @@ def _write_descriptions(
     of_scene: dict[str, list[Sample]] = {scene.id: [] for scene in scenes}
     for number, held in enumerate(shards):
         for sample in held:
-            sizes: dict[str, int] = {}
+            sizes = Counter[str]()
             for file in sample.files:
-                sizes[part_of(file.path)] = sizes.get(part_of(file.path), 0) + file.bytes
-            of_scene[sample.scene.id].append(Sample(sample.camera, number, sizes))
+                sizes[part_of(file.path)] += file.bytes
+            of_scene[sample.scene.id].append(Sample(sample.camera, number, dict(sizes)))
     entries = [_entry(scene, tuple(of_scene[scene.id])) for scene in scenes]
     write_json(out / index.NAME, release_json(name, entries, written))
     card.write_card(out, name, entries, written)

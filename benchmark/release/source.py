@@ -129,10 +129,6 @@ class Source:
             raise EOFError(f"{len(data)} of {stop - start} bytes")
         return data
 
-    def read_again(self, name: str, start: int, stop: int, size: int) -> bytes:
-        """Return the same, tried again where it fails. Raises UserError where it keeps failing."""
-        return self.persist(lambda: self.read(name, start, stop, size), name)
-
     def read_all(self, name: str) -> bytes:
         """Return a small file. Raises UserError where it cannot be read."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
@@ -41,11 +42,10 @@ def _append(source: Source, name: str, part: Path, size: int) -> None:
             have = min(file.tell(), size)
             file.truncate(have)
             progress.skip(have)
-            while have < size:
-                stop = min(have + PIECE, size)
-                data = source.read_again(name, have, stop, size)
+            for start in range(have, size, PIECE):
+                stop = min(start + PIECE, size)
+                data = source.persist(partial(source.read, name, start, stop, size), name)
                 file.write(data)
                 file.flush()
-                have = stop
                 progress.advance(len(data))
             os.fsync(file.fileno())

@@ -247,15 +247,14 @@ class FitClock:
     """
 
     def __init__(self, path: Path, checkpoint: Path) -> None:
-        self.path = path
-        self.before = self._seconds_in(checkpoint) if path.is_file() and checkpoint.is_file() else 0.0
+        self.before = 0.0
+        if path.is_file() and checkpoint.is_file():
+            last = read_json(path, "the times of an unfinished fit")
+            lasted = checkpoint.stat().st_mtime - float(last["started_unix"])
+            self.before = float(last["seconds_before"]) + max(0.0, lasted)
         self._start = time.perf_counter()
         write_json(path, {"seconds_before": self.before, "started_unix": time.time()})
 
     def seconds(self) -> float:
         """Seconds of all parts up to now."""
         return self.before + time.perf_counter() - self._start
-
-    def _seconds_in(self, checkpoint: Path) -> float:
-        last = read_json(self.path, "the times of an unfinished fit")
-        return float(last["seconds_before"]) + max(0.0, checkpoint.stat().st_mtime - float(last["started_unix"]))

@@ -43,8 +43,13 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
 
     Raises UserError where a record is none, names no camera of the recording, leaves its clip or overlaps another.
     """
+
+    def gap(record: Mapping[str, Any]) -> Gap:
+        first, ticks = (whole(record[key], 0, MAX_TICKS) for key in ("first_tick", "ticks"))
+        return Gap(str(record["camera"]), first, ticks, str(record["reason"]))
+
     try:
-        gaps = sorted(_gap(record) for record in records)
+        gaps = sorted(map(gap, records))
     except (KeyError, TypeError, ValueError) as e:
         raise problem(path, "gaps {camera, first_tick, ticks, reason}", repr(e), "restore the file") from None
     for i, gap in enumerate(gaps):
@@ -54,11 +59,6 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
             expected = f"gaps of its cameras that {'do not overlap' if inside else 'lie within the clip'}"
             raise problem(path, expected, str(gap.record), "restore the file")
     return tuple(gaps)
-
-
-def _gap(record: Mapping[str, Any]) -> Gap:
-    first, ticks = (whole(record[key], 0, MAX_TICKS) for key in ("first_tick", "ticks"))
-    return Gap(str(record["camera"]), first, ticks, str(record["reason"]))
 
 
 def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -23,16 +21,9 @@ PAPER_TABLES = (1, 2)  # those of whole methods by scene
 
 def page_metrics() -> list[dict[str, Any]]:
     """Return the metrics and costs as the page lists them."""
+    same = ("id", "title", "definition", "unit", "digits")
     metrics = [
-        {
-            "id": m.id,
-            "title": m.title,
-            "definition": m.definition,
-            "higher": m.higher_is_better,
-            "unit": m.unit,
-            "digits": m.digits,
-            "cost": False,
-        }
+        {**{key: getattr(m, key) for key in same}, "higher": m.higher_is_better, "cost": False}
         for m in METRICS.values()
     ]
     costs = [
@@ -58,17 +49,14 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
                 "id": s,
                 "revision": (revision := board.dataset["scenes"][s]),
                 "ceiling": release.ceiling_db(s, revision),
-                "sensor": release.sensor(s, revision) or _stated_sensor(board, s),
+                "sensor": release.sensor(s, revision)
+                or _distinct(r["sensors"][s] for row in board.rows for r in row.records if s in r.get("sensors", {})),
             }
             for s in board.scenes
         ],
         "published": published_values(board),
         "rows": [_row(row, board.scenes) for row in board.rows],
     }
-
-
-def _stated_sensor(board: Board, scene: str) -> str:
-    return _distinct(r["sensors"][scene] for row in board.rows for r in row.records if scene in r.get("sensors", {}))
 
 
 def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
@@ -144,16 +132,11 @@ def score_content(scores: ImageScores, comparison: Comparison | None) -> dict[st
     return {
         "images": scores.images,
         "rows": list(scores.values),
-        "values": [[_plain(scene) for scene in of_row] for of_row in scores.values.values()],
+        # [images] where there is one seed, else [images][seeds]
+        "values": [[s.tolist() if s.shape[1] > 1 else s[:, 0].tolist() for s in of] for of in scores.values.values()],
         "leftOut": {str(i): why for i, why in scores.left_out.items()},
         "better": [] if comparison is None else ["".join("01"[int(b)] for b in line) for line in comparison.better],
     }
-
-
-def _plain(scene: np.ndarray[Any, Any]) -> list[Any]:
-    """Return [images] where there is one seed, else [images][seeds]."""
-    values: list[Any] = (scene[:, 0] if scene.shape[1] == 1 else scene).tolist()
-    return values
 
 
 def details(board: Board) -> list[dict[str, Any]]:

@@ -130,13 +130,8 @@ def table_text(season: Season, results: Sequence[Result]) -> str:
     """Return the table of a season: the mean over its scenes, best first. Equal results give equal texts."""
     scenes = ", ".join(f"`{scene.id}`" for scene in season.scenes)
     header = ["rank", "method", "submitted as", *(METRICS[m].title for m in _SHOWN), "fit, s"]
-    lines = [
-        f"# Season {season.season}",
-        "",
-        f"Means over {scenes}; {PROTOCOL['name']}, version {PROTOCOL['version']}.",
-        "",
-    ]
-    lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    about = f"Means over {scenes}; {PROTOCOL['name']}, version {PROTOCOL['version']}."
+    lines = [f"# Season {season.season}", "", about, "", f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for position, result in enumerate(results, start=1):
         rank = str(position) if is_complete(result.record) else "-"
         seconds = [cell["fit_seconds"] for cell in result.record["scenes"].values()]

@@ -17,10 +17,6 @@ def test_shared_undoes_local(offset: float, drift: float, tick: float) -> None:
     assert abs(clock.shared(clock.local(tick)) - tick) < 1e-6
 
 
-def test_a_fast_clock_gains_its_drift_in_a_second() -> None:
-    assert abs(Clock(0.0, 50.0).local(20_000) - 20_001) < 1e-9
-
-
 def test_the_nearest_tick_of_the_camera_is_taken() -> None:
     rng = np.random.default_rng(0)
     for _ in range(200):

@@ -50,13 +50,6 @@ def test_distortion_is_opencvs_and_its_inverse_is_exact(values: tuple[float, ...
     np.testing.assert_allclose(found[alone], xy[alone], atol=1e-9)
 
 
-def test_the_inverse_is_opencvs() -> None:
-    bent = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 2))
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    expected = cv2.undistortPoints(bent[:, None], np.eye(3), np.array(BARREL), criteria=criteria)[:, 0]
-    np.testing.assert_allclose(undistort(bent, BARREL), expected, atol=1e-9)
-
-
 def test_nothing_is_seen_beyond_the_fold() -> None:
     lens = make_distortion([-0.3])
     fold = fold_radius(lens)
