@@ -95,11 +95,10 @@ class Dot:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points that a line joins, in their order, or single ones."""
+    """Points that a line joins, in their order."""
 
     name: str
     dots: tuple[Dot, ...]
-    joined: bool = True
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,7 @@ def _axes(across: Scale, up: Scale, x: Axis, y: Axis) -> Iterator[str]:
 def _curves(curves: Sequence[Curve], across: Scale, up: Scale) -> Iterator[str]:
     for i, curve in enumerate(curves):
         at = [(_x(across, d.x), _y(up, d.y)) for d in curve.dots]
-        if curve.joined and len(at) > 1:
+        if len(at) > 1:
             line = " ".join(f"{px:.1f},{py:.1f}" for px, py in at)
             dashed = ' class="dashed"' if i >= COLORS else ""
             yield f'<polyline points="{line}" fill="none" stroke="{_color(i)}" stroke-width="1.6"{dashed}/>'

@@ -34,11 +34,6 @@ class Box(NamedTuple):
     width: int
     height: int
 
-    @property
-    def area(self) -> int:
-        """Pixels."""
-        return self.width * self.height
-
     def of(self, image: NDArray[Value]) -> NDArray[Value]:
         """Return this part of an image [H, W, ...], a view."""
         return image[self.y : self.y + self.height, self.x : self.x + self.width]

@@ -43,7 +43,6 @@ from spike4dgs.leaderboard.tracks import RELEASE, current_release
 
 STATIC = Path(str(files("spike4dgs.leaderboard.page") / "static"))
 MARK = "data/boards.js"  # what tells a page's folder from any other
-FIRST_VIEW_BYTES = 1_500_000
 
 
 @dataclass(frozen=True)

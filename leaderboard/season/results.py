@@ -11,7 +11,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, read_json, write_json, write_text
-from spike4dgs.benchmark.method import Method, choose_device_for, get_method
+from spike4dgs.benchmark.method import Method, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
@@ -179,7 +179,7 @@ def score_season(
         if methods:
             chosen = [get_method(name) for name in methods]
             on = choose_device_for(chosen, device)
-            settings = Settings(runs_folder(secret), season.fit_seed, on, season.fit_budget)
+            settings = Settings(runs_folder(secret), season.fit_seed, on, make_budget(season.budget))
             failed = predict_all(open_committed(secret, season, training=True), chosen, settings)
             refused += [f"{name}: not fitted, see its log in {settings.out / 'logs'}" for name in sorted(failed)]
             ran = [settings.out / "predictions" / name for name in methods if name not in failed]

@@ -18,7 +18,6 @@ from typing import Any
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import json_text, read_json, write_json, write_text
-from spike4dgs.benchmark.method import Budget, make_budget
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT
 
@@ -148,11 +147,6 @@ class Season:
     def training_revisions(self) -> dict[str, str]:
         """The revision of each scene's training part, by scene id."""
         return {scene.id: scene.training_revision for scene in self.scenes}
-
-    @property
-    def fit_budget(self) -> Budget:
-        """The budget of methods that the maintainers run."""
-        return make_budget(self.budget)
 
 
 def season_folder(seasons: Path, number: int) -> Path:
