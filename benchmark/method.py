@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.plugins import Found, find_plugins
+from spike4dgs.benchmark.plugins import Plugin, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
@@ -179,7 +179,7 @@ def find_methods() -> dict[str, Method]:
     return {name: found.value for name, found in find_packaged_methods().items()}
 
 
-def find_packaged_methods() -> dict[str, Found]:
+def find_packaged_methods() -> dict[str, Plugin]:
     """Return the methods as `find_methods` does, each with the package that it comes from."""
     return find_plugins(GROUP, "method", lambda name, method, source: check_protocol(method, source))
 

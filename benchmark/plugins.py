@@ -11,7 +11,7 @@ from spike4dgs.benchmark.errors import problem
 
 
 @dataclass(frozen=True)
-class Found:
+class Plugin:
     """A registered value and the package that it comes from, such as "spike4dgs 0.1.0"."""
 
     value: Any
@@ -20,14 +20,14 @@ class Found:
 
 def find_plugins(
     group: str, kind: str, check: Callable[[str, Any, str], None], taken: Collection[str] = ()
-) -> dict[str, Found]:
+) -> dict[str, Plugin]:
     """Return all that is registered in a group, by name, in the order of the entry points' names.
 
     `kind` is the word for one of them in errors, `taken` has names that are in use, and `check(name, value, source)`
     raises UserError for a value that cannot be used. Raises UserError where a name is used twice, and where a package
     cannot be imported or names no mapping.
     """
-    plugins, fix = dict[str, Found](), "repair or uninstall the package that registers it"
+    plugins, fix = dict[str, Plugin](), "repair or uninstall the package that registers it"
     for entry in sorted(entry_points(group=group), key=lambda e: e.name):
         where = f"entry point {entry.name}"
         try:
@@ -40,7 +40,7 @@ def find_plugins(
             if name in plugins or name in taken:
                 raise problem(where, f"a new {kind} name", f"'{name}' twice", "rename one of them")
             check(name, value, source_of(entry))
-            plugins[name] = Found(value, f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value)
+            plugins[name] = Plugin(value, f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value)
     return plugins
 
 

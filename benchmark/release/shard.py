@@ -67,8 +67,18 @@ def write_shard(root: Path, name: str, files: Sequence[PlannedFile], advance: Ca
                 expected = f"{file.bytes} bytes with sha256 {file.sha256[:16]}..."
                 raise problem(file.source, expected, found, "the file was changed or damaged: make the scene again")
             blocks = blocks or [file.sha256]  # of an empty file
-            facts = (file.name, file.scene, file.path, file.camera)
-            members.append(Member(*facts, start, file.bytes, file.sha256, tuple(blocks)))
+            members.append(
+                Member(
+                    name=file.name,
+                    scene=file.scene,
+                    path=file.path,
+                    camera=file.camera,
+                    offset=start,
+                    bytes=file.bytes,
+                    sha256=file.sha256,
+                    blocks=tuple(blocks),
+                )
+            )
             write(bytes(-file.bytes % _TAR_BLOCK))
         write(bytes(2 * _TAR_BLOCK))  # the end of a tar
     digest = of_shard.hexdigest()

@@ -72,9 +72,18 @@ class Fitted:
 
 def make_order(job: Job, folder: SharedFolder, work: Path) -> Order:
     """Return the order for a job. Raises an exception where the method can neither be pickled nor found by its name."""
-    scene = job.scene
-    travels = (_pickled_or_named(job.method), scene.root.absolute(), scene.split, scene.revision)
-    return Order(*travels, job.seed, job.device, job.budget, job.key, folder, work.absolute())
+    return Order(
+        method=_pickled_or_named(job.method),
+        scene=job.scene.root.absolute(),
+        split=job.scene.split,
+        revision=job.scene.revision,
+        seed=job.seed,
+        device=job.device,
+        budget=job.budget,
+        key=job.key,
+        folder=folder,
+        work=work.absolute(),
+    )
 
 
 def fit_order(order: Order) -> Fitted | Failure:

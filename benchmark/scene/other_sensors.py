@@ -179,9 +179,15 @@ def find_events(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]
     found: dict[str, EventStream] = {}
     for camera in cameras if meta.get("events") else ():
         if (name := f"events/{camera}.npz") in files.files:
-            size, clock = (int(meta["width"]), int(meta["height"])), (float(meta["rate_hz"]), int(meta["n_ticks"]))
-            threshold = _fact(files, meta, "events", "threshold")
-            found[camera] = EventStream(camera, *size, *clock, threshold, files.only(name))
+            found[camera] = EventStream(
+                camera,
+                width=int(meta["width"]),
+                height=int(meta["height"]),
+                rate_hz=float(meta["rate_hz"]),
+                n_ticks=int(meta["n_ticks"]),
+                threshold=_fact(files, meta, "events", "threshold"),
+                files=files.only(name),
+            )
     return found
 
 

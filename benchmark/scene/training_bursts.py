@@ -164,12 +164,11 @@ def _checked(facts: BurstFacts) -> BurstFacts:
     """Return the facts. Raises ValueError for names that are none and for numbers out of bounds."""
     if not is_id(facts.world):
         raise ValueError(f"the world {shown(facts.world)}")
-    for value, most in (
-        *((n, MAX_SIDE) for n in (facts.width, facts.height)),
-        *((n, _MOST_VIEWS) for n in (facts.views, facts.rigs, facts.instants)),
-        (facts.spp, 1 << 20),
-    ):
-        whole(value, 1, most)
+    for side in (facts.width, facts.height):
+        whole(side, 1, MAX_SIDE)
+    for count in (facts.views, facts.rigs, facts.instants):
+        whole(count, 1, _MOST_VIEWS)
+    whole(facts.spp, 1, 1 << 20)
     for value in (facts.variant, facts.seed):
         whole(value, 0, 2**63)
     for gain in (facts.radiance_gain, facts.photons_per_spike):

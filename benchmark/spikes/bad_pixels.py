@@ -69,16 +69,15 @@ def deviation(stream: Recording) -> Float64:
 
     What the whole chip does, as under a lamp that flickers, does not count. Zero for fewer than two windows.
     """
-    edges = range(0, stream.n_ticks - WINDOW_TICKS + 1, WINDOW_TICKS)
+    starts = range(0, stream.n_ticks - WINDOW_TICKS + 1, WINDOW_TICKS)
     total = np.zeros((stream.height, stream.width))
-    square, levels = total.copy(), []
-    for start in edges:
+    square = total.copy()
+    for start in starts:
         counts = stream.counts(start, start + WINDOW_TICKS)
-        levels.append(float(counts.mean()))
-        own = counts - levels[-1]
+        own = counts - float(counts.mean())
         total += own
         square += own**2
-    n = max(len(edges), 1)
+    n = max(len(starts), 1)
     return np.asarray(np.sqrt(np.maximum(square / n - (total / n) ** 2, 0)))
 
 

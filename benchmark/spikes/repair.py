@@ -31,8 +31,8 @@ _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more th
 AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 
-def fill_gaps(stream: SpikeStream, longest: int = LONGEST_TICKS) -> SpikeStream:
-    """Return the stream with its missing ticks filled, in memory. Gaps longer than `longest` ticks remain listed."""
+def fill_gaps(stream: SpikeStream) -> SpikeStream:
+    """Return the stream with its missing ticks filled, in memory. Gaps longer than LONGEST_TICKS remain listed."""
     if not stream.gaps:
         return stream
     there = present(stream.gaps, stream.n_ticks)
@@ -41,7 +41,7 @@ def fill_gaps(stream: SpikeStream, longest: int = LONGEST_TICKS) -> SpikeStream:
     packed, pixels = np.array(stream.packed), stream.width * stream.height
     packed[~there] = 0
     in_threads(_fill, packed.shape[1], packed, starts, stops, pixels, small=pixels * len(starts) < _SMALL)
-    long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > longest]
+    long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > LONGEST_TICKS]
     gaps = tuple(g for g in stream.gaps if any(a <= g.first_tick < b for a, b in long))
     return replace(stream, packed=packed, gaps=gaps)
 
