@@ -63,7 +63,7 @@ class Release:
         return self.ceilings_db.get(scene) if self._has(scene, revision) else None
 
     def sensor(self, scene: str, revision: str) -> str | None:
-        """Return the sensor of a scene (`results.sensors.SENSORS`); None where the revision is not the release's.
+        """Return the sensor of a scene (`runs.record.SENSORS`); None where the revision is not the release's.
 
         `make-dataset` made all scenes of the releases so far with every term of the noise, which is its default.
         """

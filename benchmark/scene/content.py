@@ -8,7 +8,8 @@ Frames and events are outside because no track fits them, and because a value of
 rounding or a threshold on another processor.
 
 A stream's content is its bytes. That of an image or an .npz is its arrays, so another compression has the same hash;
-a mask's is the region that is scored. That of a recording of light or darkness is its counts (`spikes.counted`).
+a mask's is the region that is scored. That of a recording of light or darkness is its counts
+(`spikes.counted_recording`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """manifest.json: the size and SHA-256 of every file of a scene, and the hash of the content of encoded data.
 
 The hashes of contents make the revision without a file being decoded, or even there. A reader of a file checks its
-bytes; `identity.verify` decodes them too and checks what the manifest says of their content.
+bytes; `scene.verify` decodes them too and checks what the manifest says of their content.
 """
 
 from __future__ import annotations
