@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_renderer import FakeRenderer, files, render_fakes
+from changes import files_in
+from fake_renderer import FakeRenderer, render_fakes
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import read_geometry
@@ -75,7 +76,7 @@ class Stop(Exception):
 
 
 def test_resumes_after_an_interruption_at_every_step(fake, tmp_path):
-    whole = files(Maker(JOB, tmp_path / "whole", plain).make())
+    whole = files_in(Maker(JOB, tmp_path / "whole", plain).make())
     assert "manifest.json" in whole
 
     def one_step(stage, steps, total):
@@ -98,7 +99,7 @@ def test_resumes_after_an_interruption_at_every_step(fake, tmp_path):
             hidden.mkdir(parents=True, exist_ok=True)
             (hidden / ".000020.99.part.exr").write_bytes(b"left by a killed process")
     assert stops >= 8
-    assert files(folder) == whole
+    assert files_in(folder) == whole
 
 
 def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):
@@ -110,17 +111,17 @@ def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):
     other = Job("car", 0, 7, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
     with pytest.raises(Stop):
         Maker(other, tmp_path / "a", stop_at_truth).make()
-    mixed = files(Maker(JOB, tmp_path / "a", plain).make())
-    clean = files(Maker(JOB, tmp_path / "b", plain).make())
-    seven = files(Maker(other, tmp_path / "c", plain).make())
+    mixed = files_in(Maker(JOB, tmp_path / "a", plain).make())
+    clean = files_in(Maker(JOB, tmp_path / "b", plain).make())
+    seven = files_in(Maker(other, tmp_path / "c", plain).make())
     assert mixed == clean
     assert seven["spikes/cam_00.dat"] != clean["spikes/cam_00.dat"]
 
 
 def test_maps_that_are_off_leave_no_file_and_change_the_stream(fake, tmp_path):
     job = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds, gain_map=False, dark_map=False)
-    off = files(Maker(job, tmp_path / "off", plain).make())
-    on = files(Maker(JOB, tmp_path / "on", plain).make())
+    off = files_in(Maker(job, tmp_path / "off", plain).make())
+    on = files_in(Maker(JOB, tmp_path / "on", plain).make())
     assert off["spikes/cam_00.dat"] != on["spikes/cam_00.dat"]
     assert "truth/cam_00.npz" in on
     assert not [name for name in off if name.startswith("truth/")]
@@ -134,7 +135,7 @@ def test_two_processes_do_not_make_one_scene(fake, tmp_path):
 
 def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
     assert make("car", out=tmp_path) == 0
-    before = files(tmp_path / "car-0-tiny")
+    before = files_in(tmp_path / "car-0-tiny")
     report = json.loads((tmp_path / "car-0-tiny.report.json").read_text())
     assert set(report["stages_s"]) == {"background", "key frames", "ground truth", "streams", "description"}
     capsys.readouterr()
@@ -149,7 +150,7 @@ def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
     with pytest.raises(UserError, match=r"cam_02\.dat.*--replace"):
         make("car", out=tmp_path)
     assert make("car", out=tmp_path, replace=True) == 0
-    assert files(tmp_path / "car-0-tiny") == before
+    assert files_in(tmp_path / "car-0-tiny") == before
 
 
 def test_a_foreign_folder_is_never_touched(fake, tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_renderer import files
+from changes import files_in
 from scipy.ndimage import binary_erosion, map_coordinates
 
 from spike4dgs.benchmark.scene.images import read_geometry
@@ -38,7 +38,7 @@ def kill_when(process, pattern: str, folder: Path, count: int):
 
 @pytest.fixture(scope="module")
 def whole(tiny_data) -> dict[str, bytes]:
-    return files(tiny_data / "car-0-tiny")
+    return files_in(tiny_data / "car-0-tiny")
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
     kill_when(start(tmp_path, "--workers", "2"), "scene/images/*/*.exr", work, 1)
     output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
-    found = files(tmp_path / "car-0-tiny")
+    found = files_in(tmp_path / "car-0-tiny")
     assert found["manifest.json"] == whole["manifest.json"] and found == whole
 
 
@@ -99,4 +99,4 @@ def test_a_cluster_makes_the_same_scene(whole, tmp_path):
     with LocalCluster(**quiet, silence_logs=50) as cluster:
         output, _ = (process := start(tmp_path, "--scheduler", cluster.scheduler_address)).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
-    assert files(tmp_path / "car-0-tiny") == whole
+    assert files_in(tmp_path / "car-0-tiny") == whole

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from submissions import board, edit, edit_with_ledger, enter, entry_of, everything, read, release_of, submit
+from changes import edit_json, files_in
+from submissions import board, edit_with_ledger, enter, entry_of, read, release_of, submit
 from submitters import lost, make_results, same_boards, submit_under_fire
 
 from spike4dgs.benchmark.errors import UserError
@@ -41,7 +42,7 @@ def test_damaged_entries_are_refused_by_name_and_block_nobody(done: Path, change
 def test_a_label_that_was_edited_by_hand_is_noticed(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = enter(done, verified=False)
     verified = read(enter(done, "rough"))["verification"]
-    edit(path, lambda e: e.update(verification={**verified, "truth": {}}))
+    edit_json(path, lambda e: e.update(verification={**verified, "truth": {}}))
     enter(done, "bad", verified=False)
     assert "tfp+4dgs.json: expected an entry as LEDGER lists it" in capsys.readouterr().err
     assert [r["method"] for r in board(done)["boards"][0]["rows"]] == ["rough", "bad"]
@@ -65,12 +66,12 @@ def test_half_written_files_of_killed_processes_block_nobody(done: Path) -> None
     (done / "board/.leaderboard.9.part.json").write_text("{")
     enter(done, "rough")
     assert len(board(done)["boards"][0]["rows"]) == 2 and not board(done)["refused"]
-    assert not [name for name in everything(done / "board") if ".part" in name]
+    assert not [name for name in files_in(done / "board") if ".part" in name]
 
 
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "..", ".hidden", "", "a\n", "CON", "aux.v2", "name.", "x" * 101])
 def test_names_that_are_no_file_names_everywhere_are_refused(done: Path, name: str) -> None:
-    edit(done / "out/results/tfp+4dgs.json", lambda r: r["method"].update(name=name))
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r["method"].update(name=name))
     with pytest.raises(UserError) as e:
         enter(done, verified=False)
     assert "\n" not in str(e.value) and not (done / "board").exists()
@@ -78,11 +79,11 @@ def test_names_that_are_no_file_names_everywhere_are_refused(done: Path, name: s
 
 @pytest.mark.parametrize("name", ["../../../out", "/tmp/out", "a/b", "..", "other"])
 def test_the_datasets_name_leads_nowhere(done: Path, name: str) -> None:
-    before = everything(done)
-    edit(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"].update(name=name))
+    before = files_in(done)
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"].update(name=name))
     with pytest.raises(UserError, match=r"expected the name pattern-0\+pattern-1|at dataset/name"):
         enter(done, verified=False)
-    assert everything(done).keys() == before.keys()
+    assert files_in(done).keys() == before.keys()
 
 
 def test_names_that_differ_by_case_alone_are_refused(done: Path) -> None:

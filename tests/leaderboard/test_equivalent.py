@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from submissions import board, edit, edit_with_ledger, enter, read, track, write_release
+from changes import edit_json
+from submissions import board, edit_with_ledger, enter, read, track, write_release
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json
@@ -96,7 +97,7 @@ def test_another_noise_is_on_a_local_board(done: Path, monkeypatch: pytest.Monke
 def test_a_record_cannot_claim_it(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = ship(done, monkeypatch, 0.1)
     claim = {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
-    edit(done / "out/results/tfp+4dgs.json", lambda record: record["dataset"].update(equivalent=claim))
+    edit_json(done / "out/results/tfp+4dgs.json", lambda record: record["dataset"].update(equivalent=claim))
     for verified in (False, True):
         entry = read(enter(done, verified=verified, replace=True))
         assert "equivalent" not in entry["record"]["dataset"]

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, run
-from submissions import board, edit, enter, everything, read, release_of, submit
+from submissions import board, enter, read, release_of, submit
 
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
@@ -35,15 +36,15 @@ def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
 ) -> None:
     release_of(done, monkeypatch)
     enter(done)
-    public = everything(done / "board/entries")
+    public = files_in(done / "board/entries")
     release_of(done, monkeypatch, pattern_0="cd" * 32)
-    edit(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"]["scenes"].update({"pattern-0": "ab" * 32}))
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"]["scenes"].update({"pattern-0": "ab" * 32}))
     capsys.readouterr()
     assert submit(done / "out/results/tfp+4dgs.json", leaderboard=done / "board", replace=True) == 0
     out = capsys.readouterr().out
     assert f"pattern-0: revision {'ab' * 6} here, {'cd' * 6} in release 1" in out
     assert f"local board, in {done}/board/local.json, not on a track: local/pattern-0+1@" in out
-    assert everything(done / "board/entries") == public, "the track's entry is as it was"
+    assert files_in(done / "board/entries") == public, "the track's entry is as it was"
     (only,) = board(done)["boards"]
     assert only["track"] is None and only["why"].startswith("pattern-0: revision abab")
 
@@ -69,19 +70,19 @@ def test_without_files_an_entry_is_claimed(
 
 def test_submitting_twice_changes_nothing(done: Path) -> None:
     enter(done)
-    before = everything(done / "board")
+    before = files_in(done / "board")
     enter(done)
-    assert everything(done / "board") == before
+    assert files_in(done / "board") == before
     enter(done, verified=False)
-    assert everything(done / "board") == before, "a verified entry stays so"
+    assert files_in(done / "board") == before, "a verified entry stays so"
 
 
 def test_scoring_again_is_the_same_record(done: Path) -> None:
     enter(done)
-    before = everything(done / "board")
-    edit(done / "out/results/tfp+4dgs.json", lambda r: r.update(created="2031-01-01T00:00:00Z", command="another"))
+    before = files_in(done / "board")
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r.update(created="2031-01-01T00:00:00Z", command="another"))
     enter(done)
-    assert everything(done / "board") == before
+    assert files_in(done / "board") == before
 
 
 def test_a_claimed_entry_can_be_verified_later(done: Path) -> None:
@@ -120,7 +121,7 @@ def test_seeds_are_entries_of_one_row(done: Path) -> None:
 
 
 def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(done / "out/results/rough.json", lambda r: r["mean"].update(psnr=99.0))
+    edit_json(done / "out/results/rough.json", lambda r: r["mean"].update(psnr=99.0))
     results = {done / f"out/results/{n}.json": done / "out/predictions" / n for n in ("rough", "tfp+4dgs")}
     assert submit_all(results, scenes=(done / "s0", done / "s1"), leaderboard=done / "board") == 1
     captured = capsys.readouterr()
@@ -129,7 +130,7 @@ def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.Ca
 
 
 def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = everything(done)
+    before = files_in(done)
     monkeypatch.chdir(done)
     for name in ("", ".", "out", "s0/scene.json"):
         with pytest.raises(UserError, match="--leaderboard: expected a leaderboard or a new folder"):
@@ -140,7 +141,7 @@ def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pyt
     monkeypatch.chdir(done / "empty")
     with pytest.raises(UserError, match="the working folder"):
         submit(done / "out/results/rough.json", leaderboard=Path(""))
-    assert everything(done) == before
+    assert files_in(done) == before
 
 
 def test_the_default_folder_is_the_repositorys() -> None:
@@ -214,8 +215,8 @@ def test_a_second_fit_needs_the_files(done: Path, installed: dict[str, Any]) -> 
 
 
 def test_the_second_fit_has_the_records_seed(done: Path, installed: dict[str, Any]) -> None:
-    edit(done / "out/results/tfp+4dgs.json", lambda r: r["method"].update(seed=None))
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r["method"].update(seed=None))
     for info in (done / "out/predictions/tfp+4dgs").glob("*/prediction.json"):
-        edit(info, lambda p: p["method"].update(seed=None))
+        edit_json(info, lambda p: p["method"].update(seed=None))
     with pytest.raises(UserError, match="a scored cell with budget and seed"):
         enter(done, refit=True)

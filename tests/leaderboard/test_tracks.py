@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from changes import edit_json
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from submissions import edit, track, write_release
+from submissions import track, write_release
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.leaderboard import tracks
@@ -57,7 +58,7 @@ def test_a_release_that_was_edited_is_refused(tmp_path: Path) -> None:
     folder = write_release(tmp_path, {"a": track({"s": "0" * 64})})
     assert tracks.read_release(folder, "1").tracks[0].scenes == {"s": "0" * 64}
     tracks.read_release.cache_clear()
-    edit(folder / "1.json", lambda r: r["tracks"]["a"]["scenes"].update(s="1" * 64))
+    edit_json(folder / "1.json", lambda r: r["tracks"]["a"]["scenes"].update(s="1" * 64))
     with pytest.raises(UserError, match=r"1\.json: expected the bytes whose hash SHA256SUMS lists"):
         tracks.read_release(folder, "1")
 

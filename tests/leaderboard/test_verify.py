@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from changes import edit_json
 from dummy_methods import CountMethod, run
-from submissions import Record, board, edit, edit_with_ledger, enter, entry_of, read, release_of, submit
+from submissions import Record, board, edit_with_ledger, enter, entry_of, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
@@ -31,7 +32,7 @@ def better_psnr(record: Record) -> None:
 
 
 def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
-    edit(done / "out/results/tfp+4dgs.json", better_psnr)
+    edit_json(done / "out/results/tfp+4dgs.json", better_psnr)
     with pytest.raises(
         UserError, match=r"scene pattern-0, cam_03/0000\d0: expected psnr = .* as computed from the files"
     ):
@@ -47,7 +48,7 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
         record["scenes"]["pattern-0"]["metrics"]["psnr"] += 1e-7 / 3
         record["mean"]["psnr"] += 1e-7 / 6
 
-    edit(done / "out/results/tfp+4dgs.json", nudge)
+    edit_json(done / "out/results/tfp+4dgs.json", nudge)
     assert read(enter(done))["verification"]["label"] == "re-scored"
 
 
@@ -69,7 +70,7 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
     ],
 )
 def test_records_that_the_files_contradict_are_refused(done: Path, change: Any, message: str) -> None:
-    edit(done / "out/results/tfp+4dgs.json", change)
+    edit_json(done / "out/results/tfp+4dgs.json", change)
     with pytest.raises(UserError) as e:
         enter(done)
     assert message in str(e.value) and "\n" not in str(e.value)
@@ -141,7 +142,7 @@ def better_metaiqa(record: Record) -> None:
 
 def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done: Path, weights: Path) -> None:
     run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
-    edit(done / "out/results/with.json", better_metaiqa)
+    edit_json(done / "out/results/with.json", better_metaiqa)
     with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
         enter(done, "with")
     torch.manual_seed(1)
@@ -207,7 +208,7 @@ def test_what_submit_writes_has_no_problems(
 )
 def test_every_edit_by_hand_is_named(done: Path, change: Any, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = enter(done)
-    edit(path, change)
+    edit_json(path, change)
     lines = problems(done, capsys)
     assert any("tfp+4dgs.json" in line and message in line for line in lines)
     assert any("local.json: expected what the entries give" in line for line in lines), "its row is gone"
@@ -215,7 +216,7 @@ def test_every_edit_by_hand_is_named(done: Path, change: Any, message: str, caps
 
 def test_boards_follow_from_the_entries(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = enter(done)
-    edit(done / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
+    edit_json(done / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
     (line,) = problems(done, capsys)
     assert "local.json: expected what the entries give" in line
     enter(done)

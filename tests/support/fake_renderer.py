@@ -69,8 +69,3 @@ class FakeRenderer:
     def geometry(self, t_s, dt_s):
         flow = np.zeros((*self.shape, 2), np.float32)
         return self.depths(t_s), self.object_masks(t_s).astype(np.uint32), flow
-
-
-def files(folder):
-    """Return relative path -> bytes of every file, hidden ones included."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from changes import edit_json
 
 from spike4dgs.benchmark.files import sha256_json, write_json
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -42,21 +43,11 @@ def read(path: Path) -> dict[str, Any]:
     return read_entry(board, path.relative_to(board).as_posix(), read_ledger(board))
 
 
-def edit(path: Path, change: Any) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    write_json(path, data)
-
-
 def edit_with_ledger(path: Path, change: Any) -> None:
     """Change an entry as somebody who also knows the ledger would."""
-    edit(path, change)
+    edit_json(path, change)
     board = path.parents[2]
     add_line(board, sha256_json(json.loads(path.read_text())), path.relative_to(board).as_posix())
-
-
-def everything(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def board(done: Path, name: str = "local") -> dict[str, Any]:

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from changes import flip_bit
 
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release import check
@@ -31,9 +32,7 @@ def test_a_packed_release_is_good(release_folder: Path, capsys: pytest.CaptureFi
 
 def test_a_flipped_bit_is_found(copy: Path) -> None:
     path = sorted(copy.glob("shards/*/*.tar"))[1]
-    data = bytearray(path.read_bytes())
-    data[100_000] ^= 1
-    path.write_bytes(data)
+    flip_bit(path, 100_000)
     assert [line for line in find_problems(copy) if path.name in line and "sha256" in line]
 
 

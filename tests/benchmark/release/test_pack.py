@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import flip_bit
 from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
@@ -135,12 +136,8 @@ def test_a_run_goes_on_where_it_was_killed(
 
 
 def test_a_damaged_scene_is_not_packed(scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
-    root = tmp_path / "pattern-1"
-    shutil.copytree(scene_folders[1], root)
-    stream = root / "spikes/cam_02.dat"
-    data = bytearray(stream.read_bytes())
-    data[1000] ^= 1
-    stream.write_bytes(data)
+    root = Path(shutil.copytree(scene_folders[1], tmp_path / "pattern-1"))
+    flip_bit(root / "spikes/cam_02.dat", 1000)
     with pytest.raises(UserError, match=r"cam_02.dat: expected .* sha256 .*, found .*; the file was changed"):
         pack([open_scene(root)], tmp_path / "out", "1", 6_000_000)
     assert not list((tmp_path / "out").rglob("*.part*"))

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import flip_bit
 from fake_hub import REPOSITORY, serve_hub
 from range_server import Behaviour, serve
 
@@ -271,9 +272,8 @@ class TestWhatIsThere:
     ) -> None:
         fetch(str(release_folder), tmp_path)
         long, short = tmp_path / "pattern-0/spikes/cam_00.dat", tmp_path / "pattern-1/scene.json"
-        data = bytearray(long.read_bytes())
-        data[BLOCK + 7] ^= 1
-        long.write_bytes(data + b"more")
+        flip_bit(long, BLOCK + 7)
+        long.write_bytes(long.read_bytes() + b"more")
         short.write_bytes(b"{}")
         report = fetch(str(release_folder), tmp_path)
         assert tree(tmp_path) == whole

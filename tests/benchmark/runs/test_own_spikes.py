@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json
 from small_scenes import TICKS
 
 from spike4dgs.benchmark.errors import UserError
@@ -99,9 +100,8 @@ def test_truth_that_is_not_wanted_is_not_read(small_scene: Path, tmp_path: Path)
 
 
 def test_gaps_of_the_held_out_camera_leave_images_out(small_scene: Path, tmp_path: Path) -> None:
-    meta = json.loads((small_scene / "scene.json").read_text())
-    meta["gaps"] = [{"camera": "cam_03", "first_tick": 44, "ticks": 2, "reason": "lost"}]
-    write_json(small_scene / "scene.json", meta)
+    gap = {"camera": "cam_03", "first_tick": 44, "ticks": 2, "reason": "lost"}
+    edit_json(small_scene / "scene.json", lambda meta: meta.update(gaps=[gap]))
     write_manifest(small_scene)
     scene = open_scene(small_scene, allow_gaps=True)
     per_image = cell_of(predict(tmp_path / "p", scene, scene.targets, scene), scene)["per_image"]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json, flip_bit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
@@ -107,10 +108,7 @@ def test_missing_and_extra_predictions_are_named(folder: Path) -> None:
 
 
 def test_a_flipped_byte_is_refused_by_name(folder: Path) -> None:
-    path = folder / "cam_03/000060.exr"
-    data = bytearray(path.read_bytes())
-    data[-5] ^= 1
-    path.write_bytes(data)
+    flip_bit(folder / "cam_03/000060.exr", -5)
     found = open_predictions(folder, TARGETS)
     with pytest.raises(UserError, match=r"cam_03/000060\.exr: expected sha256"):
         found.read(TARGETS[2])
@@ -165,8 +163,7 @@ def test_the_smallest_description_of_another_program_is_enough(folder: Path) -> 
     ],
 )
 def test_a_bad_description_is_refused(folder: Path, key: str, value: object, found_at: str) -> None:
-    data = json.loads((folder / INFO).read_text())
-    (folder / INFO).write_text(json.dumps({**data, key: value}))
+    edit_json(folder / INFO, lambda info: info.update({key: value}))
     with pytest.raises(
         UserError, match=rf"prediction\.json: expected a valid spike4dgs-prediction/1, found at {found_at}"
     ):

@@ -15,6 +15,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
+from changes import flip_bit
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
 from rich.console import Console
 from small_scenes import write_small_scene
@@ -254,10 +255,7 @@ def test_two_runs_cannot_share_a_folder(small_scene: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["spikes/cam_01.dat", "images/cam_03/000040.exr", "masks/cam_03/000020.png"])
 def test_a_damaged_scene_is_refused_before_any_work(small_scene: Path, tmp_path: Path, name: str) -> None:
-    path = small_scene / name
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 4
-    path.write_bytes(data)
+    flip_bit(small_scene / name, (small_scene / name).stat().st_size // 2)
     method = CountMethod()
     with pytest.raises(UserError, match=name):
         run(tmp_path / "out", [small_scene], method)

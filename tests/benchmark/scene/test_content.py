@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import shutil
 import struct
@@ -17,13 +16,14 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
+from changes import edit_json, flip_bit
 from full_scene import write_full_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import write_bytes, write_json
+from spike4dgs.benchmark.files import write_bytes
 from spike4dgs.benchmark.scene.content import data_files, hash_arrays
 from spike4dgs.benchmark.scene.images import read_channels, read_mask, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -57,21 +57,11 @@ def revision(scene: Path, change: Change | None = None) -> str:
 
 
 def edit(name: str, change: Callable[[dict[str, Any]], Any]) -> Change:
-    def apply(root: Path) -> None:
-        data = json.loads((root / name).read_text())
-        change(data)
-        write_json(root / name, data)
-
-    return apply
+    return lambda root: edit_json(root / name, change)
 
 
 def flip(name: str, bit: int) -> Change:
-    def apply(root: Path) -> None:
-        data = bytearray((root / name).read_bytes())
-        data[bit // 8 % len(data)] ^= 1 << bit % 8
-        (root / name).write_bytes(data)
-
-    return apply
+    return lambda root: flip_bit(root / name, bit // 8 % (root / name).stat().st_size, bit % 8)
 
 
 def recompress(root: Path) -> None:

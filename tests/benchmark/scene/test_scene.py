@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from changes import edit_json as change_json
+from changes import flip_bit
 from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.images import read_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
@@ -86,9 +87,7 @@ def edit_json(name: str, edit: Callable[[dict[str, Any]], Any], rehash: bool = T
     """Change a description file, and make the manifest agree, as a program that writes foreign scenes would."""
 
     def apply(root: Path) -> None:
-        data = json.loads((root / name).read_text())
-        edit(data)
-        write_json(root / name, data)
+        change_json(root / name, edit)
         if rehash:
             write_manifest(root)
 
@@ -99,9 +98,8 @@ def edit_bytes(name: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], No
     return lambda root: (root / name).write_bytes(edit((root / name).read_bytes())) and None
 
 
-def flip(data: bytes) -> bytes:
-    middle = len(data) // 2
-    return data[:middle] + bytes([data[middle] ^ 8]) + data[middle + 1 :]
+def flip(name: str) -> Callable[[Path], None]:
+    return lambda root: flip_bit(root / name, (root / name).stat().st_size // 2, 3)
 
 
 def remove(name: str) -> Callable[[Path], None]:
@@ -187,13 +185,13 @@ def test_a_scene_that_is_none_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("damage", "name", "message"),
     [
-        (edit_bytes("spikes/cam_01.dat", flip), "spikes/cam_01.dat", "expected sha256"),
+        (flip("spikes/cam_01.dat"), "spikes/cam_01.dat", "expected sha256"),
         (edit_bytes("spikes/cam_01.dat", lambda b: b[:-120]), "spikes/cam_01.dat", "bytes (truncated)"),
         (edit_bytes("spikes/cam_01.dat", lambda b: b + b"\0"), "spikes/cam_01.dat", "bytes (longer)"),
         (remove("spikes/cam_01.dat"), "spikes/cam_01.dat", "no such file"),
-        (edit_bytes("images/cam_03/000020.exr", flip), "images/cam_03/000020.exr", "expected sha256"),
+        (flip("images/cam_03/000020.exr"), "images/cam_03/000020.exr", "expected sha256"),
         (remove("images/cam_03/000020.exr"), "images/cam_03/000020.exr", "no such file"),
-        (edit_bytes("masks/cam_03/000020.png", flip), "masks/cam_03/000020.png", "expected sha256"),
+        (flip("masks/cam_03/000020.png"), "masks/cam_03/000020.png", "expected sha256"),
         (remove("masks/cam_03/000020.png"), "masks/cam_03/000020.png", "no such file"),
     ],
 )
@@ -229,7 +227,7 @@ def test_gaps_can_be_accepted(small_scene: Path) -> None:
 def test_any_change_changes_the_revision(small_scene: Path, tmp_path: Path) -> None:
     before = open_scene(small_scene).revision
     assert open_scene(write_small_scene(tmp_path / "again")).revision == before, "same seed, same bytes"
-    edit_bytes("spikes/cam_00.dat", flip)(small_scene)
+    flip("spikes/cam_00.dat")(small_scene)
     write_manifest(small_scene)
     assert open_scene(small_scene).revision != before
 

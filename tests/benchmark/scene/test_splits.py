@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from changes import edit_json
 from dummy_methods import CountMethod
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +17,6 @@ from run_command import run_benchmark
 from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
@@ -159,9 +159,7 @@ def test_the_files_say_which_images_belong_to_which_split(scene: Path, tmp_path:
     ],
 )
 def test_targets_that_do_not_fit_the_splits_are_refused(scene: Path, edit: Any, message: str) -> None:
-    data = json.loads((scene / "targets.json").read_text())
-    edit(data)
-    write_json(scene / "targets.json", data)
+    edit_json(scene / "targets.json", edit)
     write_manifest(scene)
     with pytest.raises(UserError) as e:
         open_scene(scene)
@@ -218,8 +216,7 @@ def test_predictions_of_another_split_are_refused(
     assert main(["score", str(folder), str(scene), "--split", "views-3", "--out", str(out)]) == 0
     assert "split views-3" in capsys.readouterr().out
     assert json.loads(out.read_text())["dataset"]["split"] == "views-3"
-    info = json.loads((folder / "prediction.json").read_text())
-    write_json(folder / "prediction.json", {k: v for k, v in info.items() if k != "split"})
+    edit_json(folder / "prediction.json", lambda info: info.pop("split"))
     assert main(["score", str(folder), str(scene)]) == 0, "no split means the default one"
     assert main(["score", str(folder), str(scene), "--split", "views-3"]) == 2
     assert main(["score", str(folder), str(scene), "--split", "left"]) == 2

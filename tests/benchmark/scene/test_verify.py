@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from changes import edit_json
 from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import sha256_file, write_json
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.verify import verify_content
@@ -26,9 +26,7 @@ def full(tmp_path: Path) -> Path:
 
 
 def edit_manifest(root: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
-    data = json.loads((root / "manifest.json").read_text())
-    edit(data["files"])
-    write_json(root / "manifest.json", data)
+    edit_json(root / "manifest.json", lambda manifest: edit(manifest["files"]))
 
 
 def test_a_forged_content_is_found(full: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,15 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import files_in
 from page_boards import board, cell, row
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.leaderboard.page import site
 from spike4dgs.leaderboard.page.site import script, write_site
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def small() -> list[site.Board]:
@@ -37,7 +34,7 @@ def test_a_page_is_replaced_and_equal_boards_give_equal_bytes(tmp_path: Path) ->
     write_site(out, [*small(), *small()])
     write_site(out, small())
     write_site(tmp_path / "again", small())
-    assert files(out) == files(tmp_path / "again")
+    assert files_in(out) == files_in(tmp_path / "again")
     (tmp_path / "other").mkdir()
     (tmp_path / "other/mine.txt").touch()
     with pytest.raises(UserError, match="an earlier page"):

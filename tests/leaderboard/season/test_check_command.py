@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from changes import edit_json, flip_bit
 from fake_renderer import render_fakes
 from made_season import NUMBER, Made
 
-from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli.season import check, reveal
@@ -34,12 +34,6 @@ def over(scored: Made) -> Made:
 def checked(made: Made, **options: Any) -> int:
     given = {"scenes": made.root / "scenes", "predictions": made.root / "runs/predictions", **options}
     return check(NUMBER, seasons=made.seasons, **given)
-
-
-def change_json(path: Path, change: Callable[[Any], object]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    write_json(path, data)
 
 
 def test_all_is_right(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
@@ -89,7 +83,7 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
 
 def changed(name: str, change: Callable[[Any], object]) -> Callable[[Made], None]:
     """Change a public JSON file of the season."""
-    return lambda over: change_json(over.public / name, change)
+    return lambda over: edit_json(over.public / name, change)
 
 
 def other_opening(over: Made) -> None:
@@ -97,10 +91,7 @@ def other_opening(over: Made) -> None:
 
 
 def stream(over: Made) -> None:
-    path = over.root / "scenes" / SCENE / "spikes/cam_04.dat"
-    data = bytearray(path.read_bytes())
-    data[7] ^= 1
-    path.write_bytes(data)
+    flip_bit(over.root / "scenes" / SCENE / "spikes/cam_04.dat", 7)
 
 
 def stream_and_manifest(over: Made) -> None:
@@ -115,12 +106,12 @@ def truth_behind_an_honest_manifest(over: Made) -> None:
     shutil.copyfile(scene / "images/cam_04/000040.exr", scene / "images/cam_04/000020.exr")
     write_manifest(scene)
     name = "images/cam_04/000020.exr"
-    change_json(scene / "manifest.json", lambda d: d["files"][name].update(content=before[name]["content"]))
+    edit_json(scene / "manifest.json", lambda d: d["files"][name].update(content=before[name]["content"]))
 
 
 def source_seed(over: Made) -> None:
     """The revision is that of the content, so the seed that scene.json states is checked on its own."""
-    change_json(over.root / "scenes" / SCENE / "scene.json", lambda d: d["source"].update(seed="5"))
+    edit_json(over.root / "scenes" / SCENE / "scene.json", lambda d: d["source"].update(seed="5"))
     write_manifest(over.root / "scenes" / SCENE)
 
 
@@ -139,7 +130,7 @@ def value(over: Made) -> None:
         cell["metrics"]["psnr"] += 0.3 / len(cell["per_image"])
         data["record"]["mean"] = dataset_means(data["record"]["scenes"])
 
-    change_json(over.public / "results/counts.json", raise_one)
+    edit_json(over.public / "results/counts.json", raise_one)
     write_table(over.seasons, over.season)
 
 

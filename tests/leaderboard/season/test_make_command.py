@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_renderer import files, render_fakes
+from changes import files_in
+from fake_renderer import render_fakes
 from made_season import NUMBER, WORLDS, Made
 
 from spike4dgs.benchmark.errors import UserError
@@ -43,8 +44,8 @@ def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
 
 
 def test_no_secret_is_in_the_public_folder(made: Made) -> None:
-    drawn, public = read_opening(made.secret / OPENING_NAME), b"".join(files(made.seasons).values()).decode()
-    assert list(files(made.seasons)) == [f"{NUMBER}/season.json"]
+    drawn, public = read_opening(made.secret / OPENING_NAME), b"".join(files_in(made.seasons).values()).decode()
+    assert list(files_in(made.seasons)) == [f"{NUMBER}/season.json"]
     for secret in (drawn.salt, *(s.seed for s in drawn.scenes)):
         assert secret not in public and f"{int(secret, 16 if secret == drawn.salt else 10):x}" not in public
 
@@ -73,12 +74,12 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
 
 
 def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
-    before = files(made.root)
+    before = files_in(made.root)
     assert command(made) == 0 and "complete, kept" in capsys.readouterr().out
-    assert files(made.root) == before
+    assert files_in(made.root) == before
     with pytest.raises(UserError, match=r"expected the commitment .* choose another number or --secret"):
         command(made, secret=made.root / "another")
-    assert files(made.seasons) == {f"{NUMBER}/season.json": before[f"seasons/{NUMBER}/season.json"]}
+    assert files_in(made.seasons) == {f"{NUMBER}/season.json": before[f"seasons/{NUMBER}/season.json"]}
 
 
 @pytest.mark.parametrize(

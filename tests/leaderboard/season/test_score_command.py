@@ -1,17 +1,15 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, run
-from fake_renderer import files
 from made_season import NUMBER, Made
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
@@ -19,10 +17,6 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import reveal, score
 from spike4dgs.leaderboard.season.results import predict_all, read_results
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
-
-
-def edit(path: Path, **changes: Any) -> None:
-    write_json(path, json.loads(path.read_text()) | changes)
 
 
 def test_scores_are_those_of_whole_scenes(scored: Made, tmp_path: Path) -> None:
@@ -57,19 +51,19 @@ def test_the_table_ranks_by_psnr(scored: Made) -> None:
 
 
 def test_a_name_is_scored_once(scored: Made, capsys: pytest.CaptureFixture[str]) -> None:
-    before = files(scored.seasons)
-    assert scored.score("counts") == 0 and files(scored.seasons) == before
+    before = files_in(scored.seasons)
+    assert scored.score("counts") == 0 and files_in(scored.seasons) == before
     capsys.readouterr()
     tuned = CountMethod("counts", steps=2)
     scenes = open_committed(scored.secret, scored.season, training=True)
     predict_all(scenes, [tuned], Settings(scored.root / "runs", budget=Budget()))
-    assert scored.score("counts") == 1 and files(scored.seasons) == before
+    assert scored.score("counts") == 1 and files_in(scored.seasons) == before
     assert "a name is scored once in a season: submit under another one" in capsys.readouterr().err
 
 
 def test_one_participants_mistake_does_not_stop_another(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
     folder = made.root / "runs/predictions/counts/car-9003-tiny"
-    edit(folder / "prediction.json", scene_revision="0" * 64)
+    edit_json(folder / "prediction.json", lambda p: p.update(scene_revision="0" * 64))
     assert made.score("counts", "rough") == 1
     assert "expected predictions for scene revision" in capsys.readouterr().err
     assert [r.name for r in read_results(made.seasons, made.season)] == ["rough"]
@@ -118,7 +112,7 @@ def test_nothing_is_scored_after_the_reveal(scored: Made) -> None:
 
 
 def test_hidden_streams_take_methods_only(made: Made) -> None:
-    edit(made.public / "season.json", streams="hidden")
+    edit_json(made.public / "season.json", lambda s: s.update(streams="hidden"))
     with pytest.raises(UserError, match="expected a season with published streams"):
         made.score("counts")
 
@@ -130,9 +124,7 @@ def test_nothing_to_score_is_an_error(made: Made) -> None:
 
 @pytest.mark.parametrize("folder", [scene_folder, training_folder])
 def test_another_scene_than_the_committed_one_is_not_scored(folder: Any, made: Made) -> None:
-    data = json.loads((made.public / "season.json").read_text())
     key = "revision" if folder is scene_folder else "training_revision"
-    data["scenes"][1][key] = "0" * 64
-    write_json(made.public / "season.json", data)
+    edit_json(made.public / "season.json", lambda season: season["scenes"][1].update({key: "0" * 64}))
     with pytest.raises(UserError, match=r"turntable-9003-tiny: expected revision 0000.*, as committed"):
         score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("nearest-view",), device="cpu")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_renderer import files
+from changes import files_in, flip_bit
 from made_season import Made
 
 from spike4dgs.benchmark.errors import UserError
@@ -39,7 +39,7 @@ def part(made: Made) -> Scene:
 
 def test_no_byte_of_the_truth_is_in_it(made: Made, whole: Scene, part: Scene) -> None:
     """Files are a training camera's recordings, byte for byte, or descriptions; no other file's bytes are anywhere."""
-    inside, outside = files(part.root), files(whole.root)
+    inside, outside = files_in(part.root), files_in(whole.root)
     recordings = {name for name in inside if name in outside and inside[name] == outside[name]}
     allowed = {name for name in outside if any(f"/{c}." in name for c in whole.train)} - {
         name for name in outside if name.startswith("truth/")
@@ -57,7 +57,7 @@ def test_no_byte_of_the_truth_is_in_it(made: Made, whole: Scene, part: Scene) ->
 
 def test_the_seed_is_not_in_it(made: Made, part: Scene) -> None:
     drawn = read_opening(made.secret / OPENING_NAME)
-    everything = b"".join(files(training_folder(made.secret, SCENE)).values())
+    everything = b"".join(files_in(training_folder(made.secret, SCENE)).values())
     for seed in drawn.scenes:
         assert seed.seed.encode() not in everything
         for order in ("little", "big"):
@@ -107,12 +107,9 @@ def test_refinement_needs_the_held_out_stream(whole: Scene, part: Scene) -> None
 
 def test_equal_scenes_have_equal_parts_and_others_do_not(whole: Scene, part: Scene, tmp_path: Path) -> None:
     again = write_training_part(whole, tmp_path / SCENE)
-    assert files(again.root) == files(part.root)
-    copy = tmp_path / "changed"
-    shutil.copytree(whole.root, copy)
-    stream = bytearray((copy / "spikes/cam_00.dat").read_bytes())
-    stream[100] ^= 1
-    (copy / "spikes/cam_00.dat").write_bytes(stream)
+    assert files_in(again.root) == files_in(part.root)
+    copy = Path(shutil.copytree(whole.root, tmp_path / "changed"))
+    flip_bit(copy / "spikes/cam_00.dat", 100)
     write_manifest(copy)
     assert write_training_part(open_scene(copy), tmp_path / "other").revision != part.revision
 
@@ -133,7 +130,7 @@ def test_a_pack_unpacks_to_the_scene(small_scene: Path, tmp_path: Path) -> None:
     digest = pack_scene(scene, tmp_path / "s.tar")
     assert digest == sha256_file(tmp_path / "s.tar")
     subprocess.run(["tar", "xf", "s.tar"], cwd=tmp_path, check=True)
-    assert files(tmp_path / scene.id) == files(small_scene)
+    assert files_in(tmp_path / scene.id) == files_in(small_scene)
 
 
 def test_equal_scenes_have_equal_packs(small_scene: Path, tmp_path: Path) -> None:

@@ -1,0 +1,29 @@
+"""Changes that tests make to files, and a folder's files as bytes, to see that nothing else changed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from spike4dgs.benchmark.files import write_json
+
+
+def edit_json(path: Path, change: Callable[[Any], object]) -> None:
+    """Change the value of a JSON file in place."""
+    value = json.loads(path.read_text())
+    change(value)
+    write_json(path, value)
+
+
+def flip_bit(path: Path, byte: int, bit: int = 0) -> None:
+    """Flip one bit of a file; negative bytes count from its end."""
+    data = bytearray(path.read_bytes())
+    data[byte] ^= 1 << bit
+    path.write_bytes(data)
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    """Return relative path -> bytes of every file, hidden ones included."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
