@@ -90,19 +90,12 @@ SPAN_WINDOW = 20  # ticks that the judged intervals cover
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A camera's response to light, as its recordings of light and darkness tell.
+    """A camera's response to light, as its recordings of light and darkness tell."""
 
-    Attributes:
-        white: [H, W], spikes per tick that a pixel adds under radiance 1.
-        dark: [H, W], spikes per tick in the dark.
-        unit: spikes per tick of white of the whole array, the unit of errors.
-        good: [H, W], neither dead nor hot.
-    """
-
-    white: Float64
-    dark: Float64
-    unit: float
-    good: Mask
+    white: Float64  # [H, W] spikes per tick that a pixel adds under radiance 1
+    dark: Float64  # [H, W] spikes per tick in the dark
+    unit: float  # spikes per tick of white of the whole array, the unit of errors
+    good: Mask  # [H, W] neither dead nor hot
 
     def rate(self, radiance: Float64) -> Float64:
         """Return the spikes per tick under radiance in [0, 1]: at most one a tick."""
@@ -151,19 +144,12 @@ TOLERANCE = 0.05  # radiance; a render that is 26 dB good. Far below it the dark
 
 @dataclass(frozen=True, eq=False)
 class SpikeView:
-    """What was recorded around a target, and the mean radiance in [0, 1] that a prediction has over the same time.
-
-    Attributes:
-        recorded: counts and spans.
-        counted: predicted mean radiance [H, W] over each window that has counts.
-        spanned: predicted mean radiance over each pixel's span; None where no span was recorded.
-        true_spanned: the truth's mean over it; None where the truth is not known.
-    """
+    """What was recorded around a target, and the mean radiance in [0, 1] that a prediction has over the same time."""
 
     recorded: Recorded
-    counted: Mapping[int, Float64]
-    spanned: Float64 | None = None
-    true_spanned: Float64 | None = None
+    counted: Mapping[int, Float64]  # predicted mean radiance [H, W] over each window that has counts
+    spanned: Float64 | None = None  # and over each pixel's span; None where no span was recorded
+    true_spanned: Float64 | None = None  # the truth's mean over it; None where the truth is not known
 
     def count_error(self, window: int) -> Float64:
         """Return recorded minus predicted rate of a window [H, W], in the unit of white.

@@ -55,17 +55,11 @@ def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A camera's response to light, as estimated from its recordings.
+    """A camera's response to light, as estimated from its recordings."""
 
-    Attributes:
-        gain: [H, W], relative sensitivity, mean 1.
-        dark: [H, W], spikes per tick in the dark.
-        radiance_gain: spikes per tick of a pixel of gain 1 at radiance 1, without the dark rate.
-    """
-
-    gain: Float32
-    dark: Float32
-    radiance_gain: float
+    gain: Float32  # [H, W] relative sensitivity, mean 1
+    dark: Float32  # [H, W] spikes per tick in the dark
+    radiance_gain: float  # spikes per tick of a pixel of gain 1 at radiance 1, without the dark rate
 
     def radiance(self, rate: Float32) -> Float32:
         """Return the linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""

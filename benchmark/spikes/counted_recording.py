@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Int32, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -27,23 +28,14 @@ _AGAIN = "restore it or make the scene again"
 
 @dataclass(frozen=True, eq=False)
 class CountedRecording:
-    """The spikes of a recording, counted. Images have row 0 at the top.
+    """The spikes of a recording, counted. Images have row 0 at the top."""
 
-    Attributes:
-        first: [H, W] int32, tick of a pixel's first spike; -1 where it has none.
-        last: [H, W] int32, tick of its last spike; -1 where it has none.
-        total: [H, W] int32, its spikes.
-        windows: [N, H, W] uint8, its spikes in each whole window of WINDOW_TICKS, from tick 0 on.
-        n_ticks: length of the recording.
-        source: the file, for messages.
-    """
-
-    first: NDArray[np.int32]
-    last: NDArray[np.int32]
-    total: NDArray[np.int32]
-    windows: NDArray[np.uint8]
+    first: Int32  # [H, W] tick of a pixel's first spike; -1 where it has none
+    last: Int32  # [H, W] tick of its last spike; -1 where it has none
+    total: Int32  # [H, W] its spikes
+    windows: UInt8  # [N, H, W] its spikes in each whole window of WINDOW_TICKS, from tick 0 on
     n_ticks: int
-    source: str = "memory"
+    source: str = "memory"  # the file, for messages
 
     @property
     def width(self) -> int:
@@ -72,11 +64,8 @@ class CountedRecording:
             expected = f"whole windows of {WINDOW_TICKS} ticks within [0, {self.n_ticks}) of a counted recording"
             raise problem(self.source, expected, f"[{start}, {stop})", "use the raw recording (.dat)")
         if to_end:
-            before: NDArray[np.int64] = self.windows[:first].sum(axis=0, dtype=np.int64)
-            rest: NDArray[np.int64] = self.total - before
-            return rest
-        counts: NDArray[np.int64] = self.windows[first:last].sum(axis=0, dtype=np.int64)
-        return counts
+            return np.asarray(self.total - self.windows[:first].sum(axis=0, dtype=np.int64))
+        return np.asarray(self.windows[first:last].sum(axis=0, dtype=np.int64))
 
     def taken(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> CountedRecording:
         """Return the recording whose pixel [i, j] has the spikes of pixel (y[i, j], x[i, j])."""

@@ -51,13 +51,8 @@ def draw_weights(
     A replicate draws as many scenes as there are with replacement, for each of them its images, and for each its seeds.
     Its mean is the mean over the drawn scenes of the mean over the drawn images and seeds, so weights sum to 1.
 
-    Args:
-        images: The number of images of each scene.
-        seeds: The number of seeds.
-        most_seeds: The largest number of seeds of any method: with it, methods share the draws of scenes and images.
-        replicates: The number of resampled means.
-        scenes: Draw scenes too; otherwise each counts once.
-        seed: Of the draws.
+    `images` has the number of each scene's. `most_seeds`, the largest number of any method's, lets methods share the
+    draws of scenes and images. Without `scenes` each scene counts once.
     """
     n_scenes, longest = len(images), max(images)
     stride = 1 + longest + most_seeds
