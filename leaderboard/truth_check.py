@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.runs.predictions import Predictions
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
-Renderings = tuple[Target, NDArray[np.float32], NDArray[np.float32]]
+Renderings = tuple[Target, Float32, Float32]
 SecondRenderings = Callable[[Scene], Renderings | None]
 _WINDOW = 3  # px of the high-pass: texture that predictions blur is left out, Monte Carlo noise is white
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Mask, UInt8
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.error_map import absolute_error, choose_scale, error_image
 from spike4dgs.benchmark.runs.record import Cell, Record
@@ -39,7 +39,7 @@ class Box(NamedTuple):
         return image[self.y : self.y + self.height, self.x : self.x + self.width]
 
 
-def crops(moving: Sequence[NDArray[np.bool_]]) -> list[Box | None]:
+def crops(moving: Sequence[Mask]) -> list[Box | None]:
     """Return a box around what moves in each image [H, W] of a clip, all of one size; None where nothing does.
 
     The box is the same in all images where that costs little (`STILL`), so that the motion is seen; otherwise it
@@ -71,7 +71,7 @@ def _centred(box: Box, w: int, h: int, width: int, height: int) -> Box:
     return Box(min(max(x, 0), width - w), min(max(y, 0), height - h), w, h)
 
 
-def bounds(mask: NDArray[np.bool_]) -> Box | None:
+def bounds(mask: Mask) -> Box | None:
     """Return the smallest box around the pixels that are true; None where there are none."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import (
     device_type,
     environment,
@@ -228,7 +228,7 @@ def _provenance(job: Job, fit_seconds: float) -> Provenance:
     )
 
 
-def _render(model: Model, camera: Camera, t_us: float, where: str) -> NDArray[np.float32]:
+def _render(model: Model, camera: Camera, t_us: float, where: str) -> Float32:
     image: Any = model.render(camera, t_us)
     shape = (camera.height, camera.width)
     if not isinstance(image, np.ndarray) or image.shape != shape or not np.issubdtype(image.dtype, np.floating):

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Float32, Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene
@@ -25,7 +25,7 @@ MAX_MS = 10.0  # of the image
 class Refinable(Protocol):
     """A model that can estimate the pose of an image."""
 
-    def refine(self, camera: Camera, image: NDArray[np.float32], background: NDArray[np.bool_], t_us: float) -> Camera:
+    def refine(self, camera: Camera, image: Float32, background: Mask, t_us: float) -> Camera:
         """Return a camera near `camera` that renders `image` [H, W] at `t_us`, by the pixels in `background` [H, W]."""
         ...
 

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
@@ -86,7 +85,7 @@ def estimate(recordings: Recordings) -> Calibration:
     return Calibration((light / mean).astype(np.float32), dark_rate.astype(np.float32), mean / recordings.flat_radiance)
 
 
-def rates(recording: Recording) -> NDArray[np.float64]:
+def rates(recording: Recording) -> Float64:
     """Return spikes per tick [H, W] under steady light; a pixel without spikes counts as having half of one."""
     first, last, total = first_last_total(recording)
     span = np.maximum(last - first, 1)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Mask, UInt8, UInt32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.untrusted import MAX_SIDE
@@ -29,7 +29,7 @@ class Geometry:
     """Depth, object ids and flow of a view at an instant."""
 
     depth: Float32  # [H, W] metres along the optical axis; inf where there is nothing
-    ids: NDArray[np.uint32]  # [H, W] 0 where nothing moves, otherwise the moving object (scene.json: "instances")
+    ids: UInt32  # [H, W] 0 where nothing moves, otherwise the moving object (scene.json: "instances")
     flow: Float32  # [H, W, 2] motion of the surface point in pixels (x right, y down)
 
 
@@ -74,7 +74,7 @@ def read_rgb(path: Path, shape: Shape | None = None) -> Float32:
     return np.stack([found[name].astype(np.float32) for name in "RGB"], axis=-1)
 
 
-def write_geometry(path: Path, depth: Float32, ids: NDArray[np.uint32], flow: Float32, t_us: float) -> None:
+def write_geometry(path: Path, depth: Float32, ids: UInt32, flow: Float32, t_us: float) -> None:
     """Write depth [H, W], ids [H, W] and flow [H, W, 2] as EXR (ZIP): Z, flow.x, flow.y float32, id uint32.
 
     Raises UserError where the shapes differ, for NaN, and for flow that is not finite.
@@ -203,12 +203,12 @@ def _read_png(path: Path, what: str, shape: Shape | None, modes: tuple[str, ...]
         raise problem(path, what, f"damaged data ({str(e)[:200]})", _AGAIN) from None
 
 
-def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+def write_mask(path: Path, mask: Mask) -> None:
     """Write a mask [H, W] as 8-bit PNG (0 and 255)."""
     write_png(path, mask.astype(np.uint8) * 255)
 
 
-def read_mask(path: Path, shape: Shape | None = None) -> NDArray[np.bool_]:
+def read_mask(path: Path, shape: Shape | None = None) -> Mask:
     """Read a mask [H, W]. Raises UserError where it is missing, damaged, or not of that `shape` (if given)."""
     return _read_png(path, "a mask image", shape) > 127
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from spike4dgs.benchmark.arrays import Float32, Float64
+from spike4dgs.benchmark.arrays import Float32, Float64, Mask
 
 T = TypeVar("T", bound=np.generic)
 Distortion = tuple[float, ...]  # k1, k2, p1, p2, k3; empty: a pinhole
@@ -121,7 +121,7 @@ def _newton_step(xy: Float64, missing: Float64, lens: Distortion) -> Float64:
     return np.stack([yy * a - xy_ * b, xx * b - xy_ * a], axis=-1) / (xx * yy - xy_ * xy_)[..., None]
 
 
-def inside(at: Float64, width: int, height: int) -> NDArray[np.bool_]:
+def inside(at: Float64, width: int, height: int) -> Mask:
     """Return which positions [..., 2] px lie within an image."""
     return np.asarray((at >= 0).all(-1) & (at[..., 0] <= width) & (at[..., 1] <= height))
 
@@ -144,7 +144,7 @@ def resample(image: Float32, at: Float64) -> Float32:
     return np.asarray(found, np.float32)
 
 
-def _filled(image: Float32, known: NDArray[np.bool_]) -> Float32:
+def _filled(image: Float32, known: Mask) -> Float32:
     """Return an image without NaN: unknown pixels get the mean of the known ones around, or of all."""
     weight = uniform_filter(known.astype(np.float64), 5)
     mean = uniform_filter(np.where(known, image, 0.0).astype(np.float64), 5)

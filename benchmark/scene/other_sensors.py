@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Int64, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import decode_srgb, read_png
@@ -127,10 +127,10 @@ _AGAIN = "restore it or make the scene again"
 class Events(NamedTuple):
     """Events in order of time."""
 
-    t: NDArray[np.int64]  # microseconds from the start of the clip
+    t: Int64  # microseconds from the start of the clip
     x: NDArray[np.uint16]  # column
     y: NDArray[np.uint16]  # row, 0 at the top
-    p: NDArray[np.uint8]  # 1: brighter, 0: darker
+    p: UInt8  # 1: brighter, 0: darker
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,7 @@ class EventStream:
         return found
 
     @property
-    def ticks(self) -> NDArray[np.int64]:
+    def ticks(self) -> Int64:
         """The tick that contains each event."""
         return (self.events.t * (self.rate_hz * 1e-6)).astype(np.int64)
 

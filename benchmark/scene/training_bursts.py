@@ -33,7 +33,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Float64
+from spike4dgs.benchmark.arrays import Float32, Float64, Half, Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, parse_json
 from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_SIDE, check_header, is_id, positive, shown, whole
@@ -82,7 +82,7 @@ class Burst:
 
     keys: Float32  # [k, V, H, W] radiance at k ticks, evenly from -REACH to REACH around the instant
     depth: Float32  # [V, H, W] metres along the optical axis at the instant, inf: nothing
-    moving: NDArray[np.bool_]  # [V, H, W] stored for this instant: shows something that moves, its shadow, or is near
+    moving: Mask  # [V, H, W] stored for this instant: shows something that moves, its shadow, or is near
     w2c: Float64  # [V, 4, 4]
     K: Float64  # [V, 3, 3]
     gain: Float32  # [V, H, W] relative sensitivity
@@ -227,6 +227,6 @@ def stack_bursts(rigs: Sequence[Sequence[Burst]], backgrounds: Sequence[tuple[Fl
     return arrays
 
 
-def _half(depth: Float32) -> NDArray[np.float16]:
+def _half(depth: Float32) -> Half:
     with np.errstate(over="ignore"):  # beyond 65 km there is nothing
         return depth.astype(np.float16)

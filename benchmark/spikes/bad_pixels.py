@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float64, Mask
+from spike4dgs.benchmark.arrays import Float64, Int64, Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.counted_recording import WINDOW_TICKS, Recording
 from spike4dgs.benchmark.spikes.gaps import present
@@ -48,7 +47,7 @@ class BadPixels:
         return self.dead | self.hot | self.flickering
 
 
-def total_counts(stream: Recording) -> NDArray[np.int64]:
+def total_counts(stream: Recording) -> Int64:
     """Return the spikes per pixel of a whole stream [H, W]."""
     counts = np.zeros((stream.height, stream.width), np.int64)
     for start in range(0, stream.n_ticks, _LONGEST_WINDOW):

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Int32, UInt8
+from spike4dgs.benchmark.arrays import Int32, Int64, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -53,7 +53,7 @@ class CountedRecording:
         ticks: NDArray[Any] = np.array(self.n_ticks, np.int64)
         return {"first": self.first, "last": self.last, "total": self.total, "windows": self.windows, "n_ticks": ticks}
 
-    def counts(self, start: int, stop: int) -> NDArray[np.int64]:
+    def counts(self, start: int, stop: int) -> Int64:
         """Return the spikes per pixel in ticks [start, stop) as [H, W], as `SpikeStream.counts` does.
 
         Raises UserError unless the ticks are whole windows, or windows and all that follows.
@@ -88,7 +88,7 @@ def counted(recording: Recording) -> CountedRecording:
     return CountedRecording(first, last, total, windows, recording.n_ticks, recording.source)
 
 
-def first_last_total(recording: Recording) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def first_last_total(recording: Recording) -> tuple[Int64, Int64, Int64]:
     """Return the ticks of each pixel's first and last spike (-1: none), and the number of its spikes, each [H, W]."""
     if isinstance(recording, CountedRecording):
         return tuple(x.astype(np.int64) for x in (recording.first, recording.last, recording.total))  # type: ignore[return-value]

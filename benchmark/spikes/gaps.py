@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.untrusted import MAX_TICKS, whole
 
@@ -44,12 +44,12 @@ def read_gaps(records: Sequence[Mapping[str, Any]], n_ticks: Mapping[str, int], 
     Raises UserError where a record is none, names no camera of the recording, leaves its clip or overlaps another.
     """
 
-    def gap(record: Mapping[str, Any]) -> Gap:
+    def parse(record: Mapping[str, Any]) -> Gap:
         first, ticks = (whole(record[key], 0, MAX_TICKS) for key in ("first_tick", "ticks"))
         return Gap(str(record["camera"]), first, ticks, str(record["reason"]))
 
     try:
-        gaps = sorted(map(gap, records))
+        gaps = sorted(map(parse, records))
     except (KeyError, TypeError, ValueError) as e:
         raise problem(path, "gaps {camera, first_tick, ticks, reason}", repr(e), "restore the file") from None
     for i, gap in enumerate(gaps):
@@ -70,7 +70,7 @@ def refuse_gaps(gaps: Sequence[Gap], path: Path, allow_gaps: bool) -> None:
         raise problem(path, "a recording without gaps", found, fix)
 
 
-def present(gaps: Iterable[Gap], n_ticks: int) -> NDArray[np.bool_]:
+def present(gaps: Iterable[Gap], n_ticks: int) -> Mask:
     """Return which ticks of one camera's clip have data: [n_ticks] bool."""
     mask = np.ones(n_ticks, np.bool_)
     for gap in gaps:

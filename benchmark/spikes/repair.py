@@ -15,9 +15,8 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Int64, UInt8
+from spike4dgs.benchmark.arrays import Int64, Mask, UInt8
 from spike4dgs.benchmark.spikes.bits import find_spike, in_threads, kernel
 from spike4dgs.benchmark.spikes.counted_recording import CountedRecording, Recording
 from spike4dgs.benchmark.spikes.gaps import present
@@ -108,7 +107,7 @@ def _shift(total: int, n: int, length: float) -> float:
     return min(max((even - total) / (n + 1), -1.0), 1.0)
 
 
-def fill_pixels(stream: AnyRecording, bad: NDArray[np.bool_] | None) -> AnyRecording:
+def fill_pixels(stream: AnyRecording, bad: Mask | None) -> AnyRecording:
     """Return the stream, in memory, whose pixels of a mask [H, W] fire as their nearest pixel outside of it does.
 
     Of a counted recording the counts are those of that pixel.

@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Int32, UInt8
+from spike4dgs.benchmark.arrays import Int32, Int64, UInt8
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -27,8 +26,8 @@ _BLOCK = 64  # bytes of a tick, 512 pixels, whose spikes are gathered at a time
 class SpikeTimes:
     """The spikes of all pixels, one pixel after the other, in the stored order of pixels."""
 
-    ticks: NDArray[np.int32]  # [N] ascending within a pixel
-    starts: NDArray[np.int64]  # [P + 1] pixel p has ticks[starts[p]:starts[p + 1]]
+    ticks: Int32  # [N] ascending within a pixel
+    starts: Int64  # [P + 1] pixel p has ticks[starts[p]:starts[p + 1]]
 
 
 @lru_cache(maxsize=1)
@@ -45,7 +44,7 @@ def spike_times(stream: SpikeStream) -> SpikeTimes:
 
 
 @kernel
-def _count(packed: UInt8, counts: NDArray[np.int64], start: int, stop: int) -> None:
+def _count(packed: UInt8, counts: Int64, start: int, stop: int) -> None:
     first, end = start * _BLOCK, min(stop * _BLOCK, packed.shape[1])
     for t in range(len(packed)):
         for byte in range(first, end):
@@ -56,7 +55,7 @@ def _count(packed: UInt8, counts: NDArray[np.int64], start: int, stop: int) -> N
 
 
 @kernel
-def _gather(packed: UInt8, starts: NDArray[np.int64], ticks: NDArray[np.int32], start: int, stop: int) -> None:
+def _gather(packed: UInt8, starts: Int64, ticks: Int32, start: int, stop: int) -> None:
     first, end, pixels = start * _BLOCK, min(stop * _BLOCK, packed.shape[1]), len(starts) - 1
     at = starts[8 * first : min(8 * end, pixels)].copy()
     for t in range(len(packed)):

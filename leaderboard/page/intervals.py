@@ -24,9 +24,8 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float64, UInt32
+from spike4dgs.benchmark.arrays import Float64, Int64, Mask, UInt32
 
 
 def hashed(counters: UInt32, seed: int) -> UInt32:
@@ -97,15 +96,15 @@ class Comparison:
 
     means: Float64
     half_widths: Float64
-    better: NDArray[np.bool_]
+    better: Mask
 
     @property
-    def best_ranks(self) -> NDArray[np.int64]:
+    def best_ranks(self) -> Int64:
         """One more than the number of methods that are better."""
         return np.asarray(1 + self.better.sum(0))
 
     @property
-    def worst_ranks(self) -> NDArray[np.int64]:
+    def worst_ranks(self) -> Int64:
         """The number of methods, less those that are worse."""
         return np.asarray(len(self.means) - self.better.sum(1))
 
