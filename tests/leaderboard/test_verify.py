@@ -9,7 +9,7 @@ import pytest
 import torch
 from changes import edit_json
 from dummy_methods import CountMethod, run
-from submissions import Record, board, edit_with_ledger, enter, entry_of, read, release_of, submit
+from submissions import board, edit_with_ledger, enter, entry_of, raise_metric, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
@@ -21,18 +21,8 @@ from spike4dgs.cli.verify_leaderboard import verify_leaderboard
 from spike4dgs.leaderboard import tracks
 
 
-def better_psnr(record: Record) -> None:
-    """A forgery that agrees with itself."""
-    cells = record["scenes"].values()
-    for cell in cells:
-        for values in cell["per_image"].values():
-            values["psnr"] += 0.01
-        cell["metrics"]["psnr"] += 0.01
-    record["mean"]["psnr"] += 0.01
-
-
 def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
-    edit_json(done / "out/results/tfp+4dgs.json", better_psnr)
+    edit_json(done / "out/results/tfp+4dgs.json", lambda record: raise_metric(record, "psnr", 0.01))
     with pytest.raises(
         UserError, match=r"scene pattern-0, cam_03/0000\d0: expected psnr = .* as computed from the files"
     ):
@@ -42,13 +32,7 @@ def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
 
 
 def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
-    def nudge(record: Record) -> None:
-        values = record["scenes"]["pattern-0"]["per_image"]["cam_03/000020"]
-        values["psnr"] += 1e-7
-        record["scenes"]["pattern-0"]["metrics"]["psnr"] += 1e-7 / 3
-        record["mean"]["psnr"] += 1e-7 / 6
-
-    edit_json(done / "out/results/tfp+4dgs.json", nudge)
+    edit_json(done / "out/results/tfp+4dgs.json", lambda record: raise_metric(record, "psnr", 1e-7))
     assert read(enter(done))["verification"]["label"] == "re-scored"
 
 
@@ -132,17 +116,9 @@ def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
     assert enter(done, "with").read_bytes() == before, "what was verified stays so"
 
 
-def better_metaiqa(record: Record) -> None:
-    for cell in record["scenes"].values():
-        for values in cell["per_image"].values():
-            values["metaiqa"] += 0.25
-        cell["metrics"]["metaiqa"] += 0.25
-    record["mean"]["metaiqa"] += 0.25
-
-
 def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done: Path, weights: Path) -> None:
     run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
-    edit_json(done / "out/results/with.json", better_metaiqa)
+    edit_json(done / "out/results/with.json", lambda record: raise_metric(record, "metaiqa", 0.25))
     with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
         enter(done, "with")
     torch.manual_seed(1)
@@ -229,17 +205,8 @@ def test_a_forgery_that_agrees_with_itself_is_found_with_the_files(
     done: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An entry edited together with its ledger line and its board: only scoring again finds it."""
-
-    def better(entry: dict[str, Any]) -> None:
-        record = entry["record"]
-        for cell in record["scenes"].values():
-            for values in cell["per_image"].values():
-                values["psnr"] += 1
-            cell["metrics"]["psnr"] += 1
-        record["mean"]["psnr"] += 1
-
     path = enter(done)
-    edit_with_ledger(path, better)
+    edit_with_ledger(path, lambda entry: raise_metric(entry["record"], "psnr", 1))
     enter(done, "rough")  # writes the boards anew
     assert not problems(done, capsys)
     (line,) = problems(done, capsys, **files(done))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changes import flip_bit
+from changes import files_in, flip_bit
 from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
@@ -27,12 +27,6 @@ from spike4dgs.benchmark.scene.verify import verify_content
 from spike4dgs.cli import main
 from spike4dgs.cli.verify import verify
 from spike4dgs.generators.recorder.sources import DARK, emulated_source
-
-
-def tree(root: Path) -> dict[str, bytes]:
-    """The files below a folder by path, without lock files."""
-    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != ".download.lock")
-    return {p.relative_to(root).as_posix(): p.read_bytes() for p in files}
 
 
 def lists(root: Path) -> list[dict]:
@@ -93,13 +87,13 @@ def test_the_same_scenes_give_the_same_bytes(
     release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
 ) -> None:
     pack(open_scenes(scene_folders), tmp_path / "again", "1", 6_000_000)
-    assert tree(tmp_path / "again") == tree(release_folder)
+    assert files_in(tmp_path / "again") == files_in(release_folder)
 
 
 def test_sums_are_those_of_sha256sum(release_folder: Path) -> None:
     done = subprocess.run(["sha256sum", "--strict", "-c", SUMS], cwd=release_folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-    assert set(tree(release_folder)) - {SUMS} == {line.split("  ")[1] for line in _lines(release_folder / SUMS)}
+    assert set(files_in(release_folder)) - {SUMS} == {line.split("  ")[1] for line in _lines(release_folder / SUMS)}
 
 
 def _lines(path: Path) -> list[str]:
@@ -131,7 +125,7 @@ def test_a_run_goes_on_where_it_was_killed(
     times.pop()
     damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
     pack(open_scenes(scene_folders), out, "1", 6_000_000)
-    assert tree(out) == tree(release_folder)
+    assert files_in(out) == files_in(release_folder)
     assert len(kept) == 1 and [path.stat().st_mtime_ns for path in kept] == times, "a finished shard stays"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changes import flip_bit
+from changes import files_in, flip_bit
 from fake_hub import REPOSITORY, serve_hub
 from range_server import Behaviour, serve
 
@@ -42,8 +42,7 @@ def fetch(
 
 
 def tree(root: Path) -> dict[str, bytes]:
-    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != ".download.lock")
-    return {p.relative_to(root).as_posix(): p.read_bytes() for p in files}
+    return {name: data for name, data in files_in(root).items() if name != ".download.lock"}
 
 
 @pytest.fixture(scope="session")
