@@ -223,7 +223,7 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_fisheye_coefficients_are_opencvs(tmp_path: Path) -> None:
+def test_fisheye_coefficients_are_opencvs() -> None:
     from spike4dgs.benchmark.exchange.foreign_camera import fisheye_distortion
 
     k, xy = np.array([0.1, -0.02, 0.003, -0.001]), np.random.default_rng(3).uniform(-1, 1, (50, 2))

@@ -165,7 +165,7 @@ def test_a_damaged_file_is_one_clear_error(content: bytes, tmp_path: Path) -> No
         read_fingerprint(tmp_path / "f.npz")
 
 
-def test_a_file_of_another_format_is_refused(scene: Scene, tmp_path: Path) -> None:
+def test_a_file_of_another_format_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "f.npz", head=np.frombuffer(b'{"format": "other"}', np.uint8))
     with pytest.raises(UserError, match="format 'other'"):
         read_fingerprint(tmp_path / "f.npz")

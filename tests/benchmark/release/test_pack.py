@@ -101,7 +101,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def test_a_run_goes_on_where_it_was_killed(
-    release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
 ) -> None:
     code = (
         "import os, signal, sys; from pathlib import Path\n"
@@ -137,9 +137,7 @@ def test_a_damaged_scene_is_not_packed(scene_folders: tuple[Path, ...], tmp_path
     assert not list((tmp_path / "out").rglob("*.part*"))
 
 
-def test_what_is_there_is_not_overwritten(
-    release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
-) -> None:
+def test_what_is_there_is_not_overwritten(scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="found notes.txt; choose another --out"):
         pack(open_scenes(scene_folders), tmp_path, "1", 6_000_000)

@@ -57,7 +57,7 @@ def total(files: dict[str, bytes]) -> int:
     return sum(map(len, files.values()))
 
 
-def test_scenes_come_out_as_they_were(whole: dict[str, bytes], scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
+def test_scenes_come_out_as_they_were(whole: dict[str, bytes], scene_folders: tuple[Path, ...]) -> None:
     for root in scene_folders:
         for path in root.glob("spikes/*.dat"):
             assert whole[f"{root.name}/spikes/{path.name}"] == path.read_bytes()

@@ -37,7 +37,7 @@ def part(made: Made) -> Scene:
     return open_scene(training_folder(made.secret, SCENE))
 
 
-def test_no_byte_of_the_truth_is_in_it(made: Made, whole: Scene, part: Scene) -> None:
+def test_no_byte_of_the_truth_is_in_it(whole: Scene, part: Scene) -> None:
     """Files are a training camera's recordings, byte for byte, or descriptions; no other file's bytes are anywhere."""
     inside, outside = files_in(part.root), files_in(whole.root)
     recordings = {name for name in inside if name in outside and inside[name] == outside[name]}
