@@ -25,7 +25,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
 from spike4dgs.benchmark.runs.record import read_record
-from spike4dgs.benchmark.runs.refinement import MAX_TICKS, free_ticks
+from spike4dgs.benchmark.runs.refinement import free_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import read_exr
 from spike4dgs.benchmark.scene.lens import resample
@@ -229,15 +229,15 @@ def test_refinement_without_background_pixels_is_refused() -> None:
 
 @given(st.sets(st.integers(0, 59), max_size=30), st.integers(60, 400))
 def test_the_image_comes_from_the_longest_time_without_targets(ticks: set[int], n_ticks: int) -> None:
-    start, stop = free_ticks(sorted(ticks), n_ticks)
+    start, stop = free_ticks(sorted(ticks), n_ticks, 200)
     assert 0 <= start < stop <= n_ticks and not ticks & set(range(start, stop))
     runs = "".join("x" if t in ticks else "." for t in range(n_ticks)).split("x")
-    assert stop - start == min(MAX_TICKS, max(map(len, runs)))
+    assert stop - start == min(200, max(map(len, runs)))
 
 
 def test_a_clip_of_targets_alone_is_refused() -> None:
     with pytest.raises(UserError, match="ticks that are not scored"):
-        free_ticks(range(10), 10)
+        free_ticks(range(10), 10, 200)
 
 
 class SeenFrom(CountModel):
