@@ -20,8 +20,8 @@ MOVED = {
     "speed simulate": "report speed-error --only sensor sensor-spikezoo",
     "speed decode": "report speed-error --only decoding",
     "speed metrics": "report speed-error --only scale-metrics flip",
-    "speed tfi": "report speed-error --only stacks",
-    "speed tfp": "report speed-error --only stacks",
+    "speed tfi": "speed images",
+    "speed tfp": "speed images",
 }
 
 COMMANDS: dict[str, Command] = {

@@ -32,7 +32,7 @@ def plan() -> Sequence[Measurement]:
         (
             *(splat.precision, splat.gradients, cuts.exponential, cuts.extent, cuts.transmittance, cuts.pixel_filter),
             *(splat.background, splat.beside_torch, networks.fused_ssim, networks.lookup, networks.msdi_images),
-            *(images.makers, images.stacks, images.half_floats, *fits.FITS),
+            *(images.makers, images.half_floats, *fits.FITS),
             *(sensor.integration, sensor.other_program, keys.keys, rendering.savings, rendering.soft_light),
             *(scores.scores, scores.flip_score, scores.decoding),
             *(growth.pixels, growth.gaussians, growth.views, growth.threads),

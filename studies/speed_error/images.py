@@ -1,4 +1,4 @@
-"""Images from spikes: windows against noise and blur, stacks against plain numpy, and the numbers that hold them."""
+"""Images from spikes: windows against noise and blur, and the numbers that hold them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.baselines.images.tfi import tfi_stack
-from spike4dgs.baselines.images.tfp import HALF_WINDOW, count_stack, tfp_image, tfp_stack
+from spike4dgs.baselines.images.tfp import HALF_WINDOW, tfp_image
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import encode_srgb
@@ -19,7 +18,6 @@ from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Series, compared, measurement
 from spike4dgs.studies.kit.timing import by_turns_ms
-from spike4dgs.studies.speed_error.scores import unpack_plainly
 
 GROUP = "Images from spikes"
 Maker = Callable[[Scene, Target], Float32]
@@ -44,27 +42,6 @@ def fired_stream(ticks: int, width: int, height: int, seed: int = 0) -> SpikeStr
 def held_out(scene: Scene, target: Target) -> tuple[SpikeStream, int, float]:
     """Return the stream, the tick and the gain that a maker gets for a scored image."""
     return scene.stream(target.camera), target.tick, scene.radiance_gain
-
-
-def tfp_plainly(stream: SpikeStream) -> Float32:
-    """Return TFP at every tick from numpy's cumulative sum of the unpacked clip."""
-    sums = np.zeros((stream.n_ticks + 1, stream.height, stream.width), np.int32)
-    np.cumsum(unpack_plainly(stream), axis=0, dtype=np.int32, out=sums[1:])
-    t = np.arange(stream.n_ticks)
-    first, last = np.maximum(t - HALF_WINDOW, 0), np.minimum(t + HALF_WINDOW, stream.n_ticks)
-    return ((sums[last] - sums[first]) / (last - first)[:, None, None].astype(np.float32)).astype(np.float32)
-
-
-def tfi_plainly(stream: SpikeStream) -> Float32:
-    """Return TFI at every tick inside complete intervals, NaN elsewhere, by running maxima over the unpacked clip."""
-    fired = unpack_plainly(stream)
-    t = np.arange(len(fired), dtype=np.float32)[:, None, None]
-    last = np.maximum.accumulate(np.where(fired, t, -np.inf), axis=0)
-    before = np.concatenate([np.full_like(last[:1], -np.inf), last[:-1]])
-    after = np.minimum.accumulate(np.where(fired, t, np.inf)[::-1], axis=0)[::-1]
-    with np.errstate(invalid="ignore"):
-        rate = (1 / (after - before)).astype(np.float32)
-    return np.where(np.isfinite(after) & np.isfinite(before), rate, np.float32(np.nan))
 
 
 def _window(half_window: int, scene: Scene, target: Target) -> Float32:
@@ -132,46 +109,6 @@ def rms_errors(scene: Scene, targets: Any, make: Maker) -> dict[str, float | Non
         squares["rms"].append(float(off.mean()))
         squares["moving"] += [float(off[moving].mean())] if moving.any() else []
     return {k: math.sqrt(float(np.mean(v))) if v else None for k, v in squares.items()}
-
-
-@measurement(
-    "stacks",
-    GROUP,
-    "Images at every tick",
-    (*TIMES, Column("max", "largest difference, spikes per tick")),
-    ("max",),
-    (2, 10, 60),
-)
-def stacks(request: Request) -> Iterator[Series]:
-    """TFP and TFI of a whole clip from packed bits, in float32, by running sums.
-
-    The same images by plain numpy from the unpacked clip.
-
-    Counts are integers and divisions are rounded once: nothing is lost, and the time is that of the result's memory, so
-    that memory which is given again is fastest.
-
-    tests/baselines/images
-    """
-    width, height, ticks = request.pick((24, 16, 60), (200, 125, 400), (400, 250, 1000))
-    stream = fired_stream(ticks, width, height, request.seed)
-    out = np.empty((ticks, height, width), np.float32)
-    t = np.arange(ticks)
-    lengths = (np.minimum(t + HALF_WINDOW, ticks) - np.maximum(t - HALF_WINDOW, 0))[:, None, None]
-
-    def error(found: Any, exact: Any) -> dict[str, float]:
-        rates = found / lengths.astype(np.float32) if found.dtype == np.uint8 else found
-        return {"max": float(np.nanmax(np.abs(rates - exact)))}
-
-    counts: dict[str, Any] = {"as counts, 8 bits": partial(count_stack, stream)}
-    for name, plainly, ours, more in (("tfp", tfp_plainly, tfp_stack, counts), ("tfi", tfi_plainly, tfi_stack, {})):
-        calls = {
-            "numpy, unpacked": partial(plainly, stream),
-            "from packed bits": partial(ours, stream),
-            "into given memory": partial(ours, stream, out=out),
-            **more,
-        }
-        title = f"{name} at {ticks} ticks of {width}x{height}"
-        yield compared(title, calls, error, request.pick(1, 3, 5), "into given memory")
 
 
 @measurement(

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from slow_images import slow_tfi, slow_tfp
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.baselines.images.tfi import tfi_image, tfi_stack
-from spike4dgs.baselines.images.tfp import TfpSettings, count_stack, tfp_image, tfp_stack
+from spike4dgs.baselines.images.tfi import tfi_image
+from spike4dgs.baselines.images.tfp import TfpSettings, tfp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.settings import Settings
@@ -29,31 +29,16 @@ def stream_of(spikes: np.ndarray, bottom_up: bool = True) -> SpikeStream:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 50), st.integers(1, 19), st.integers(1, 21), st.booleans(), st.integers(0, 9), st.integers(1, 60))
-def test_stacks_and_images_equal_the_slow_twins(
+def test_images_equal_the_slow_twins(
     n: int, height: int, width: int, bottom_up: bool, seed: int, half_window: int
 ) -> None:
     spikes = random_spikes(n, height, width, seed)
     stream = stream_of(spikes, bottom_up)
-    tfp, tfi, counts = tfp_stack(stream, half_window), tfi_stack(stream), count_stack(stream, half_window)
-    assert tfp.dtype == tfi.dtype == np.float32
     for tick in {0, 1, n // 2, n - 2, n - 1} & set(range(n)):
-        expected = slow_tfp(spikes, tick, half_window)
-        np.testing.assert_allclose(tfp[tick], expected, rtol=2e-7)
-        np.testing.assert_array_equal(tfp_image(stream, tick, half_window), tfp[tick])
-        length = min(n, tick + half_window) - max(0, tick - half_window)
-        np.testing.assert_allclose(counts[tick], expected * length, rtol=1e-12)
-        np.testing.assert_allclose(tfi[tick], slow_tfi(spikes, tick), rtol=6e-8)
-        np.testing.assert_array_equal(tfi_image(stream, tick), tfi[tick])
-
-
-@pytest.mark.parametrize("half_window", [127, 128, 200, 32767])
-def test_wide_windows_of_pixels_that_always_fire(half_window: int) -> None:
-    stream = stream_of(np.ones((420, 3, 5), np.uint8))
-    counts = count_stack(stream, half_window)
-    assert counts.dtype == (np.uint8 if half_window <= 127 else np.uint16)
-    assert counts.max() == min(420, 2 * half_window)
-    np.testing.assert_allclose(tfp_stack(stream, half_window), 1, rtol=1e-6)
-    np.testing.assert_array_equal(tfi_stack(stream), 1)
+        tfp, tfi = tfp_image(stream, tick, half_window), tfi_image(stream, tick)
+        assert tfp.dtype == tfi.dtype == np.float32
+        np.testing.assert_allclose(tfp, slow_tfp(spikes, tick, half_window), rtol=2e-7)
+        np.testing.assert_allclose(tfi, slow_tfi(spikes, tick), rtol=6e-8)
 
 
 def test_sparse_pixels_at_the_ends_of_the_clip() -> None:
@@ -62,18 +47,21 @@ def test_sparse_pixels_at_the_ends_of_the_clip() -> None:
     spikes = np.zeros((20, 1, len(fired)), np.uint8)
     for x, ticks in enumerate(fired):
         spikes[ticks, 0, x] = 1
-    intervals = 1 / np.maximum(tfi_stack(stream_of(spikes))[:, 0], 1e-9)
-    np.testing.assert_allclose(intervals[0], [1e9, 20, 20, 20, 19, 4, 16, 4, 1], rtol=1e-6)
-    np.testing.assert_allclose(intervals[4], [1e9, 20, 20, 20, 19, 4, 16, 2, 1], rtol=1e-6)
-    np.testing.assert_allclose(intervals[5], [1e9, 20, 20, 20, 19, 16, 16, 2, 1], rtol=1e-6)
-    np.testing.assert_allclose(intervals[19], [1e9, 20, 20, 20, 19, 16, 4, 15, 1], rtol=1e-6)
+    for tick, intervals in {
+        0: [1e9, 20, 20, 20, 19, 4, 16, 4, 1],
+        4: [1e9, 20, 20, 20, 19, 4, 16, 2, 1],
+        5: [1e9, 20, 20, 20, 19, 16, 16, 2, 1],
+        19: [1e9, 20, 20, 20, 19, 16, 4, 15, 1],
+    }.items():
+        found = 1 / np.maximum(tfi_image(stream_of(spikes), tick)[0], 1e-9)
+        np.testing.assert_allclose(found, intervals, rtol=1e-6)
 
 
 def test_the_interval_contains_the_start_of_the_tick() -> None:
     """Light that doubles at tick 30 shows in TFI at tick 30, not a tick before or after."""
     spikes = np.zeros((60, 1, 1), np.uint8)
     spikes[1:30:4] = spikes[29:60:2] = 1
-    image = tfi_stack(stream_of(spikes))[:, 0, 0]
+    image = np.array([tfi_image(stream_of(spikes), tick)[0, 0] for tick in range(60)])
     np.testing.assert_allclose(image[2:30], 0.25)
     np.testing.assert_allclose(image[30:], 0.5)
 
@@ -114,7 +102,7 @@ def test_a_tick_outside_the_clip_is_refused(tick: int) -> None:
 @pytest.mark.parametrize("half_window", [0, 40000])
 def test_a_window_out_of_range_is_refused(half_window: int) -> None:
     with pytest.raises(UserError, match="half_window: expected 1 to 32767 ticks"):
-        tfp_stack(stream_of(np.ones((20, 2, 2), np.uint8)), half_window)
+        tfp_image(stream_of(np.ones((20, 2, 2), np.uint8)), 10, half_window)
 
 
 def test_the_window_is_a_setting_of_the_maker() -> None:
