@@ -17,8 +17,8 @@ from spike4dgs.baselines.nearest_view import NearestView
 from spike4dgs.baselines.radiance_field.fit import RADIANCE_FIELD
 from spike4dgs.baselines.spacetime import MOTIONS
 from spike4dgs.baselines.spike_render import SpikeRender
-from spike4dgs.baselines.starts.colmap import ColmapSettings, UncalibratedSettings, colmap, colmap_uncalibrated
-from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r, dust3r_uncalibrated
+from spike4dgs.baselines.starts.colmap import ColmapSettings, colmap
+from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r
 from spike4dgs.baselines.tracking.fit import TRACKING
 from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.method import recipes as ours
@@ -31,17 +31,11 @@ INITIALIZATIONS = {
     "colmap": Initialization(
         lambda r: colmap(r.scene, r.seed, r.settings), ColmapSettings(), label="poses by COLMAP", estimates_poses=True
     ),
-    "colmap-uncalibrated": Initialization(
-        lambda r: colmap_uncalibrated(r.scene, r.seed, r.settings), UncalibratedSettings(), estimates_poses=True
-    ),
     "dust3r": Initialization(
         lambda r: dust3r(r.scene, r.seed, r.settings, r.device),
         Dust3rSettings(),
         label="poses by DUSt3R",
         estimates_poses=True,
-    ),
-    "dust3r-uncalibrated": Initialization(
-        lambda r: dust3r_uncalibrated(r.scene, r.seed, r.settings, r.device), Dust3rSettings(), estimates_poses=True
     ),
 }
 PARTS = Parts(

@@ -15,14 +15,7 @@ from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.images.msdi import MSDI
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.starts.base import Initialization
-from spike4dgs.method.starts.msdi import (
-    MsdiMatchedSettings,
-    MsdiSettings,
-    MsdiUncalibratedSettings,
-    msdi,
-    msdi_matched,
-    msdi_uncalibrated,
-)
+from spike4dgs.method.starts.msdi import MsdiMatchedSettings, MsdiSettings, msdi, msdi_matched
 from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
@@ -37,12 +30,6 @@ PARTS = Parts(
             lambda r: msdi_matched(r.scene, r.seed, r.settings, r.device),
             MsdiMatchedSettings(),
             label="poses by MSDI and matching",
-            estimates_poses=True,
-            calibrated=True,
-        ),
-        "msdi-uncalibrated": Initialization(
-            lambda r: msdi_uncalibrated(r.scene, r.seed, r.settings, r.device),
-            MsdiUncalibratedSettings(),
             estimates_poses=True,
             calibrated=True,
         ),

@@ -212,11 +212,9 @@ class Trainer:
 
     def _image(self, splats: Splats, chosen: Sequence[int], views: Views) -> RenderOutput:
         """Render into the chosen views, over the background where there is one."""
-        return self.projected.render(splats, chosen) if self.projected else self._render(splats, views)
-
-    def _render(self, splats: Splats, views: Views) -> RenderOutput:
-        s = self.settings
-        return render(splats, views, eps2d=s.filter_variance, antialiased=s.filter_compensated)
+        if self.projected:
+            return self.projected.render(splats, chosen)
+        return render(splats, views, self.settings.pixel_filter)
 
     def _views(self, chosen: Sequence[int]) -> Views:
         v, rows = self.training_images.views, list(chosen)

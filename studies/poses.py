@@ -25,8 +25,9 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.msdi.pose import solve_poses
 from spike4dgs.method.starts.base import Initialization
-from spike4dgs.method.starts.msdi import infer, matched_poses, unposed
+from spike4dgs.method.starts.msdi import DEFAULTS, infer, matched_poses
 from spike4dgs.method.starts.rig import rig, window_means
 from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
 from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
@@ -56,8 +57,16 @@ def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) 
 
 
 def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = unposed(scene, infer(scene, calibrated=calibrated), seed, calibrated=calibrated)
-    return Estimate(start.cameras, len(start.points))
+    """Return the poses by the network alone: each view's from its own points, by PnP."""
+    found, cameras = infer(scene, calibrated=calibrated), []
+    known = np.stack([c.K for c in found.cameras]) if calibrated else None
+    for camera, pose in zip(scene.cameras, solve_poses(found.points, found.confidence, known, seed), strict=True):
+        if pose.w2c is None:
+            fix = "use rig or colmap"
+            raise problem(f"MSDI on {scene.id}", f"a pose for {camera.id}", f"none ({pose.reason})", fix)
+        focal = {} if pose.focal_px is None else dict.fromkeys(("fx", "fy"), pose.focal_px * found.factor)
+        cameras.append(replace(camera, R=pose.w2c[:3, :3], t=pose.w2c[:3, 3], **focal))
+    return Estimate(cameras, int(found.sure(DEFAULTS).sum()))
 
 
 def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:

@@ -23,7 +23,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.models.saved_model import SavedModel, load_model
 from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat.reference import composite_patch, project
-from spike4dgs.method.splat.types import NEAR, PixelFilter
+from spike4dgs.method.splat.types import PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import resized
 from spike4dgs.studies.kit.timing import show_table
@@ -135,10 +135,10 @@ def exact_patch(
     The Gaussians are projected as for the whole image; those that cannot reach the patch are left out.
     """
     splats, views = model.splats(t_us), Views.from_cameras([camera])
-    wide = Splats(*(t.double().cpu() for t in (*splats.geometry, splats.colors)))
+    wide = Splats(*(t.double().cpu() for t in splats.tensors))
     whole = (camera.width, camera.height)
     f = model.pixel_filter
-    seen = project(wide, views.w2c[0], views.K[0], whole, f.compensated, NEAR, f.variance)
+    seen = project(wide, views.w2c[0], views.K[0], whole, f)
     image, _ = composite_patch(seen, wide.colors, corner, size)
     K = views.K.clone()
     K[:, :2, 2] -= torch.tensor(corner, dtype=K.dtype)

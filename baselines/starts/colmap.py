@@ -1,13 +1,12 @@
-"""The initialisations `colmap` and `colmap-uncalibrated`: poses by structure from motion (COLMAP).
+"""The initialisation `colmap`: poses by structure from motion (COLMAP).
 
 SIFT features of one image per training view, the mean of the whole clip: what moves is a blur there, and the static
 rest, where the spikes' quantisation noise has averaged out, carries the poses of a static rig. One global
 mapping solves for all views at once (`structure_from_motion`).
 
-`colmap` keeps the calibrated intrinsics; `colmap-uncalibrated` knows nothing and refines one focal length for all
-views from a prior of 1.2 image widths. Their points are COLMAP's. With `flat_field`, `colmap` sees images corrected by
-the cameras' calibrations, in which views have up to twice as many points in common, and sweeps planes from the poses
-found, as `rig` does from given ones.
+The calibrated intrinsics are kept, and the points are COLMAP's. With `flat_field` it sees images corrected by the
+cameras' calibrations, in which views have up to twice as many points in common, and sweeps planes from the poses found,
+as `rig` does from given ones.
 
 Poses come out in a frame of their own: the similarity that fits them to the calibrated training poses
 (`benchmark.metrics.pose_error`) takes everything to the scene's frame, where held-out cameras are known. Calibrated
@@ -22,32 +21,20 @@ import numpy as np
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.starts.base import Start
-from spike4dgs.method.starts.rig import PointSettings, RigSettings, rig, swept, window_means
-from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, FeatureSettings, Mapping, clip_means, map_views
+from spike4dgs.method.starts.rig import RigSettings, rig, swept, window_means
+from spike4dgs.method.starts.structure_from_motion import FeatureSettings, clip_means, map_views
 
 WHO = "COLMAP"
 
 
 @dataclass(frozen=True)
-class MappingSettings(FeatureSettings, PointSettings):
-    """Numbers of both initialisations by COLMAP: features, and the plane sweep that replaces few points."""
+class ColmapSettings(FeatureSettings, RigSettings):
+    """Numbers of `colmap` (prefix `initialization`). With `flat_field` all points come from a plane sweep."""
 
     min_points: int = 100  # fewer are no start for Gaussians: they come from a plane sweep with the estimated cameras
 
 
-@dataclass(frozen=True)
-class ColmapSettings(MappingSettings, RigSettings):
-    """Numbers of `colmap` (prefix `initialization`). With `flat_field` all points come from a plane sweep."""
-
-
-@dataclass(frozen=True)
-class UncalibratedSettings(MappingSettings):
-    """Numbers of `colmap-uncalibrated` (prefix `initialization`)."""
-
-    focal_prior: float = FOCAL_PRIOR  # image widths
-
-
-DEFAULTS, UNCALIBRATED = ColmapSettings(), UncalibratedSettings()
+DEFAULTS = ColmapSettings()
 
 
 def colmap(scene: TrainingScene, seed: int, settings: ColmapSettings = DEFAULTS) -> Start:
@@ -59,15 +46,7 @@ def colmap(scene: TrainingScene, seed: int, settings: ColmapSettings = DEFAULTS)
         images = window_means(scene, 0, scene.n_ticks, flat_field=True)
         found = map_views(scene, images, seed, settings).of_all(scene, WHO)
         return rig(replace(scene, cameras=found.cameras), settings)
-    return _start(scene, map_views(scene, clip_means(scene), seed, settings), settings)
-
-
-def colmap_uncalibrated(scene: TrainingScene, seed: int, settings: UncalibratedSettings = UNCALIBRATED) -> Start:
-    """Return the same, with intrinsics unknown."""
-    return _start(scene, map_views(scene, clip_means(scene), seed, settings, settings.focal_prior), settings)
-
-
-def _start(scene: TrainingScene, found: Mapping, settings: MappingSettings) -> Start:
-    if len(found.of_all(scene, WHO).points) < settings.min_points:
+    found = map_views(scene, clip_means(scene), seed, settings).of_all(scene, WHO)
+    if len(found.points) < settings.min_points:
         return swept(replace(scene, cameras=found.cameras), settings, flat_field=False)
     return Start(found.cameras, found.points.astype(np.float32), found.values)

@@ -1,4 +1,4 @@
-"""The initialisations `dust3r` and `dust3r-uncalibrated`: poses and points by DUSt3R from weights that users bring.
+"""The initialisation `dust3r`: poses and points by DUSt3R from weights that users bring.
 
 The network sees the first training view beside each of the others and gives, per pair, the points of both images in
 the first one's frame, at a scale of the pair's own. The pairs share the first view's points, so their scales follow
@@ -6,8 +6,8 @@ from the ratios of its distances. Each other view then gets its pose by PnP with
 points, and all is moved to the scene's frame as COLMAP's result is. Pairs beyond this star, and the joint optimisation
 over all of them, are left out: with 8 views of an array every view overlaps the first.
 
-`dust3r` keeps the calibrated intrinsics in PnP; `dust3r-uncalibrated` takes one focal length from the first view's
-points (`focal_from_points`). Images are the means of the clip, as for COLMAP.
+The calibrated intrinsics are kept in PnP; `estimate` can do without, with one focal length from the first view's points
+(`focal_from_points`). Images are the means of the clip, as for COLMAP.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ WEIGHTS = NamedWeights(
 
 @dataclass(frozen=True)
 class Dust3rSettings(Settings):
-    """Numbers of `dust3r` and `dust3r-uncalibrated` (prefix `initialization`)."""
+    """Numbers of `dust3r` (prefix `initialization`)."""
 
     long_side_px: int = 512  # the size that the weights were trained at
     ransac_px: float = 5.0  # of the network's image
@@ -93,13 +93,6 @@ def dust3r(scene: TrainingScene, seed: int, settings: Dust3rSettings = DEFAULTS,
     Raises WeightsError where the weights are absent, UserError where they are others or a view gets no pose.
     """
     return estimate(scene, clip_means(scene), seed, settings, device, calibrated=True)
-
-
-def dust3r_uncalibrated(
-    scene: TrainingScene, seed: int, settings: Dust3rSettings = DEFAULTS, device: str = "auto"
-) -> Start:
-    """Return the same, with intrinsics unknown."""
-    return estimate(scene, clip_means(scene), seed, settings, device, calibrated=False)
 
 
 def estimate(

@@ -92,8 +92,7 @@ class GaussianModel:
 
     def rendered(self, splats: Splats, views: Views) -> Tensor:
         """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
-        f = self.pixel_filter
-        return self.image(render(splats, views, eps2d=f.variance, antialiased=f.compensated).image, views)
+        return self.image(render(splats, views, self.pixel_filter).image, views)
 
     @through_lens
     @torch.no_grad()

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.starts.matched_poses import Seen, read_matches
+from spike4dgs.method.starts.plane_sweep import widest_baseline
 from spike4dgs.method.starts.structure_from_motion import FeatureSettings, find_features
 
 
@@ -102,7 +104,7 @@ def adjust(
 
 def triangulated(cameras: Sequence[Camera], tracks: Tracks) -> Float64:
     """Return the points [P, 3] nearest to the rays of their observations, and in front of the cameras."""
-    centers, depth = np.stack([c.center for c in cameras]), np.zeros((tracks.points, 3))
+    centers = np.stack([c.center for c in cameras])
     rays = np.concatenate([tracks.uv, np.ones((len(tracks.uv), 1))], axis=1)
     to_world = np.stack([c.R.T @ np.linalg.inv(c.K) for c in cameras])
     rays = np.einsum("nij,nj->ni", to_world[tracks.camera], rays)
@@ -117,8 +119,7 @@ def triangulated(cameras: Sequence[Camera], tracks: Tracks) -> Float64:
     np.add.at(far, tracks.point, rays)
     far = centers.mean(axis=0) + 1e3 * size * far / np.maximum(np.linalg.norm(far, axis=1, keepdims=True), 1e-12)
     weight = 1e-9
-    depth = np.linalg.solve(A + weight * np.eye(3), (b + weight * far)[..., None])[..., 0]
-    return np.asarray(depth)
+    return np.asarray(np.linalg.solve(A + weight * np.eye(3), (b + weight * far)[..., None])[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +145,8 @@ def _in_cameras(state: _State, tracks: Tracks) -> Float64:
 
 def _descended(state: _State, tracks: Tracks, s: AdjustSettings, moves: NDArray[np.bool_], scale: float) -> _State:
     """Return the state after Levenberg-Marquardt with weights of one scale."""
-    prior = _prior(state.cameras, s)
+    sigma = np.repeat([np.radians(s.turn_deg), max(s.shift * widest_baseline(state.cameras), 1e-9)], 3)
+    prior = 1 / sigma**2  # weights of a camera's six unknowns
     damping, cost = 1e-3, _cost(state, tracks, s, prior, scale)
     for _ in range(s.steps):
         new = _stepped(state, tracks, s, moves, prior, scale, damping)
@@ -159,14 +161,6 @@ def _descended(state: _State, tracks: Tracks, s: AdjustSettings, moves: NDArray[
         if done:
             break
     return state
-
-
-def _prior(cameras: Sequence[Camera], s: AdjustSettings) -> Float64:
-    """Return the weights of a camera's six unknowns [6]."""
-    centers = np.stack([c.center for c in cameras])
-    size = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
-    sigma = np.repeat([np.radians(s.turn_deg), max(s.shift * size, 1e-9)], 3)
-    return np.asarray(1 / sigma**2)
 
 
 def _cost(state: _State, tracks: Tracks, s: AdjustSettings, prior: Float64, scale: float) -> float:
@@ -224,23 +218,10 @@ def _slopes(state: _State, tracks: Tracks) -> tuple[Float64, Float64]:
     pinhole[:, 0, 0], pinhole[:, 1, 1] = K[:, 0, 0] / z, K[:, 1, 1] / z
     pinhole[:, :, 2] = -np.stack([K[:, 0, 0] * x[:, 0], K[:, 1, 1] * x[:, 1]], axis=1) / (z * z)[:, None]
     by_point = pinhole @ R
-    return np.concatenate([-pinhole @ cross_matrix(x), -by_point], axis=2), by_point
+    return np.concatenate([np.cross(x[:, None], pinhole), -by_point], axis=2), by_point
 
 
 def _moved(camera: Camera, step: Float64) -> Camera:
     """Return a camera turned in its own frame by a rotation vector, its centre shifted."""
-    R = turn(step[:3]) @ camera.R
+    R = Rotation.from_rotvec(step[:3]).as_matrix() @ camera.R
     return replace(camera, R=R, t=-R @ (camera.center + step[3:])) if step.any() else camera
-
-
-def cross_matrix(v: Float64) -> Float64:
-    """Return matrices [..., 3, 3] with [v]x w = v x w."""
-    x, y, z = np.moveaxis(np.asarray(v, np.float64), -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([np.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
-
-
-def turn(w: Float64) -> Float64:
-    """Return the rotation matrix [3, 3] of a rotation vector [3] (Rodrigues)."""
-    angle, W = float(np.linalg.norm(w)), cross_matrix(w)
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * W @ W)

@@ -12,21 +12,20 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from spike4dgs.method.splat import cpu
 from spike4dgs.method.splat.cuda.background import Layer as DeviceLayer
 from spike4dgs.method.splat.cuda.background import make_layer, render_over
 from spike4dgs.method.splat.kernels.project import Geometry
 from spike4dgs.method.splat.kernels.raster import Layer
-from spike4dgs.method.splat.types import CUSTOMARY, NEAR, PixelFilter, RenderOutput, Splats, Views
+from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter, RenderOutput, Splats, Views
 
 
 class Background:
     """Splats in views, neither of which changes. Splats rendered with it need the same number of channels."""
 
     def __init__(self, splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> None:
-        self.splats = Splats(*(t.detach() for t in (*splats.geometry, splats.colors)))
+        self.splats = Splats(*(t.detach() for t in splats.tensors))
         self.views, self.pixel_filter = views, pixel_filter
         self._layer: Layer | None = None
         self._on_device: DeviceLayer | None = None
@@ -42,9 +41,9 @@ class Background:
         if splats.means.device.type != "cpu":
             self._on_device = self._on_device or make_layer(self.splats, self.views, self.pixel_filter)
             return render_over(self._on_device, splats, chosen)
-        index, f = list(chosen), self.pixel_filter
+        index = list(chosen)
         views = Views(self.views.w2c[index], self.views.K[index], self.views.width, self.views.height)
-        settings = cpu.Settings(views.width, views.height, NEAR, f.variance, f.compensated, depth=False)
+        settings = cpu.Settings(views.width, views.height, self.pixel_filter, depth=False)
         self._layer = self._layer or _make_layer(self.splats, self.views, settings)
         layer = self._layer._replace(chosen=np.array(index))
         return cpu.rasterize(Splats(*splats.geometry, splats.colors.float()), views, settings, torch.float32, layer)
@@ -76,11 +75,7 @@ class Repeated:
 
 def join(a: Splats, b: Splats) -> Splats:
     """Return the Gaussians of `a` followed by those of `b`."""
-    return Splats(*(torch.cat(pair) for pair in zip(_tensors(a), _tensors(b), strict=True)))
-
-
-def _tensors(splats: Splats) -> tuple[Tensor, ...]:
-    return (*splats.geometry, splats.colors)
+    return Splats(*(torch.cat(pair) for pair in zip(a.tensors, b.tensors, strict=True)))
 
 
 def _make_layer(splats: Splats, views: Views, s: cpu.Settings) -> Layer:

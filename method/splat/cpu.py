@@ -25,7 +25,7 @@ from spike4dgs.method.splat.kernels.raster import Layer, Lists, raster_kernels, 
 from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run, useful_threads
 from spike4dgs.method.splat.kernels.tiles import AHEAD, BATCH, MAX_BLOCKS
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views, not_finite, require_finite
+from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views, not_finite, require_finite
 
 Array = np.ndarray
 
@@ -46,9 +46,7 @@ class Settings:
 
     width: int
     height: int
-    near: float
-    eps2d: float
-    antialiased: bool
+    pixel_filter: PixelFilter
     depth: bool
 
     @property
@@ -58,7 +56,8 @@ class Settings:
 
     def cameras(self, entries: Array) -> Cameras:
         """Return the kernels' cameras from their entries [V, 16], see `camera_entries`."""
-        return Cameras(entries, self.width, self.height, self.near, self.eps2d, self.antialiased)
+        f = self.pixel_filter
+        return Cameras(entries, self.width, self.height, f.variance, f.compensated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,15 +243,11 @@ class _Rasterize(torch.autograd.Function):
         return (*own, None, None, None, None)
 
 
-def render_cpu(
-    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
-) -> RenderOutput:
+def render_cpu(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
     """Render with the back end "cpu": see `render` for the arguments."""
-    dtype = torch.float32
-    if any(t.dtype == torch.float64 for t in splats.geometry):
-        dtype = torch.float64
-    settings = Settings(views.width, views.height, near, eps2d, antialiased, depth)
-    return rasterize(splats, views, settings, dtype, no_layer())
+    wide = any(t.dtype == torch.float64 for t in splats.geometry)
+    settings = Settings(views.width, views.height, pixel_filter, depth)
+    return rasterize(splats, views, settings, torch.float64 if wide else torch.float32, no_layer())
 
 
 def rasterize(splats: Splats, views: Views, settings: Settings, dtype: torch.dtype, layer: Layer) -> RenderOutput:
@@ -260,8 +255,7 @@ def rasterize(splats: Splats, views: Views, settings: Settings, dtype: torch.dty
     if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
         require_finite(splats)
     geometry = [t.to(dtype) for t in splats.geometry]
-    inputs = (*splats.geometry, splats.colors, views.w2c)
-    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in (*splats.tensors, views.w2c))
     means2d = torch.zeros(len(views), len(splats), 2, dtype=dtype, requires_grad=wanted)
     radii = torch.zeros(len(views), len(splats))
     layers, alpha = _Rasterize.apply(*geometry, splats.colors, views.w2c, means2d, views.K, settings, layer, radii)

@@ -2,10 +2,10 @@
 
 It defines the semantics that the other back ends are tested against (those of gsplat 1.5):
 
-    p = R m + t,  culled where p_z < near
+    p = R m + t,  culled where p_z < NEAR
     S2 = J R S R^T J^T + eps2d I,  J the projection's Jacobian at p, at most 0.3 half images outside the image
     alpha = min(0.999, o exp(-d^T S2^-1 d / 2)),  skipped where below 1/255
-    antialiased: o *= sqrt(|S2 - eps2d I| / |S2|)
+    compensated: o *= sqrt(|S2 - eps2d I| / |S2|)
     front to back by float32 depth, ties by index:  C += T alpha c,  T *= 1 - alpha,  until T would fall to 1e-4
 
 Memory grows as pixels x Gaussians. Not differentiated: the visibility decisions and the order.
@@ -21,10 +21,11 @@ from torch import Tensor
 from spike4dgs.method.splat.types import (
     ALPHA_MAX,
     ALPHA_MIN,
-    EPS2D,
+    CUSTOMARY,
     FRUSTUM_MARGIN,
     NEAR,
     T_MIN,
+    PixelFilter,
     RenderOutput,
     Splats,
     Views,
@@ -56,12 +57,11 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def project(
-    splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], antialiased: bool, near: float, eps2d: float
-) -> Projection:
+def project(splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], pixel_filter: PixelFilter) -> Projection:
     """Project float64 Gaussians into one view of size (width, height)."""
+    eps2d, antialiased = pixel_filter.variance, pixel_filter.compensated
     p = splats.means @ w2c[:3, :3].T + w2c[:3, 3]  # [N, 3]
-    index = torch.nonzero((p[:, 2] >= near) & (splats.quats.square().sum(-1) > 0))[:, 0]
+    index = torch.nonzero((p[:, 2] >= NEAR) & (splats.quats.square().sum(-1) > 0))[:, 0]
     index = index[torch.argsort(p[index, 2].detach().float(), stable=True)]
     p, f, c = p[index], K[[0, 1], [0, 1]], K[:2, 2]
     z = p[:, 2:]
@@ -134,15 +134,13 @@ def composite_patch(
     return composite(part, part.center - offset, colors[part.index], size)
 
 
-def render_reference(
-    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
-) -> RenderOutput:
+def render_reference(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
     """Render with the back end "reference": see `render`. Computes in float64, returns the dtype of the colours."""
     require_finite(splats)
     dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
-    wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))
+    wide = Splats(*(t.double() for t in splats.tensors))
     w2c, K = views.w2c.double(), views.K.double()
-    seen = [project(wide, w2c[c], K[c], size, antialiased, near, eps2d) for c in range(len(views))]
+    seen = [project(wide, w2c[c], K[c], size, pixel_filter) for c in range(len(views))]
     blank = torch.zeros(n, 2, dtype=torch.float64)
     means2d = torch.stack([blank.index_copy(0, s.index, s.center) for s in seen])
     if means2d.requires_grad:
@@ -160,19 +158,17 @@ def render_reference(
 
 
 @torch.no_grad()
-def cutoff_margin(
-    splats: Splats, views: Views, *, antialiased: bool = False, near: float = NEAR, eps2d: float = EPS2D
-) -> Tensor:
+def cutoff_margin(splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> Tensor:
     """Return each pixel's distance from a decision that float32 may take otherwise, [C, H, W] float64.
 
     The smallest relative distance, over the Gaussians that reach the pixel, of alpha from 1/255 and of the next T
     from 1e-4. Where it is below the precision of a back end, a whole Gaussian may be there or not.
     """
     size = (views.width, views.height)
-    wide = Splats(*(t.double() for t in (*splats.geometry, splats.colors)))
+    wide = Splats(*(t.double() for t in splats.tensors))
     out = torch.full((len(views), views.height, views.width), torch.inf, dtype=torch.float64)
     for c in range(len(views)):
-        s = project(wide, views.w2c[c].double(), views.K[c].double(), size, antialiased, near, eps2d)
+        s = project(wide, views.w2c[c].double(), views.K[c].double(), size, pixel_filter)
         if not len(s.index):
             continue
         raw, live = alphas(s, s.center, size)

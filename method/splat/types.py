@@ -16,9 +16,8 @@ ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becom
 T_MIN = 1e-4  # a pixel is finished before the Gaussian that would bring T down to this
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
 
-# Defaults of `render`.
 NEAR = 0.01  # Gaussians whose centre is nearer than this (in world units) are not rendered
-EPS2D = 0.3  # variance of the pixel filter, px^2
+EPS2D = 0.3  # variance of the customary pixel filter, px^2
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,11 @@ class Splats:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """All five, in the order of the fields."""
+        return (*self.geometry, self.colors)
 
     @property
     def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

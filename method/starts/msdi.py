@@ -1,4 +1,4 @@
-"""The initialisations `msdi`, `msdi-matched`, `msdi-uncalibrated`: points and poses by MSDI's network (section 3.3).
+"""The initialisations `msdi` and `msdi-matched`: points and poses by MSDI's network (section 3.3).
 
 The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
 was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
@@ -10,10 +10,8 @@ lack of texture, the network's points replace the nearest depth: those of view 0
 to the matched ones.
 
 `msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
-views match in corrected means of the clip (`bundle`). From there on it is `msdi`.
-
-`msdi-uncalibrated` has the network alone: each view's pose follows from its own points, by PnP (`method.msdi.pose`),
-with one focal length for all. In both everything is moved to the scene's frame as COLMAP's result is.
+views match in corrected means of the clip (`bundle`), and are moved to the scene's frame as COLMAP's are. From there on
+it is `msdi`.
 """
 
 from __future__ import annotations
@@ -29,36 +27,26 @@ from torch.nn import functional
 
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
-from spike4dgs.method.msdi.pose import focal_from_points, solve_poses
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
-from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
-from spike4dgs.method.starts.rig import Cloud, CloudSettings, PointSettings, fill, filled, matched, thin, window_means
+from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched, window_means
 from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
 
 @dataclass(frozen=True)
-class EstimateSettings(Settings):
-    """Numbers of the network's estimate (prefix `initialization`)."""
+class MsdiSettings(PointSettings):
+    """Numbers of `msdi` (prefix `initialization`)."""
 
     trained_px: int = 104  # longer side of the training images
     least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
-
-
-@dataclass(frozen=True)
-class MsdiSettings(EstimateSettings, PointSettings):
-    """Numbers of `msdi` (prefix `initialization`)."""
-
     least_matches: int = 50  # for a line through inverse depths
     line_rounds: int = 10  # of reweighted least squares
     farthest: float = 2.0  # times the farthest match: points beyond it are left out
@@ -69,12 +57,7 @@ class MsdiMatchedSettings(MsdiSettings, MatchSettings):
     """Numbers of `msdi-matched` (prefix `initialization`)."""
 
 
-@dataclass(frozen=True)
-class MsdiUncalibratedSettings(EstimateSettings, CloudSettings):
-    """Numbers of `msdi-uncalibrated` (prefix `initialization`)."""
-
-
-DEFAULTS, MATCHED, UNCALIBRATED = MsdiSettings(), MsdiMatchedSettings(), MsdiUncalibratedSettings()
+DEFAULTS, MATCHED = MsdiSettings(), MsdiMatchedSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +70,7 @@ class Estimate:
     points: Float64  # [V, h, w, 3] in view 0's frame, at any scale
     confidence: Float64  # [V, h, w]
 
-    def sure(self, settings: EstimateSettings) -> NDArray[np.bool_]:
+    def sure(self, settings: MsdiSettings) -> NDArray[np.bool_]:
         """Return the pixels [V, h, w] whose points are used."""
         least = np.quantile(self.confidence, settings.least_confidence, axis=(1, 2), keepdims=True)
         return (self.confidence >= least) & np.isfinite(self.points).all(axis=-1)
@@ -128,15 +111,8 @@ def matched_poses(
     return bundle(scene, guess, estimate.factor, images, seed, settings).of_all(scene, "MSDI")
 
 
-def msdi_uncalibrated(
-    scene: TrainingScene, seed: int, settings: MsdiUncalibratedSettings = UNCALIBRATED, device: str = "auto"
-) -> Start:
-    """Return poses, intrinsics and points by the network; raises as `msdi`, and where a view gets no pose."""
-    return unposed(scene, infer(scene, settings, device, calibrated=False), seed, settings, calibrated=False)
-
-
 def infer(
-    scene: TrainingScene, settings: EstimateSettings = DEFAULTS, device: str = "auto", *, calibrated: bool
+    scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = "auto", *, calibrated: bool
 ) -> Estimate:
     """Return the network's estimate for the middle of the clip, told the intrinsics or not; raises as `msdi`."""
     device = choose_device(device, rasterizes=False)
@@ -218,46 +194,3 @@ def inverse_depth_line(depth: Float64, uv: Float64, z: Float64, settings: MsdiSe
         line = np.polyfit(x, y, 1, w=np.sqrt(weights))
         weights = 1 / np.maximum(np.abs(np.polyval(line, x) - y), 1e-6 * y.mean())
     return line if line[0] > 0 else None
-
-
-def unposed(
-    scene: TrainingScene,
-    estimate: Estimate,
-    seed: int,
-    settings: MsdiUncalibratedSettings = UNCALIBRATED,
-    *,
-    calibrated: bool,
-) -> Start:
-    """Return poses by PnP, and points, in the scene's frame; intrinsics are the calibrated ones, or estimated too.
-
-    Raises UserError where a view has no pose.
-    """
-    first, f = scene.cameras[0], estimate.factor
-    cameras = list(scene.cameras) if calibrated else _one_focal(scene, estimate, settings)
-    K = np.stack([shrunk(camera, f).K for camera in cameras])
-    poses = solve_poses(estimate.points, estimate.confidence, K, seed)
-    if bad := [f"{c.id} ({p.reason})" for c, p in zip(estimate.cameras, poses, strict=True) if not p.found]:
-        fix = "use rig or colmap"
-        raise problem(f"MSDI on {scene.id}", "a pose for each view", f"none for {', '.join(bad)}", fix)
-    known = [pose.w2c for pose in poses if pose.w2c is not None]
-    posed = [replace(c, R=w2c[:3, :3], t=w2c[:3, 3]) for c, w2c in zip(cameras, known, strict=True)]
-    move = align_cameras(posed, scene.cameras)
-    moved = tuple(move.camera(c) for c in posed)
-    sure = estimate.sure(settings)
-    cloud = thin(moved, Cloud(move(estimate.points[sure]), estimate.images[sure]), settings)
-    images = estimate.images.repeat(f, axis=1).repeat(f, axis=2)[:, : first.height, : first.width]
-    cloud = fill(moved, images, cloud, settings)
-    return Start(moved, cloud.points.astype(np.float32), cloud.values)
-
-
-def _one_focal(scene: TrainingScene, estimate: Estimate, settings: EstimateSettings) -> list[Camera]:
-    """Return the cameras with the focal length of view 0's points, square pixels, the principal point in the middle."""
-    first, f = scene.cameras[0], estimate.factor
-    middle = first.width / 2, first.height / 2
-    v, u = np.nonzero(estimate.sure(settings)[0])
-    offsets = np.stack([u + 0.5, v + 0.5], axis=-1) - np.divide(middle, f)
-    focal = focal_from_points(estimate.points[0, v, u], offsets)
-    if focal is None:
-        fix = "use rig or colmap"
-        raise problem(f"MSDI on {scene.id}", "points that give a focal length", "none before the camera", fix)
-    return [replace(c, fx=focal * f, fy=focal * f, cx=middle[0], cy=middle[1]) for c in scene.cameras]

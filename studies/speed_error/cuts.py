@@ -16,7 +16,7 @@ from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.vector_ir import EXP2_POLYNOMIAL, Lanes, array_data, host_lanes, offset
 from spike4dgs.method.splat.reference import project
-from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, EPS2D, NEAR, T_MIN, PixelFilter
+from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, CUSTOMARY, T_MIN, PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.studies.kit.measurement import (
     TIMES,
@@ -40,7 +40,7 @@ def composited(splats: Splats, views: Views, alpha_min: float, t_min: float) -> 
     """Return the image [H*W] in float64, cut at other limits than the rasteriser's, and the mean work at a pixel."""
     opaque = torch.ones(len(splats), dtype=torch.float64)  # so that the projection culls nothing
     size, all_opaque = (views.width, views.height), wide(splats, opacities=opaque)
-    view = project(all_opaque, views.w2c[0].double(), views.K[0].double(), size, False, NEAR, EPS2D)
+    view = project(all_opaque, views.w2c[0].double(), views.K[0].double(), size, CUSTOMARY)
     view = replace(view, opacity=splats.opacities.double()[view.index])
     colors, image = all_opaque.colors[view.index, 0], []
     pairs = 0
@@ -153,7 +153,7 @@ def pixel_filter(request: Request) -> Iterator[Series]:
 
 
 def _filtered(splats: Splats, views: Views, f: PixelFilter) -> Tensor:
-    return render(splats, views, eps2d=f.variance, antialiased=f.compensated, backend="cpu").image[0, :, :, 0]
+    return render(splats, views, f, backend="cpu").image[0, :, :, 0]
 
 
 def _mean_of_samples(splats: Splats, fine: Views) -> Tensor:

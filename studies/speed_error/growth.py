@@ -47,7 +47,7 @@ def _image(splats: Splats, views: Views) -> Any:
 
 
 def _step(splats: Splats, views: Views) -> Any:
-    leaves = [t.requires_grad_() for t in (*splats.geometry, splats.colors)]
+    leaves = [t.requires_grad_() for t in splats.tensors]
     image = render(Splats(*leaves), views, backend="cpu").image
     return torch.autograd.grad(image.sum(), leaves)
 

@@ -12,7 +12,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Background, join
 from spike4dgs.method.splat.reference import composite_patch, cutoff_margin, project
-from spike4dgs.method.splat.types import EPS2D, NEAR
+from spike4dgs.method.splat.types import CUSTOMARY
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.studies.kit.measurement import (
     TIMES,
@@ -40,7 +40,7 @@ _CLEAR = 1e-3  # relative distance from a decision, alpha >= 1/255 or T > 1e-4, 
 def exact_image(splats: Splats, views: Views) -> Tensor:
     """Return the image [H, W, F] of one view by the reference, float64, part by part."""
     s = wide(splats)
-    view = project(s, views.w2c[0].double(), views.K[0].double(), (views.width, views.height), False, NEAR, EPS2D)
+    view = project(s, views.w2c[0].double(), views.K[0].double(), (views.width, views.height), CUSTOMARY)
     image = torch.empty(views.height, views.width, splats.colors.shape[1], dtype=torch.float64)
     for y in range(0, views.height, PATCH):
         for x in range(0, views.width, PATCH):
@@ -70,7 +70,7 @@ def precision(request: Request) -> Iterator[Series]:
 
 def _precision(name: str, scene: Scene, request: Request) -> Series:
     splats, views = scene
-    narrow = Splats(*(t.float() for t in (*splats.geometry, splats.colors)))
+    narrow = Splats(*(t.float() for t in splats.tensors))
     sure = cutoff_margin(splats, views)[0] > _CLEAR if views.width * len(splats) <= 200_000 else None
 
     def errors(found: Tensor, exact: Tensor) -> dict[str, float]:
@@ -91,7 +91,7 @@ def _precision(name: str, scene: Scene, request: Request) -> Series:
 
 def gradients_of(splats: Splats, views: Views, weight: Tensor, backend: str, dtype: torch.dtype) -> list[Tensor]:
     """Return the gradients of a weighted sum of the image, by `PARAMETERS`."""
-    leaves = [t.to(dtype).requires_grad_() for t in (*splats.geometry, splats.colors)]
+    leaves = [t.to(dtype).requires_grad_() for t in splats.tensors]
     image = render(Splats(*leaves), views, backend=backend).image[0]  # type: ignore[arg-type]
     return list(torch.autograd.grad((image * weight.to(image)).sum(), leaves))
 
@@ -157,7 +157,7 @@ def background(request: Request) -> Iterator[Series]:
     n, size = request.pick((200, (40, 24)), (20_000, (200, 125)), (50_000, (400, 250)))
     splats, views = random_scene(n, request.seed, *size)
     leftmost = splats.means[:, 0].div(splats.means[:, 2]).argsort()
-    tensors = (*splats.geometry, splats.colors)
+    tensors = splats.tensors
     moving_first: list[Point] = []
     for share in (0.02, 0.1, 0.3, 1.0):
         cut = max(1, round(share * n))

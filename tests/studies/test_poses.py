@@ -3,12 +3,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.cli import main
+from spike4dgs.method.msdi.training_data import points_of
+from spike4dgs.method.starts.msdi import Estimate, shrunk
 from spike4dgs.method.starts.structure_from_motion import clip_means
 from spike4dgs.studies.poses import measure_poses, poses
 
@@ -51,6 +54,22 @@ def test_refined_poses_are_a_row_of_their_own() -> None:
     assert before["registered"] == after["registered"] == "8 of 8" and before["points"] == after["points"]
     assert 0 < float(before["rotation_deg"] or 0) < 1 and 0 < float(after["rotation_deg"] or 0) < 1
     assert after["rotation_deg"] != before["rotation_deg"]
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_perfect_network_finds_the_rig_again(calibrated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = tuple(shrunk(c, 2) for c in WORLD.training.cameras)
+    depth = np.array([WORLD.trace(c, 0.5)[1] for c in small], np.float32)
+    relative = np.stack([c.w2c @ np.linalg.inv(small[0].w2c) for c in small])
+    points = points_of(depth, np.stack([c.K for c in small]), relative).astype(np.float64) / 3.7
+    perfect = Estimate(2, small, depth, points, np.full(depth.shape, 9.0))
+    monkeypatch.setattr("spike4dgs.studies.poses.infer", lambda scene, calibrated: perfect)
+    (row,) = measure_poses(WORLD.training, depth, "msdi", 0, calibrated=calibrated)
+    assert row["registered"] == "8 of 8" and float(row["rotation_max_deg"] or 9) < 0.1
+    assert float(row["translation_m"] or 9) < 0.01 and row["focal_ratio"] == pytest.approx(1, abs=0.01)
+    points[2] = np.random.default_rng(0).normal(size=points[2].shape)
+    (row,) = measure_poses(WORLD.training, depth, "msdi", 0, calibrated=calibrated)
+    assert f"a pose for {small[2].id}, found none" in str(row["error"])
 
 
 def test_unknown_names_are_refused(small_scene: Path) -> None:

@@ -57,7 +57,7 @@ def small(splats: Splats, v: Views, count: int = 24) -> tuple[Splats, Views]:
     step = max(1, len(splats) // count)
     K = v.K.clone()
     K[:, :2] *= SCALE
-    few = Splats(*(t[::step][:count] for t in (*splats.geometry, splats.colors)))
+    few = Splats(*(t[::step][:count] for t in splats.tensors))
     return few, Views(v.w2c[-1:], K[-1:], round(WIDTH * SCALE), round(HEIGHT * SCALE))
 
 
@@ -65,7 +65,7 @@ def behind_and_over() -> None:
     """A background and others in front of it against all of them at once: equal bits, and equal gradients."""
     splats, v = small(random_splats(24, 2, seed=31), views(2))
     v = Views(torch.cat([views(2).w2c[:1], v.w2c]), v.K.repeat(2, 1, 1), v.width, v.height)
-    behind = Splats(*(t[:18] for t in (*splats.geometry, splats.colors)))
+    behind = Splats(*(t[:18] for t in splats.tensors))
     # In a corner: the other tile is copied.
     corner = splats.means[18:] * 0.1 + torch.tensor([-0.3, 0.0, 1.0])
     front = [corner, splats.quats[18:], splats.scales[18:] * 0.2, splats.opacities[18:], splats.colors[18:]]
@@ -93,7 +93,7 @@ def same_bits() -> None:
     splats, v = small(random_splats(24, 1, seed=32), views(1))
     results = []
     for _ in range(2):
-        leaves = [t.clone().requires_grad_() for t in (*splats.geometry, splats.colors)]
+        leaves = [t.clone().requires_grad_() for t in splats.tensors]
         out = render(Splats(*leaves), v, backend="cuda")
         out.image.square().sum().backward()
         results.append([out.image.detach(), *(t.grad for t in leaves)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat import RenderOutput, Splats, Views, render
+from spike4dgs.method.splat import PixelFilter, RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.reference import cutoff_margin
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "w2c", "means2d")
@@ -31,12 +31,13 @@ class Parity:
 
 
 def differentiate(
-    splats: Splats, v: Views, backend: str, keep: Tensor, depth: bool, device: str = "cpu", **options: object
+    splats: Splats, v: Views, backend: str, keep: Tensor, depth: bool, device: str = "cpu", compensated: bool = False
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
     """Render and pull back a fixed random cotangent of every output; keep [C, H, W] masks pixels on a cut-off."""
-    leaves = [t.detach().to(device, copy=True).requires_grad_() for t in (*splats.geometry, splats.colors, v.w2c)]
+    leaves = [t.detach().to(device, copy=True).requires_grad_() for t in (*splats.tensors, v.w2c)]
     seen = Views(leaves[5], v.K, v.width, v.height)
-    out = render(Splats(*leaves[:5]), seen, backend=backend, depth=depth, **options)  # type: ignore[arg-type]
+    f = PixelFilter(compensated=compensated)
+    out = render(Splats(*leaves[:5]), seen, f, backend=backend, depth=depth)  # type: ignore[arg-type]
     g = torch.Generator().manual_seed(0)
     loss = torch.zeros((), dtype=torch.float64)
     for layer, weight in ((out.image, 1.0), (out.alpha[..., None], 1.0), (out.depth, 0.2)):
@@ -52,9 +53,9 @@ def parity(
     splats: Splats, v: Views, backend: str, device: str = "cpu", *, depth: bool = False, antialiased: bool = False
 ) -> Parity:
     """Return how far a back end's images and gradients are from the reference's."""
-    keep = cutoff_margin(splats, v, antialiased=antialiased) > ON_CUTOFF
-    expected, wanted = differentiate(splats, v, "reference", keep, depth, antialiased=antialiased)
-    found, got = differentiate(splats, v, backend, keep, depth, device, antialiased=antialiased)
+    keep = cutoff_margin(splats, v, PixelFilter(compensated=antialiased)) > ON_CUTOFF
+    expected, wanted = differentiate(splats, v, "reference", keep, depth, compensated=antialiased)
+    found, got = differentiate(splats, v, backend, keep, depth, device, antialiased)
     error, finite = 0.0, True
     for name in ("image", "alpha", "depth") if depth else ("image", "alpha"):
         a, b = getattr(expected, name).detach(), getattr(found, name).detach().cpu()

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from spike4dgs.method.splat.cuda.prepare import Lists, all_tiles, make_pairs, sort_pairs
-from spike4dgs.method.splat.cuda.render import Behind, Job, Projected, blend, grid_of, project_splats
-from spike4dgs.method.splat.types import CUSTOMARY, NEAR, PixelFilter, RenderOutput, Splats, Views
+from spike4dgs.method.splat.cuda.render import Behind, Job, blend, grid_of, project_splats
+from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,11 @@ class Layer:
 
 
 @torch.no_grad()
-def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> Layer:
+def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Layer:
     """Render the background once into all views."""
     device = splats.means.device
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
-    p, grid = _project(splats, views, pixel_filter), grid_of(views)
+    p, grid = project_splats(splats, views, pixel_filter), grid_of(views)
     layers = splats.colors[p.seen.index].float()
     pairs = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
     lists = sort_pairs(grid, pairs.keys, pairs.rows, torch.full_like(pairs.rows, -1), all_tiles(grid, device))
@@ -47,7 +47,7 @@ def render_over(layer: Layer, splats: Splats, chosen: Sequence[int]) -> RenderOu
     """Render `splats` and the background into the views `chosen`: see `Background.render`."""
     device, pick = splats.means.device, torch.tensor(list(chosen), device=splats.means.device)
     views = Views(layer.views.w2c[pick], layer.views.K[pick], layer.views.width, layer.views.height)
-    p, grid = _project(splats, views, layer.pixel_filter), grid_of(views)
+    p, grid = project_splats(splats, views, layer.pixel_filter), grid_of(views)
     own = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
     touched = torch.unique(own.keys >> 32)
     keys, rows = _behind_pairs(layer, pick, touched)
@@ -60,10 +60,6 @@ def render_over(layer: Layer, splats: Splats, chosen: Sequence[int]) -> RenderOu
     )
     image, alpha = blend(p.records, splats.colors[p.seen.index].float(), job)
     return RenderOutput(image.permute(0, 2, 3, 1), alpha, None, p.radii, p.means2d)
-
-
-def _project(splats: Splats, views: Views, f: PixelFilter) -> Projected:
-    return project_splats(splats, views, antialiased=f.compensated, near=NEAR, eps2d=f.variance)
 
 
 def _behind_pairs(layer: Layer, pick: Tensor, touched: Tensor) -> tuple[Tensor, Tensor]:

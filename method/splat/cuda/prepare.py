@@ -22,7 +22,7 @@ from numba.core import config
 from torch import Tensor
 
 from spike4dgs.method.splat.reference import rotation_matrices
-from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, Splats, Views
+from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, NEAR, PixelFilter, Splats, Views
 
 # A small image has few tiles. That a grid could be larger is no news to the user.
 warnings.filterwarnings("ignore", message=".*Grid size")
@@ -61,13 +61,14 @@ class Seen:
     radius: Tensor  # [M] px
 
 
-def project(splats: Splats, views: Views, antialiased: bool, near: float, eps2d: float) -> Seen:
-    """Project Gaussians into views; all tensors on one device. See `render` for the arguments."""
+def project(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Seen:
+    """Project Gaussians into views; all tensors on one device."""
+    eps2d, antialiased = pixel_filter.variance, pixel_filter.compensated
     means, quats, scales, opacities = (t.double() for t in splats.geometry)
     w2c, K = views.w2c.double(), views.K.double()
     p = means @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]  # [C, N, 3]
     exists = (quats.square().sum(-1) > 0) & (opacities >= ALPHA_MIN)
-    view, index = torch.nonzero((p[..., 2] >= near) & exists, as_tuple=True)
+    view, index = torch.nonzero((p[..., 2] >= NEAR) & exists, as_tuple=True)
     axes = rotation_matrices(torch.where(exists[:, None], quats, quats.new_tensor([1.0, 0, 0, 0]))) * scales[:, None]
     p, f, c = p[view, index], K[:, [0, 1], [0, 1]][view], K[:, :2, 2][view]
     z = p[:, 2:]

@@ -26,7 +26,7 @@ from spike4dgs.method.splat.cuda.prepare import (
     simulated,
     sort_pairs,
 )
-from spike4dgs.method.splat.types import RenderOutput, Splats, Views, require_finite
+from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views, require_finite
 
 THREADS = TILE * TILE  # of a block: one for each pixel
 MAX_CHANNELS = 4  # of one kernel call, which keeps them in registers
@@ -64,7 +64,7 @@ class _Blend(torch.autograd.Function):
         else:
             records, layers = torch.cat([behind.records, records]), torch.cat([behind.layers, layers])
             image, alpha = behind.image.clone(memory_format=torch.contiguous_format), behind.alpha.clone()
-        forward, _ = _kernels(channels)
+        forward, _, _ = _kernels(channels)
         arguments = (records, layers, lists.rows, lists.offsets, lists.tiles, grid.across, grid.down, image, alpha)
         launch(forward, len(lists.tiles), THREADS, records.device, *arguments)
         ctx.save_for_backward(records, layers, image, alpha)
@@ -75,7 +75,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
         records, layers, image, alpha = ctx.saved_tensors
         lists, starts = ctx.job.lists, ctx.job.starts
-        _, backward = _kernels(layers.shape[1])
+        _, backward, sum_pairs = _kernels(layers.shape[1])
         values = 6 + layers.shape[1]
         sums = layers.new_zeros(max(int(lists.slots.shape[0]), 1), values)
         launch(
@@ -85,7 +85,7 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         own = len(starts) - 1
         totals = records.new_zeros(own, values)
-        launch(_sum_kernel(), -(-totals.numel() // THREADS), THREADS, records.device, sums, starts, totals)
+        launch(sum_pairs, -(-totals.numel() // THREADS), THREADS, records.device, sums, starts, totals)
         return _chain(records[len(records) - own :], totals[:, :6]), totals[:, 6:].float(), None
 
 
@@ -101,17 +101,11 @@ def _chain(records: Tensor, moments: Tensor) -> Tensor:
 
 
 @cache
-def _kernels(channels: int) -> tuple[Any, Any]:
-    from spike4dgs.method.splat.cuda.kernels import blend_kernels
+def _kernels(channels: int) -> tuple[Any, Any, Any]:
+    """Return the forward, the backward and the sum kernel."""
+    from spike4dgs.method.splat.cuda.kernels import blend_kernels, sum_pairs
 
-    return blend_kernels(channels)
-
-
-@cache
-def _sum_kernel() -> Any:
-    from spike4dgs.method.splat.cuda.kernels import sum_pairs
-
-    return sum_pairs
+    return (*blend_kernels(channels), sum_pairs)
 
 
 def blend(records: Tensor, layers: Tensor, job: Job) -> tuple[Tensor, Tensor]:
@@ -139,12 +133,11 @@ class Projected:
     means2d: Tensor  # [C, N, 2] px
 
 
-def project_splats(splats: Splats, views: Views, *, antialiased: bool, near: float, eps2d: float) -> Projected:
+def project_splats(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Projected:
     """Project splats and make the tensor that receives dL/dmeans2d. Raises UserError for NaN."""
-    tensors = (*splats.geometry, splats.colors)
-    if not torch.isfinite(torch.stack([t.detach().sum().double() for t in tensors]).sum()):
+    if not torch.isfinite(torch.stack([t.detach().sum().double() for t in splats.tensors]).sum()):
         require_finite(splats)
-    seen = project(splats, views, antialiased, near, eps2d)
+    seen = project(splats, views, pixel_filter)
     wide = any(t.dtype == torch.float64 for t in splats.geometry)
     shape, at = (len(views), len(splats)), (seen.view, seen.index)
     means2d = seen.center.new_zeros(*shape, 2, dtype=torch.float64 if wide else torch.float32)
@@ -152,15 +145,13 @@ def project_splats(splats: Splats, views: Views, *, antialiased: bool, near: flo
     radii = seen.radius.new_zeros(shape, dtype=torch.float32)
     radii[at] = seen.radius.float()
     center = seen.center
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, views.w2c)):
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (*splats.tensors, views.w2c)):
         means2d.requires_grad_()
         center = center + (means2d - means2d.detach())[at].double()  # adds 0, and receives the centre's gradient
     return Projected(seen, torch.cat([center, seen.shape], -1), radii, means2d)
 
 
-def render_cuda(
-    splats: Splats, views: Views, *, depth: bool, antialiased: bool, near: float, eps2d: float
-) -> RenderOutput:
+def render_cuda(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
     """Render with the back end "cuda": see `render` for the arguments."""
     device = splats.means.device
     if not simulated():
@@ -170,7 +161,7 @@ def render_cuda(
             fix = f"{missing.fix}, or move the tensors to the CPU"
             raise problem("back end cuda", missing.expected, missing.found, fix)
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
-    p, grid = project_splats(splats, views, antialiased=antialiased, near=near, eps2d=eps2d), grid_of(views)
+    p, grid = project_splats(splats, views, pixel_filter), grid_of(views)
     layers = splats.colors[p.seen.index].float()
     if depth:
         layers = torch.cat([layers, p.seen.depth[:, None].float()], -1)

@@ -13,6 +13,7 @@ thin the Gaussian is. L = log2(opacity) = (hx xi_scale)^2 - log2(255), since the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,31 +148,50 @@ def pointers_of(context: Any, builder: Any, sig: Any, args: Any, names: str) -> 
     return {n: array_data(context, builder, sig.args[i], args[i]) for i, n in enumerate(names.split(), start=1)}
 
 
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
-def composite_blocks(
-    typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
-    begin: Any, end: Any, gaussian: Any,
-) -> Generated:  # fmt: skip
-    """Blend one Gaussian into blocks [begin, end) of the list (starts, xis, etas)."""
-    integer = types.int64
-    signature = types.void(variant, tile, records, colors, starts, xis, etas, integer, integer, integer)
-    chosen = Variant.unpack(variant.literal_value)
+def _over_blocks(turn: Callable[[BlockLoop], None]) -> Any:
+    """Return the intrinsic that does a `turn` for each of the blocks [begin, end) of the list (starts, xis, etas)."""
 
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas")
-        loop = BlockLoop(builder, chosen, pointers, args[9])
-        v = loop.v
-        loop.open(args[7], args[8], 0)
-        pixel, _, _, raw = loop.block()
-        _, _, weight, stored, _ = loop.blend(raw, v.load(pixel))
-        v.store(stored, pixel)
-        for value in loop.color:
-            pixel = offset(builder, pixel, int64(PLANE))
-            v.store(v.fma(weight, value, v.load(pixel)), pixel)
-        loop.close([])
-        return context.get_dummy_value()
+    @intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
+    def blocks(
+        typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
+        begin: Any, end: Any, gaussian: Any,
+    ) -> Generated:  # fmt: skip
+        integer = types.int64
+        signature = types.void(variant, tile, records, colors, starts, xis, etas, integer, integer, integer)
+        chosen = Variant.unpack(variant.literal_value)
 
-    return signature, generate
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas")
+            loop = BlockLoop(builder, chosen, pointers, args[9])
+            loop.open(args[7], args[8], 0)
+            turn(loop)
+            loop.close([])
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return blocks
+
+
+def _composite(loop: BlockLoop) -> None:
+    """Blend the Gaussian into the current block."""
+    v = loop.v
+    pixel, _, _, raw = loop.block()
+    _, _, weight, stored, _ = loop.blend(raw, v.load(pixel))
+    v.store(stored, pixel)
+    for value in loop.color:
+        pixel = offset(loop.b, pixel, int64(PLANE))
+        v.store(v.fma(weight, value, v.load(pixel)), pixel)
+
+
+def _replay(loop: BlockLoop) -> None:
+    """Bring T and R behind a Gaussian that wants no gradients, as `differentiate_blocks` does."""
+    pixel, _, _, raw = loop.block()
+    _, _, weight, stored, _ = loop.blend(raw, loop.v.load(pixel))
+    loop.pass_on(pixel, stored, weight)
+
+
+composite_blocks, replay_blocks = _over_blocks(_composite), _over_blocks(_replay)
 
 
 @intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
@@ -209,29 +229,6 @@ def differentiate_blocks(
         for first in range(0, len(final), 8):
             out = offset(b, pointers["sums"], b.add(args[11], int64(first)))
             Lanes(b, 8).store(_sum_across(v, final[first : first + 8]), out)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@intrinsic(prefer_literal=True)  # type: ignore[untyped-decorator]
-def replay_blocks(
-    typing_context: Any, variant: Any, tile: Any, records: Any, colors: Any, starts: Any, xis: Any, etas: Any,
-    begin: Any, end: Any, gaussian: Any,
-) -> Generated:  # fmt: skip
-    """Bring T and R behind a Gaussian that wants no gradients, as `differentiate_blocks` does."""
-    integer = types.int64
-    signature = types.void(variant, tile, records, colors, starts, xis, etas, integer, integer, integer)
-    chosen = Variant.unpack(variant.literal_value)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointers = pointers_of(context, builder, sig, args, "tile records colors starts xis etas")
-        loop = BlockLoop(builder, chosen, pointers, args[9])
-        loop.open(args[7], args[8], 0)
-        pixel, _, _, raw = loop.block()
-        _, _, weight, stored, _ = loop.blend(raw, loop.v.load(pixel))
-        loop.pass_on(pixel, stored, weight)
-        loop.close([])
         return context.get_dummy_value()
 
     return signature, generate

@@ -18,7 +18,7 @@ import numpy as np
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import helper, kernel
 from spike4dgs.method.splat.kernels.vector_ir import bits_double, double_bits, fetch_add, float_bits
-from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN
+from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 
 BLOCK = 128  # Gaussians per work item
 CULLED = np.uint32(0xFFFFFFFF)  # depth key of an invisible Gaussian
@@ -40,15 +40,11 @@ class Geometry(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """V cameras of one image size, and how Gaussians are projected into their images.
-
-    `entries` has a row for each.
-    """
+    """V cameras of one image size, a row of `entries` for each, and the pixel filter of their images."""
 
     entries: np.ndarray  # [V, 16] float64: R row by row (9), t (3), fx, fy, cx, cy
     width: int
     height: int
-    near: float
     eps2d: float
     antialiased: bool
 
@@ -168,7 +164,7 @@ def gather_parameters(s: np.ndarray, l: int, i: int, geometry: Any) -> None:  # 
 @kernel
 def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any) -> None:
     """Project all Gaussians (a `Geometry`) into all `Cameras` and fill `out` (a `Projected`)."""
-    views, (_, width, height, near, eps2d, antialiased) = len(cameras.entries), cameras
+    views, (_, width, height, eps2d, antialiased) = len(cameras.entries), cameras
     n_all, across = len(geometry.means), (width + TILE_WIDTH - 1) // TILE_WIDTH
     blocks = (n_all + BLOCK - 1) // BLOCK
     while True:
@@ -186,7 +182,7 @@ def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any)
         for l in range(n, BLOCK):  # noqa: E741
             gather_parameters(s, l, first, geometry)
         for l in range(BLOCK):  # noqa: E741
-            project_lane(s, l, R, t, f, limits, width, height, near, eps2d, antialiased)
+            project_lane(s, l, R, t, f, limits, width, height, eps2d, antialiased)
         histogram[block, :] = 0
         invalid[block] = -1
         total = 0
@@ -222,7 +218,7 @@ def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any)
 
 @helper
 def project_lane(
-    s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, width: int, height: int, near: float, eps2d: float,  # noqa: E741
+    s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, width: int, height: int, eps2d: float,  # noqa: E741
     antialiased: bool,
 ) -> None:  # fmt: skip
     """Project one lane; DEPTH becomes -1 where the Gaussian is invisible."""
@@ -233,7 +229,7 @@ def project_lane(
     s[BAD + l] = 0.0 if everything - everything == 0.0 else 1.0
     x, y = R[0] * mx + R[1] * my + R[2] * mz + t[0], R[3] * mx + R[4] * my + R[5] * mz + t[1]
     z = R[6] * mx + R[7] * my + R[8] * mz + t[2]
-    inverse_z = 1.0 / max(z, near)
+    inverse_z = 1.0 / max(z, NEAR)
     u, v = x * inverse_z, y * inverse_z
     q = rotation(qw, qx, qy, qz)
     a = (q[0] * sx, q[1] * sy, q[2] * sz, q[3] * sx, q[4] * sy, q[5] * sz, q[6] * sx, q[7] * sy, q[8] * sz)
@@ -250,7 +246,7 @@ def project_lane(
     across = (cx + half_width >= 0.5) & (cx - half_width <= width - 0.5)
     down = (cy + half_height >= 0.5) & (cy - half_height <= height - 0.5)
     visible = (o >= ALPHA_MIN) & (det > 0.0) & (det < math.inf) & (qw * qw + qx * qx + qy * qy + qz * qz > 0.0)
-    s[DEPTH + l] = z if (z >= near) & visible & across & down else -1.0
+    s[DEPTH + l] = z if (z >= NEAR) & visible & across & down else -1.0
     s[CX + l], s[CY + l], s[SLOPE + l] = cx, cy, xy / xx
     s[HX + l], s[HY + l], s[XTOP + l] = half_width, half_height, xy / yy * half_height
     s[XIS + l], s[ETAS + l] = math.sqrt(HALF_LOG2E / xx), math.sqrt(HALF_LOG2E * xx / det)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clock_world import ClockWorld
+from scipy.spatial.transform import Rotation
 
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.scene.camera_state import CameraState, Clock
@@ -16,7 +17,6 @@ from spike4dgs.method.recordings.recording import GIVEN, Recording
 from spike4dgs.method.recordings.self_calibrated import self_calibrated, survey_clocks
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings
-from spike4dgs.method.self_calibration.pose_adjustment import turn
 
 SHORT = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1).training
 
@@ -41,7 +41,7 @@ def test_what_is_given_is_not_looked_at() -> None:
 def test_wrong_poses_are_adjusted_and_said() -> None:
     rng, given = np.random.default_rng(0), []
     for camera in SHORT.cameras:
-        R = turn(np.radians(0.5) * rng.normal(size=3)) @ camera.R
+        R = Rotation.from_rotvec(np.radians(0.5) * rng.normal(size=3)).as_matrix() @ camera.R
         given.append(replace(camera, R=R, t=-R @ camera.center))
     found = self_calibrated(recording(replace(SHORT, cameras=tuple(given))), "auto", "given", seed=0)
     assert found.changed == ("poses",) and found.given == tuple(given)

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clock_world import ClockWorld
+from scipy.spatial.transform import Rotation
 
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, angle_deg
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings, Tracks, adjust, triangulated, turn
+from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings, Tracks, adjust, triangulated
 from spike4dgs.method.self_calibration.poses import check_poses, pose_of_another
 
 WORLD = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1)
@@ -23,7 +24,7 @@ def off(cameras: Sequence[Camera], degrees: float, seed: int = 0) -> tuple[Camer
     rng, moved = np.random.default_rng(seed), []
     for camera in cameras:
         axis = rng.normal(size=3)
-        R = turn(np.radians(degrees) * axis / np.linalg.norm(axis)) @ camera.R
+        R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix() @ camera.R
         moved.append(replace(camera, R=R, t=-R @ camera.center))
     return tuple(moved)
 

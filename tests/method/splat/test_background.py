@@ -16,7 +16,7 @@ from spike4dgs.method.splat.types import CUSTOMARY
 
 
 def rows(splats: Splats, index: Tensor) -> Splats:
-    return Splats(*(t[index].float() for t in (*splats.geometry, splats.colors)))
+    return Splats(*(t[index].float() for t in splats.tensors))
 
 
 BOX = PixelFilter(1 / 12, compensated=True)
@@ -28,7 +28,7 @@ def both_ways(splats: Splats, v: Views, moving: Tensor, chosen: list[int], f: Pi
     order = torch.cat([torch.nonzero(~moving)[:, 0], torch.nonzero(moving)[:, 0]])
     everything = [t.requires_grad_() for t in (*rows(splats, order).geometry, rows(splats, order).colors)]
     own = [t.requires_grad_() for t in (*rows(splats, moving).geometry, rows(splats, moving).colors)]
-    expected = render(Splats(*everything), few, eps2d=f.variance, antialiased=f.compensated, backend="cpu")
+    expected = render(Splats(*everything), few, f, backend="cpu")
     found = Background(rows(splats, ~moving), v, f).render(Splats(*own), chosen)
     assert torch.equal(found.image, expected.image) and torch.equal(found.alpha, expected.alpha)
     n = int((~moving).sum())
@@ -90,7 +90,7 @@ def test_a_view_that_comes_back_gets_a_background_of_its_own() -> None:
     kept = repeated.in_view(Views(v.w2c[:1].clone(), v.K[:1].clone(), v.width, v.height))
     assert kept is not None and repeated.in_view(one[0]) is kept, "the same camera, whichever object says so"
     moving = rows(random_splats(30, seed=1), torch.arange(30))
-    expected = render(join(splats, moving), one[0], eps2d=BOX.variance, antialiased=BOX.compensated, backend="cpu")
+    expected = render(join(splats, moving), one[0], BOX, backend="cpu")
     assert torch.equal(kept.render(moving, [0]).image, expected.image)
     assert repeated.in_view(Views(v.w2c[:1], v.K[:1], v.width, v.height - 1)) is None, "another size"
     assert all(repeated.in_view(view) is None for view in one[1:]), "each of them is seen once"

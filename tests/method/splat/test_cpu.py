@@ -18,7 +18,7 @@ from splat_parity import differentiate
 from splat_scenes import HARD, changed, far_origin, random_splats, views
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.splat import Splats, Views, cpu, render, set_threads
+from spike4dgs.method.splat import PixelFilter, Splats, Views, cpu, render, set_threads
 from spike4dgs.method.splat.kernels.threads import work_alone
 
 SUPPORT = Path(splat_parity.__file__).parent
@@ -31,7 +31,7 @@ def compare(splats: Splats, v: Views, **options: bool) -> None:
 @pytest.mark.parametrize("scene", [scene for scene in HARD if scene is not far_origin])  # float64 alone resolves that
 def test_hard_scenes_in_float32(scene: Callable[[], tuple[Splats, Views]]) -> None:
     splats, v = scene()
-    compare(Splats(*(t.float() for t in (*splats.geometry, splats.colors))), v)
+    compare(Splats(*(t.float() for t in splats.tensors)), v)
 
 
 @pytest.mark.parametrize(("channels", "depth"), [(1, False), (1, True), (2, False), (3, True), (4, False), (9, True)])
@@ -96,15 +96,6 @@ def test_threads_that_render_at_once_do_not_disturb_one_another() -> None:
         assert all(pool.map(same, range(4)))
 
 
-def test_background_shows_through() -> None:
-    splats, v = random_splats(50, 3, seed=24), views()
-    background = torch.tensor([0.2, 0.5, 0.9], requires_grad=True)
-    plain, out = render(splats, v), render(splats, v, background=background)
-    torch.testing.assert_close(out.image, plain.image + (1 - plain.alpha)[..., None] * background)
-    out.image.sum().backward()
-    torch.testing.assert_close(background.grad, (1 - plain.alpha).sum().expand(3))
-
-
 def test_nothing_is_differentiated_without_need() -> None:
     out = render(random_splats(20), views())
     assert not out.image.requires_grad and not out.means2d.requires_grad
@@ -123,8 +114,8 @@ def test_one_line_errors() -> None:
         Splats(s.means, s.quats[:4], s.scales, s.opacities, s.colors)
     with pytest.raises(UserError, match="camera"):
         Views(v.w2c[:0], v.K[:0], 10, 10)
-    with pytest.raises(UserError, match="background"):
-        render(s, v, background=torch.ones(2))
+    with pytest.raises(UserError, match="variance"):
+        render(s, v, PixelFilter(-0.1))
     with pytest.raises(UserError, match="backend"):
         render(s, v, backend="opengl")  # type: ignore[arg-type]
     for name in ("means", "quats", "scales", "opacities", "colors"):

@@ -38,7 +38,7 @@ def over_squares(sigma_px: float, u: float, v: float, opacity: float) -> torch.T
 
 
 def image(splats: Splats, f: PixelFilter, backend: str) -> torch.Tensor:
-    out = render(splats, view(), eps2d=f.variance, antialiased=f.compensated, backend=backend)  # type: ignore[arg-type]
+    out = render(splats, view(), f, backend=backend)  # type: ignore[arg-type]
     return out.image[0, ..., 0].double()
 
 

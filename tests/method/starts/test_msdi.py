@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -33,7 +32,6 @@ from spike4dgs.method.starts.msdi import (
     msdi,
     msdi_matched,
     shrunk,
-    unposed,
 )
 from spike4dgs.method.starts.rig import Cloud, RigSettings, matched, rig
 
@@ -128,16 +126,6 @@ def test_the_start_is_that_of_corrected_images_where_views_match(random_network:
     np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 
-def test_without_poses_the_rig_is_found_again(perfect: Estimate) -> None:
-    start = unposed(SCENE, perfect, seed=0, calibrated=False)
-    for found, true in zip(start.cameras, SCENE.cameras, strict=True):
-        assert angle_deg(found.R @ true.R.T) < 0.1
-        assert np.linalg.norm(found.center - true.center) < 0.01
-        assert found.fx == pytest.approx(true.fx, rel=0.01)
-    error = depth_errors(start, SCENE.cameras[3])
-    assert len(error) > 1000 and np.median(error) < 0.01
-
-
 def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.MonkeyPatch) -> None:
     world = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
     scene, camera = world.training, world.training.cameras[0]
@@ -153,13 +141,6 @@ def test_poses_that_the_network_begins_and_matches_end(monkeypatch: pytest.Monke
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 120) & (v < 76)
     expected = world.trace(world.held_out, 0.5)[1][v[inside], u[inside]]
     assert inside.sum() > 2000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
-
-
-def test_a_view_without_a_pose_is_named(perfect: Estimate) -> None:
-    points = perfect.points.copy()
-    points[2] = np.random.default_rng(0).normal(size=points[2].shape)
-    with pytest.raises(UserError, match=f"a pose for each view, found none for {SCENE.cameras[2].id}"):
-        unposed(SCENE, replace(perfect, points=points), seed=0, calibrated=True)
 
 
 def test_a_shrunk_camera_sees_the_same_points() -> None:

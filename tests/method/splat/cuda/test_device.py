@@ -43,7 +43,7 @@ pytestmark = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
 
 
 def on_device(splats: Splats) -> list[torch.Tensor]:
-    return [t.detach().to("cuda").requires_grad_() for t in (*splats.geometry, splats.colors)]
+    return [t.detach().to("cuda").requires_grad_() for t in splats.tensors]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -52,7 +52,7 @@ def test_hard_scenes(scene: Callable[[], tuple[Splats, Views]], dtype: torch.dty
     splats, v = scene()
     if scene is far_origin and dtype == torch.float32:
         pytest.skip("float32 resolves 1 mm at 1e4 m: promised for float64 inputs only")
-    cast = Splats(*(t.to(dtype) for t in (*splats.geometry, splats.colors)))
+    cast = Splats(*(t.to(dtype) for t in splats.tensors))
     splat_parity.compare(cast, v, "cuda", "cuda")
 
 

@@ -11,15 +11,16 @@ from spike4dgs.method.splat import render
 from spike4dgs.method.splat.cuda.prepare import TILE, all_tiles, make_pairs, project, sort_pairs
 from spike4dgs.method.splat.cuda.render import grid_of
 from spike4dgs.method.splat.reference import project as project_reference
+from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("scene", HARD)
 def test_projection_equals_the_reference(scene, antialiased: bool) -> None:  # type: ignore[no-untyped-def]
     splats, v = scene()
-    seen = project(splats, v, antialiased, 0.01, 0.3)
+    seen = project(splats, v, PixelFilter(compensated=antialiased))
     for c in range(len(v)):
-        wanted = project_reference(splats, v.w2c[c], v.K[c], (v.width, v.height), antialiased, 0.01, 0.3)
+        wanted = project_reference(splats, v.w2c[c], v.K[c], (v.width, v.height), PixelFilter(compensated=antialiased))
         mine = seen.view == c
         order = torch.argsort(seen.depth[mine].float(), stable=True)
         assert torch.equal(seen.index[mine][order], wanted.index)
@@ -29,7 +30,7 @@ def test_projection_equals_the_reference(scene, antialiased: bool) -> None:  # t
 
 def test_every_tile_lists_what_its_pixels_may_see_nearest_first() -> None:
     splats, v = random_splats(200, seed=3), views(2)
-    seen, grid = project(splats, v, False, 0.01, 0.3), grid_of(v)
+    seen, grid = project(splats, v, CUSTOMARY), grid_of(v)
     pairs = make_pairs(seen.view, seen.box, seen.depth, grid)
     slots = torch.arange(len(pairs.keys))
     lists = sort_pairs(grid, pairs.keys, pairs.rows, slots, all_tiles(grid, torch.device("cpu")))
