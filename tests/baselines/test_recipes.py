@@ -11,7 +11,7 @@ import pytest
 from spike4dgs.baselines.images.tfp import tfp_image
 from spike4dgs.baselines.recipes import CALIBRATED, PARTS, POSED, RECIPES, SUPERVISED
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods, get_method
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.method.fit import RecipeMethod
@@ -101,12 +101,6 @@ def test_a_recipe_holds_settings_of_its_own_parts_only() -> None:
     assert METHODS["tfp+static"].params["settings"]["motion"] == {}
 
 
-def test_the_entry_point_finds_them() -> None:
-    found = find_methods()
-    assert all(found[name] is METHODS[name] for name in METHODS)
-    assert get_method("tfp+static") is METHODS["tfp+static"]
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_params_survive_json(name: str) -> None:
     params = METHODS[name].params
@@ -165,22 +159,6 @@ def test_an_unknown_part_is_named(part: str) -> None:
     parts: dict[str, Any] = {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"}
     with pytest.raises(UserError, match=f"recipe mine: expected {part} among .*found 'nothing'"):
         RecipeMethod(Recipe("mine", **{**parts, part: "nothing"}), PARTS)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "found"),
-    [
-        ({"motion.levle": 2}, "'motion.levle'"),
-        ({"motion.levels": 2.5}, "2.5"),
-        ({"trainer.ramp": "0.5"}, "'0.5'"),
-        ({"motion.levels": True}, "True"),
-        ({"levels": 2}, "'levels'"),
-    ],
-)
-def test_an_unknown_or_mistyped_setting_is_named(overrides: dict[str, Any], found: str) -> None:
-    recipe = Recipe("mine", "tfp", "rig", "hexplane", "pixel", settings=overrides)
-    with pytest.raises(UserError, match=f"recipe mine: expected .*found {found}"):
-        RecipeMethod(recipe, PARTS)
 
 
 def test_a_recipe_overrides_the_numbers_of_its_image_maker(scene: Scene) -> None:

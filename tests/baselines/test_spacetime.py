@@ -223,17 +223,6 @@ def surface() -> tuple[Tensor, np.ndarray]:
     return torch.from_numpy(points.astype(np.float32)), board[v, u]
 
 
-def test_points_are_seen_where_the_cameras_see_them() -> None:
-    points, _ = surface()
-    rows, inside = project(points, make_training_images(1).views)
-    for i, camera in enumerate(WORLD.cameras):
-        uv, z = camera.project(points.double().numpy())
-        within = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
-        assert (inside[i].numpy() == within).all()
-        u, v = np.floor(uv[within]).astype(int).T
-        assert (rows[i].numpy()[within] == v * camera.width + u).all()
-
-
 def test_only_what_moves_is_laid_down_several_times_with_the_values_of_its_times() -> None:
     points, board = surface()
     f = make_training_images()

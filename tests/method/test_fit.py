@@ -25,20 +25,13 @@ SHORT = Budget(scale=0.005)
 
 
 @cache
-def fitted(name: str) -> tuple[Model, tuple[float, ...]]:
-    """A model and the losses that its fit reported."""
-    losses: list[float] = []
-
-    def note(done: int, total: int, note: str = "") -> None:
-        if note.startswith("loss "):
-            losses.append(float(note.split()[1].rstrip(",")))
-
-    return METHODS[name].fit(WORLD.training, FitRequest(Budget(scale=0.2), progress=note)), tuple(losses)
+def fitted(name: str) -> Model:
+    return METHODS[name].fit(WORLD.training, FitRequest(Budget(scale=0.2)))
 
 
 @cache
 def psnr(name: str, moving: bool) -> float:
-    return WORLD.psnr(fitted(name)[0], moving)
+    return WORLD.psnr(fitted(name), moving)
 
 
 @pytest.mark.slow
@@ -48,14 +41,6 @@ def test_a_deforming_scene_beats_a_static_one_and_the_nearest_view(moving: bool)
     print(f"moving={moving}: tfp+4dgs {ours:.2f}, tfp+static {static:.2f}, nearest-view {nearest:.2f} dB")
     assert ours > nearest + 3
     assert ours > static + (2 if moving else 0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["tfp+4dgs", "tfp+static"])
-def test_the_loss_falls(name: str) -> None:
-    losses = fitted(name)[1]
-    quarter = len(losses) // 4
-    assert np.mean(losses[-quarter:]) < 0.75 * np.mean(losses[:2])
 
 
 def test_a_model_has_the_filter_that_its_recipe_fits_with() -> None:
@@ -68,7 +53,7 @@ def test_a_model_has_the_filter_that_its_recipe_fits_with() -> None:
 
 @pytest.mark.slow
 def test_a_model_renders_the_same_bits_again_and_stops_at_the_ends_of_the_clip() -> None:
-    model, end = fitted("tfp+4dgs")[0], WORLD.training.duration_us
+    model, end = fitted("tfp+4dgs"), WORLD.training.duration_us
     images = {t: model.render(WORLD.held_out, t) for t in (-1e6, 0.0, 0.5 * end, end, 1e9)}
     np.testing.assert_array_equal(images[-1e6], images[0.0])
     np.testing.assert_array_equal(images[1e9], images[end])

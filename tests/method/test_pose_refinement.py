@@ -122,25 +122,6 @@ def test_wrong_poses_become_better_and_the_image_sharp() -> None:
     assert WORLD.psnr(refined, moving=False) > WORLD.psnr(kept, moving=False) + 4
 
 
-def test_a_resumed_fit_has_the_same_poses(tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill(done: int, total: int, note: str = "") -> None:
-        if note.startswith("loss") and done >= 20:
-            raise Killed
-
-    short = method(coarse_steps=30)
-    whole = short.fit(SCENE, FitRequest())
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-        patch.setattr("spike4dgs.method.trainer.Trainer.run.__defaults__", (None, "", 0.0))
-        short.fit(SCENE, FitRequest(progress=kill, checkpoint=tmp_path / "c.safetensors"))
-    again = short.fit(SCENE, FitRequest(checkpoint=tmp_path / "c.safetensors"))
-    for a, b, start in zip(whole.cameras, again.cameras, wrong(SCENE, 0).cameras, strict=True):
-        np.testing.assert_array_equal(a.w2c, b.w2c)
-        assert a.id == "cam_00" or not np.array_equal(a.w2c, start.w2c)
-
-
 class Spanned(ImageMaker):
     """A stand-in for the images part whose values are means over ten ticks."""
 

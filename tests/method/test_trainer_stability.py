@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -38,7 +39,7 @@ class PixelTwin(Pixel):
 class TrainerTwin(Trainer):
     """Renders with the slow renderer, which is float64 throughout."""
 
-    def _render(self, splats: Splats, views: Views) -> RenderOutput:
+    def _image(self, splats: Splats, chosen: Sequence[int], views: Views) -> RenderOutput:
         return render(splats, views, backend="reference")
 
 
@@ -67,7 +68,7 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     def rendered() -> Tensor:
         with torch.no_grad():
             splats = [model.splats(fit.gaussians, t) for t in (0.1, 0.5, 0.9)]
-            return torch.stack([fit._render(g, training_images.views).image[..., 0] for g in splats])
+            return torch.stack([fit._image(g, (), training_images.views).image[..., 0] for g in splats])
 
     before = rendered()
     fit.run(silent)

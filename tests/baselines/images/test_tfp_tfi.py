@@ -91,14 +91,6 @@ def test_a_moving_edge_is_where_it_was_at_the_start_of_the_tick() -> None:
         assert abs(edge - 30) < 0.1 if name == "tfp" else abs(edge - 30) < 0.5
 
 
-@pytest.mark.parametrize("tick", [-1, 20])
-def test_a_tick_outside_the_clip_is_refused(tick: int) -> None:
-    stream = stream_of(np.ones((20, 2, 2), np.uint8))
-    for maker in IMAGES.values():
-        with pytest.raises(UserError, match=r"memory: expected ticks within \[0, 20\), found .*; "):
-            maker(stream, [tick], 0.6)
-
-
 @pytest.mark.parametrize("half_window", [0, 40000])
 def test_a_window_out_of_range_is_refused(half_window: int) -> None:
     with pytest.raises(UserError, match="half_window: expected 1 to 32767 ticks"):

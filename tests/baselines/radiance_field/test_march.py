@@ -30,25 +30,6 @@ def test_encoding_is_the_formula() -> None:
     assert len(out) == encoded_size(3, 5)
 
 
-@pytest.mark.parametrize("density", [0.0, 0.3, 5.0])
-def test_weights_of_a_slab_of_constant_density(density: float) -> None:
-    """Through d metres of density s the light that is stopped is 1 - exp(-s d), however it is sampled."""
-    length, steps = 1.4, 300
-    z = torch.cat([torch.rand(1, steps, generator=rng(), dtype=torch.float64).sort().values, torch.ones(1, 1)], 1)
-    z = 2 + 3 * z
-    inside = (z > 3) & (z < 4)
-    weights = weigh(density * inside.double(), z, torch.tensor([length], dtype=torch.float64))
-    stopped = float((weights * inside).sum())
-    first, last = torch.nonzero(inside)[[0, -1], 1]
-    path = length * float(z[0, last + 1] - z[0, first])  # a sample stands for the stretch up to the next
-    assert stopped == pytest.approx(1 - math.exp(-density * path), abs=1e-12)
-    assert path == pytest.approx(length, abs=0.05)
-    # and inside, the shares fall off exponentially
-    depth = length * (z[0, inside[0]] - z[0, first])
-    expected = torch.exp(-density * depth) * -torch.expm1(-density * length * z.diff()[0, inside[0, :-1]])
-    torch.testing.assert_close(weights[inside], expected, rtol=1e-9, atol=1e-15)
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(3, 40))
 def test_weights_are_the_recursion_and_sum_to_one(seed: int, n: int) -> None:
@@ -79,18 +60,6 @@ def test_resampling_is_interpolation_of_the_inverse_cdf(seed: int, n: int) -> No
         share = weights[r, 1:-1].numpy() + 1e-5
         cdf = np.concatenate([[0], np.cumsum(share / share.sum())])
         np.testing.assert_allclose(found[r].numpy(), np.interp(u[r].numpy(), cdf, middles), atol=1e-9)
-
-
-def test_resampled_places_are_distributed_as_the_weights() -> None:
-    """Kolmogorov-Smirnov distance of 20,000 stratified samples to the CDF: below 0.005; unstratified below 0.012."""
-    fractions = (torch.arange(20) + 0.5)[None] / 20
-    weights = torch.exp(-((fractions - 0.4) ** 2) / 0.01) + 0.3 * (fractions > 0.8)
-    middles = ((fractions[0, 1:] + fractions[0, :-1]) / 2).double().numpy()
-    cdf = np.concatenate([[0], np.cumsum(weights[0, 1:-1].double().numpy())])
-    for u, bound in ((spread(1, 20_000, rng()), 0.005), (torch.rand(1, 20_000, generator=rng()), 0.012)):
-        x = resample(fractions, weights, u)[0].sort().values.double().numpy()
-        ks = np.abs(np.interp(x, middles, cdf / cdf[-1]) - (np.arange(len(x)) + 0.5) / len(x)).max()
-        assert ks < bound
 
 
 def test_a_ray_that_meets_nothing_is_sampled_everywhere() -> None:

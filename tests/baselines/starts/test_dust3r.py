@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from toy_world import ToyWorld
 
@@ -15,10 +13,9 @@ from spike4dgs.baselines.starts import dust3r as module
 from spike4dgs.baselines.starts.dust3r import Dust3rSettings, Pair, dust3r, predictor, resized, solve
 from spike4dgs.baselines.starts.dust3r_network import Dust3r, Dust3rShape, canonical, load_dust3r
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.pose_error import angle_deg, pose_errors
+from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.method.msdi.layers import rotate, unpack
-from spike4dgs.method.msdi.pose import solve_pose
+from spike4dgs.method.msdi.layers import rotate
 from spike4dgs.method.starts.structure_from_motion import clip_means
 
 TINY = Dust3rShape(2, 32, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
@@ -89,14 +86,6 @@ def test_both_decoders_see_the_other_image_and_have_weights_of_their_own() -> No
     assert not torch.allclose(a1, a2) and not torch.allclose(b1, b2) and not torch.allclose(swapped, b1)
 
 
-def test_output_is_unpacked_by_the_exponentials() -> None:
-    out = torch.tensor([0.3, -0.4, 1.2, 0.7]).view(1, 4, 1, 1)
-    points, confidence = unpack(out)
-    assert torch.allclose(points[0, 0, 0], out[0, :3, 0, 0] / 1.3 * (np.exp(1.3) - 1))
-    assert torch.allclose(confidence, 1 + torch.tensor(0.7).exp())
-    assert torch.equal(unpack(torch.zeros(1, 4, 1, 1))[0], torch.zeros(1, 1, 1, 3))
-
-
 def published(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """The names of the published file: the head's layers under their other names, and what is not needed."""
     names = {name.replace("layer_rn.0", "layer1_rn").replace("layer_rn.2", "layer3_rn"): t for name, t in state.items()}
@@ -149,25 +138,6 @@ def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(
         assert "found no consistent points" in str(e) or "cameras at different positions" in str(e)
     else:
         assert len(start.cameras) == 8 and np.isfinite(start.points).all()
-
-
-@pytest.mark.parametrize("outliers", [0.0, 0.3])
-def test_pnp_finds_the_pose(outliers: float) -> None:
-    rng = np.random.default_rng(4)
-    camera = replace(WORLD.cameras[3], R=Rotation.random(random_state=3).as_matrix())
-    uv, z = rng.uniform(0, 60, (300, 2)), rng.uniform(1, 5, 300)
-    points = camera.unproject(uv, z)
-    wrong = rng.random(300) < outliers
-    uv[wrong] += rng.uniform(20, 60, (int(wrong.sum()), 2))
-    pose = solve_pose(points, uv, camera.K, 0, reach_px=5.0)
-    assert pose is not None
-    assert np.radians(float(angle_deg(pose[0] @ camera.R.T))) < 1e-4 and np.abs(pose[1] - camera.t).max() < 1e-4
-
-
-def test_pnp_without_a_pose_says_so() -> None:
-    rng = np.random.default_rng(0)
-    points, pixels = rng.normal(size=(40, 3)), rng.uniform(0, 5000, (40, 2))
-    assert solve_pose(points, pixels, WORLD.cameras[0].K, 0, reach_px=5.0) is None
 
 
 def test_resized_view_sees_the_same_scene() -> None:

@@ -19,7 +19,7 @@ from spike4dgs.method.gaussians.optimizer import (
     set_learning_rate,
     set_learning_rates,
 )
-from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate, share
+from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate
 from spike4dgs.method.splat import Views, render
 
 SETTINGS = DensitySettings()
@@ -138,19 +138,6 @@ def test_relocation_prefers_opaque_hosts() -> None:
     edit = relocate(g, dead, torch.Generator().manual_seed(0))
     hosts = (edit.source < 0) & ~dead
     assert hosts[:200].sum() > 80 and hosts[200:].sum() < 8
-
-
-@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.99])
-@pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
-def test_shared_opacity_and_scale_follow_the_published_sums(opacity: float, copies: int) -> None:
-    new, shrink = (float(v) for v in share(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies])))
-    assert 1 - (1 - new) ** copies == pytest.approx(opacity, rel=1e-9)
-    total = sum(
-        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
-        for i in range(1, copies + 1)
-        for k in range(i)
-    )
-    assert shrink == pytest.approx(opacity / total, rel=1e-6)
 
 
 def test_relocation_changes_the_image_far_less_than_plain_copies_would() -> None:

@@ -80,18 +80,6 @@ def test_a_dark_stripe_between_bright_ones_is_dark():
     np.testing.assert_allclose(adaptive_image(stream, 160), 0.5, atol=0.02)
 
 
-@pytest.mark.parametrize("fired", [[], [7]])
-def test_pixels_with_fewer_than_two_spikes_have_the_clips_mean_rate(fired):
-    spikes = np.zeros((50, 2, 9), bool)
-    spikes[fired] = True
-    for tick in (0, 25, 49):
-        np.testing.assert_allclose(adaptive_image(stream_of(spikes), tick), len(fired) / 50)
-
-
-def test_a_saturated_pixel_has_one_spike_a_tick():
-    np.testing.assert_array_equal(adaptive_image(stream_of(np.ones((30, 3, 8), bool)), 3), 1)
-
-
 def test_spike_times_are_those_of_the_plain_array():
     spikes = np.random.default_rng(3).random((70, 30, 41)) < 0.3
     found = spike_times(stream_of(spikes, bottom_up=False))
@@ -207,7 +195,3 @@ def test_the_maker_gives_images_and_spans():
     np.testing.assert_allclose(images[1], rate / 0.5, rtol=1e-6)
     np.testing.assert_array_equal(spans[1], span)
     assert IMAGES["adaptive"].with_spans(stream, [20], 0.5)[1] is None, "an instant"
-
-
-def test_its_windows_are_those_of_adaptive():
-    assert IntervalSettings().shortest == AdaptiveSettings().shortest

@@ -53,22 +53,6 @@ def test_closed_form_equals_the_loop_in_rate_and_gradient(seed: int, reset: str,
     torch.testing.assert_close(results[0][1], results[1][1], rtol=0, atol=1e-12)
 
 
-def test_nothing_fires_in_the_dark_and_passes_no_gradient() -> None:
-    current = torch.zeros(5, requires_grad=True)
-    for reset in RESETS:
-        rate = firing_rate(current, torch.linspace(0, 0.99, 5), 256, reset)
-        (gradient,) = torch.autograd.grad(rate.sum(), current)
-        assert not rate.any() and not gradient.any()
-
-
-def test_above_one_spike_a_step_the_rate_is_one_and_the_gradient_still_leads_down() -> None:
-    current = torch.tensor([1.0, 1.3, 40.0], requires_grad=True)
-    for reset in RESETS:
-        rate = firing_rate(current, torch.zeros(3), 64, reset)
-        (gradient,) = torch.autograd.grad(rate.sum(), current)
-        assert torch.equal(rate, torch.ones(3)) and torch.equal(gradient, torch.ones(3))
-
-
 def test_mean_over_starts_is_the_current_and_the_surrogate_its_finite_difference() -> None:
     """Over uniform starts the subtractive rate is I exactly: smooth, with slope 1. The surrogate leaves out the steps
     after the last spike, on average half an interval: 1 - 1 / (2 I M), and never less than 1 - 1 / (I M)."""

@@ -78,34 +78,6 @@ def test_the_table_gives_the_values_and_gradients_of_phi_on_every_pixel(seed: in
         torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-12)
 
 
-def test_gradients_of_the_moments_are_finite_differences() -> None:
-    phi, step = other_phi(12, 3), 1e-6
-    counts = torch.arange(9).double()
-    spike = (counts / 8).requires_grad_()
-
-    def total(s: torch.Tensor) -> torch.Tensor:
-        average, deviation = every_pixel(phi, s)
-        return (average + 0.7 * deviation).sum()
-
-    average, deviation = window_moments(phi, spike, 8)
-    found = torch.autograd.grad((average + 0.7 * deviation).sum(), [spike, *phi.parameters()])
-    with torch.no_grad():
-        for i in range(9):
-            at = torch.zeros(9).double()
-            at[i] = step
-            numeric = (total(spike + at) - total(spike - at)) / (2 * step)
-            assert float(found[0][i]) == pytest.approx(float(numeric), rel=1e-5, abs=1e-8)
-        for gradient, parameter in zip(found[1:], phi.parameters(), strict=True):
-            for i in range(12):
-                values = []
-                for sign in (1, -1):
-                    parameter.view(-1)[i] += sign * step
-                    values.append(float(total(spike)))
-                    parameter.view(-1)[i] -= sign * step
-                numeric = (values[0] - values[1]) / (2 * step)
-                assert float(gradient.view(-1)[i]) == pytest.approx(numeric, rel=1e-5, abs=1e-8)
-
-
 def test_surrogate_gradient_is_that_of_the_mean_over_all_charges() -> None:
     """Over all charges the average of the window is a smooth function of the rate: a staircase with Gamma steps, of
     which the mean slope over one step is compared."""
@@ -136,15 +108,6 @@ def test_phi_begins_as_the_sequence_of_an_even_stream(ticks: int) -> None:
         assert float((average - s).abs().max()) < 0.5 / ticks
         middle = slice(32, -32)
         torch.testing.assert_close(deviation[middle], (s * (1 - s)).sqrt()[middle], rtol=0, atol=1.2 / ticks)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 50))
-def test_deviation_of_spikes_follows_from_their_average(seed: int, ticks: int) -> None:
-    rng = np.random.default_rng(seed)
-    spikes = rng.random((ticks, 30)) < rng.random(30)
-    a = spikes.mean(0)
-    np.testing.assert_allclose(spikes.std(0), np.sqrt(a * (1 - a)), atol=1e-12)
 
 
 @pytest.mark.parametrize("tick", [0, 60, 119])

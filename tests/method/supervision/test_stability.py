@@ -14,17 +14,7 @@ from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import measure
-from spike4dgs.method.gaussians.density import DensitySettings
-from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images.base import ImageMaker
-from spike4dgs.method.images.training import ImageSettings, make_training_images
-from spike4dgs.method.motion.table import Static
-from spike4dgs.method.schedule import TrainerSettings
-from spike4dgs.method.starts.base import Start
 from spike4dgs.method.supervision.base import Sample, Supervision
-from spike4dgs.method.torch_state import seeded
-from spike4dgs.method.trainer import Trainer
 
 SUPERVISIONS = PARTS.supervision
 
@@ -153,28 +143,3 @@ def test_float32_gives_the_losses_of_float64(name: str, make_scene: Callable[[],
     # A charge within rounding of the threshold may fire in one and not in the other: a spike of 80 x 384 in windows.
     assert values[0] == pytest.approx(values[1], rel=1e-4)
     assert float((gradients[0] - gradients[1]).norm()) < 2e-3 * float(gradients[1].norm())
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("make_scene", [one_camera_saw_nothing, no_number_in_one_map, one_tick_clip])
-def test_training_keeps_every_parameter_a_number(name: str, make_scene: Callable[[], TrainingScene]) -> None:
-    scene = make_scene()
-    s, spaced = TrainerSettings(coarse_steps=6, fine_steps=1, views_per_step=3), ImageSettings(time_spacing_ticks=40)
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-0.8, -0.2, 0.2], [0.8, 0.6, 1.2], (60, 3)).astype(np.float32)
-    start = Start(CAMERAS, points, rng.random(60).astype(np.float32))
-
-    def rate(stream: SpikeStream, tick: int, settings: object) -> np.ndarray:
-        image = stream.counts(0, scene.n_ticks) / np.float32(scene.n_ticks)
-        image[0, :3] = np.nan
-        return image
-
-    extent = measure(start, scene)
-    motion = Static(extent, Static.defaults, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, ImageMaker(name="mean", rate=rate), spaced, "cpu")
-    gaussians = from_points(points, start.values, opacity=0.5)
-    loss, density = SUPERVISIONS[name](SUPERVISIONS[name].defaults, scene), DensitySettings()
-    trainer = Trainer(training_images, gaussians, motion, loss, s, density, scale=extent.scale, seed=0)
-    losses = [float(trainer.train_step()) for _ in range(6)]
-    assert np.isfinite(losses).all()
-    assert all(v.isfinite().all() for k, v in trainer.state().tensors.items() if not k.startswith("statistics"))

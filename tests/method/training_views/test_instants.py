@@ -45,11 +45,6 @@ def test_quadratic_light_over_any_span_becomes_the_instant(half: float) -> None:
     assert (mean(p, a, b) - light(p, 0.0)).abs().max() > 1e-3, "without it they differ"
 
 
-def test_light_to_the_fifth_power_is_exact_over_the_whole_span() -> None:
-    p, b = polynomial(0.5, 0.01, -2e-3, 1e-4, 3e-5, -2e-6), torch.full(SHAPE, 10.0, dtype=torch.float64)
-    torch.testing.assert_close(corrected(p, -b, b, 10.0), light(p, 0.0))
-
-
 def test_a_span_that_reaches_far_is_not_followed_to_its_end() -> None:
     p, far = polynomial(0.5, 0.01), random(20, 60, 9)
     followed = correction(
