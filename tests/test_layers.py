@@ -27,8 +27,8 @@ ORDER = {
     "weights spikes scene exchange release metrics method runs reports",
     "generators": "profiles sensor worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
-    "method": "torch_state settings splat gaussians training_views motion supervision pose_refinement schedule models "
-    "checkpoint msdi images starts self_calibration trainer fit recipes viewing recordings",
+    "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
+    "schedule models checkpoint msdi images starts self_calibration trainer fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",
     "leaderboard": "tracks entry truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error rendering images recorder_runs recorder saved_models oracle_truth "

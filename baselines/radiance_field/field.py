@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
 import torch
@@ -14,30 +12,24 @@ from torch.nn import functional
 
 from spike4dgs.method.motion.hexplane import HexPlane, HexPlaneShape
 from spike4dgs.method.motion.mlp import perceptron
+from spike4dgs.method.two_threads import on_two_threads
 
 BLOCK = 2048  # rows; 1024 to 4096 take the same time within the noise for layers of 32 to 64
-PARTS = 2  # fixed, so that sums are taken in one order on any number of cores
 
 Rows = Callable[..., Tensor]  # row tensors [n, ...] -> [n, K], each row by itself
 
 
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(PARTS - 1, "field", initializer=lambda: torch.set_num_threads(1))
-
-
 def _cuts(rows: int) -> list[slice]:
-    """Return blocks of equal size, as many for each part."""
-    count = PARTS * -(-rows // (PARTS * BLOCK))
+    """Return blocks of equal size, as many for each of two threads."""
+    count = 2 * -(-rows // (2 * BLOCK))
     edges = [rows * i // count for i in range(count + 1)]
     return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
 
 
-def _in_parts(blocks: list[Any], work: Callable[[Any], Any]) -> list[list[Any]]:
-    """Call `work` on each of the blocks, on one thread per part; return the results by part."""
-    cut = len(blocks) // PARTS
-    later = _pool().submit(lambda: [work(b) for b in blocks[cut:]])
-    return [[work(b) for b in blocks[:cut]], later.result()]
+def _in_parts(blocks: list[Any], work: Callable[[Any], Any]) -> tuple[list[Any], list[Any]]:
+    """Call `work` on each of the blocks, in halves whatever the cores, so that sums keep their order."""
+    cut = len(blocks) // 2
+    return on_two_threads(lambda part: [work(b) for b in part], blocks[:cut], blocks[cut:])
 
 
 class _Blocks(torch.autograd.Function):

@@ -125,15 +125,19 @@ def hexplane_shape(extent: Extent, settings: HexPlaneSettings) -> HexPlaneShape:
     return HexPlaneShape(spatial, times, settings.features, settings.mlp_width)
 
 
-class HexPlaneDeformation(nn.Module):
-    """Features, one linear layer, five heads. Means move in units of `scale` metres."""
+class HexPlaneMotion(Motion):
+    """The motion `hexplane`: features, one linear layer, five heads. Means move in units of `scale` metres."""
 
-    def __init__(
-        self, shape: HexPlaneShape, low: Tensor, high: Tensor, scale: float, generator: torch.Generator
-    ) -> None:
+    label = "4DGS"
+    defaults = HexPlaneSettings()
+    # 4DGS's preset for several views sees 3,000 and 15,000 single images: steps of four here.
+    published = {"trainer.coarse_steps": 750, "trainer.fine_steps": 3750}
+
+    def __init__(self, extent: Extent, settings: HexPlaneSettings, generator: torch.Generator) -> None:
         super().__init__()
-        self.scale = scale
-        self.planes = HexPlane(shape, low, high, generator)
+        self.settings, self.scale = settings, extent.scale
+        shape = hexplane_shape(extent, settings)
+        self.planes = HexPlane(shape, extent.low, extent.high, generator)
         w = shape.width
         self.trunk = nn.Linear(shape.features * len(shape.spatial), w)
         self.hidden = nn.Linear(w, w * len(_CHANGES))  # the heads' first layers side by side
@@ -144,36 +148,15 @@ class HexPlaneDeformation(nn.Module):
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)
 
-    def changes(self, means: Tensor, t: float) -> dict[str, Tensor]:
-        """Return what is added to each parameter of Gaussians at `means` [N, 3] at the time t in [0, 1]."""
+    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
+        """Return the Gaussians at the time t in [0, 1]."""
         final: list[Tensor] = list(self.last.parameters())  # weight, bias, weight, bias, ...
         last = torch.block_diag(*final[0::2]), torch.cat(final[1::2])
         layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
-        out = perceptron(self.planes(means, t), layers)
-        parts = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))
-        return {**parts, "means": parts["means"] * self.scale, "logits": parts["logits"][:, 0]}
-
-    def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
-        """Return the Gaussians at the time t in [0, 1]."""
-        added = self.changes(gaussians.means, t)
+        out = perceptron(self.planes(gaussians.means, t), layers)
+        added = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))
+        added["means"], added["logits"] = added["means"] * self.scale, added["logits"][:, 0]
         return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
-
-    def mlp(self) -> list[nn.Parameter]:
-        """Return the parameters of the linear layers."""
-        return [*self.trunk.parameters(), *self.hidden.parameters(), *self.last.parameters()]
-
-
-class HexPlaneMotion(HexPlaneDeformation, Motion):
-    """The motion `hexplane`: the deformation with 4DGS's learning rates and regularisers."""
-
-    label = "4DGS"
-    defaults = HexPlaneSettings()
-    # 4DGS's preset for several views sees 3,000 and 15,000 single images: steps of four here.
-    published = {"trainer.coarse_steps": 750, "trainer.fine_steps": 3750}
-
-    def __init__(self, extent: Extent, settings: HexPlaneSettings, generator: torch.Generator) -> None:
-        super().__init__(hexplane_shape(extent, settings), extent.low, extent.high, extent.scale, generator)
-        self.settings = settings
 
     def splats(self, gaussians: Gaussians, t: float) -> Splats:
         """Return the deformed Gaussians."""
@@ -182,9 +165,10 @@ class HexPlaneMotion(HexPlaneDeformation, Motion):
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:
         """Return planes and MLP with their learning rates."""
         s = self.settings
+        mlp = [*self.trunk.parameters(), *self.hidden.parameters(), *self.last.parameters()]
         return {
             "grid": (list(self.planes.parameters()), Decay(s.lr_grid, s.lr_grid_last)),
-            "deformation": (self.mlp(), Decay(s.lr_deformation, s.lr_deformation_last)),
+            "deformation": (mlp, Decay(s.lr_deformation, s.lr_deformation_last)),
         }
 
     def regularizer(self) -> Tensor:

@@ -6,8 +6,6 @@ vectors instead of 6 * 4. The twin in plain torch is `hexplane.sample_level`. Gr
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,7 @@ from numba import njit
 from torch import Tensor
 
 from spike4dgs.benchmark.compilation import cached_njit
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "hexplane")
+from spike4dgs.method.two_threads import on_two_threads
 
 
 @njit(inline="always")
@@ -112,11 +106,7 @@ def _backward(unit, space, lines, grad, grad_unit, grad_space, grad_lines):
 
 def _each_level(jobs: list[tuple[Any, ...]]) -> None:
     """Run one kernel call per level, half of them on a second thread. Every result is written by one thread only."""
-    helpers = [_pool().submit(job[0], *job[1:]) for job in jobs[1::2]]
-    for job in jobs[0::2]:
-        job[0](*job[1:])
-    for helper in helpers:
-        helper.result()
+    on_two_threads(lambda some: [job[0](*job[1:]) for job in some], jobs[0::2], jobs[1::2])
 
 
 class _Levels(torch.autograd.Function):

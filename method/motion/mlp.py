@@ -8,29 +8,22 @@ cores. The twin is the same three layers in plain torch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from spike4dgs.method.two_threads import on_two_threads
+
 BLOCK = 512  # rows: 512 x 384 activations are 0.8 MB, within a core's second-level cache
-PARTS = 2  # fixed, so that sums are taken in one order on any number of cores
 
 
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(PARTS - 1, "perceptron", initializer=lambda: torch.set_num_threads(1))
-
-
-def _in_parts(rows: int, work: Callable[[list[slice]], Any]) -> list[Any]:
-    """Call `work` on each part's blocks of rows; return the results in order."""
+def _in_parts(rows: int, work: Callable[[list[slice]], Any]) -> tuple[Any, Any]:
+    """Call `work` on each half of the blocks of rows: two on any number of cores, so that sums keep their order."""
     blocks = [slice(a, min(a + BLOCK, rows)) for a in range(0, rows, BLOCK)]
-    cut = (len(blocks) + 1) // PARTS
+    cut = (len(blocks) + 1) // 2
     quiet = torch.no_grad()(work)  # the mode belongs to the thread that calls
-    later = _pool().submit(quiet, blocks[cut:])
-    return [quiet(blocks[:cut]), later.result()]
+    return on_two_threads(quiet, blocks[:cut], blocks[cut:])
 
 
 class _Perceptron(torch.autograd.Function):

@@ -28,6 +28,7 @@ from spike4dgs.benchmark.scene.lens import Distortion, distort, inside, nearest,
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
 M = TypeVar("M")
+Pair = tuple[float, float]
 _MARGIN_PX = 2  # around the camera's field of view: cubic interpolation reaches so far
 
 
@@ -63,14 +64,12 @@ def make_lenses(cameras: Sequence[Camera]) -> tuple[Lens, ...]:
     bounds = np.array([_bounds(camera) for camera in cameras])
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     left, top, right, bottom = (int(v) for v in (*low, *high))
+    corner, size = (left, top), (right - left, bottom - top)
     lenses = []
     for c in cameras:
-        to_camera, to_pinhole = _maps(
-            c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion, left, top, right - left, bottom - top
-        )
-        size = right - left, bottom - top
+        maps = _maps((c.width, c.height), (c.fx, c.fy), (c.cx, c.cy), c.distortion, corner, size)
         pinhole = replace(c, width=size[0], height=size[1], cx=c.cx - left, cy=c.cy - top, distortion=())
-        lenses.append(Lens(c, pinhole, to_camera, to_pinhole))
+        lenses.append(Lens(c, pinhole, *maps))
     return tuple(lenses)
 
 
@@ -82,30 +81,20 @@ def _bounds(camera: Camera) -> Float64:
 
 @lru_cache(maxsize=64)  # a model renders one camera many times
 def _maps(
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    lens: Distortion,
-    left: int,
-    top: int,
-    pinhole_width: int,
-    pinhole_height: int,
+    size: Pair, focal: Pair, principal: Pair, lens: Distortion, corner: Pair, pinhole_size: Pair
 ) -> tuple[Float64, Float64]:
-    """Return `Lens.to_camera` and `Lens.to_pinhole` of a pinhole that begins at (left, top) px of the camera's."""
-    f, c, corner = np.array([fx, fy]), np.array([cx, cy]), np.array([left, top])
-    there = (_centers(pinhole_width, pinhole_height) + corner - c) / f
-    here = (_centers(width, height) - c) / f
+    """Return `Lens.to_camera` and `Lens.to_pinhole` of a pinhole that begins at the `corner` px of the camera's."""
+    f, c = np.array(focal), np.array(principal)
+    there = (_centers(pinhole_size) + corner - c) / f
+    here = (_centers(size) - c) / f
     if not lens:
         return there * f + c, here * f + c - corner
     return distort(there, lens) * f + c, undistort(here, lens) * f + c - corner
 
 
-def _centers(width: int, height: int) -> Float64:
+def _centers(size: Pair) -> Float64:
     """Return the centres [height, width, 2] of pixels."""
-    v, u = np.mgrid[:height, :width] + 0.5
+    v, u = np.mgrid[: size[1], : size[0]] + 0.5
     return np.stack([u, v], axis=-1)
 
 

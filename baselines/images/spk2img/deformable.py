@@ -9,8 +9,6 @@ is written down.
 
 from __future__ import annotations
 
-import functools
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from spike4dgs.benchmark.compilation import cached_njit
 from spike4dgs.method.splat.kernels.vector_ir import Lanes, array_data, offset
+from spike4dgs.method.two_threads import on_two_threads
 
 
 def deformable_conv(x: Tensor, offsets: Tensor, masks: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -87,11 +86,6 @@ class DeformableConv(nn.Module):
 
 TAPS = 9
 GROUP = 8  # channels of a group, which the kernel knows when it is compiled: one vector
-
-
-@functools.cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "deformable")
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -160,9 +154,7 @@ def convolve(x: Tensor, found: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     batch, channels, height, width = x.shape
     pixels, guides = (t.permute(0, 2, 3, 1).contiguous().numpy() for t in (x, found))
     columns = torch.empty(batch, height, width, TAPS * channels)
-    sample: Any = functools.partial(_sample, pixels.reshape(-1), guides, columns.view(-1).numpy(), channels)
-    helper = _pool().submit(sample, 1, 2)  # every other row of pixels each
-    sample(0, 2)
-    helper.result()
+    given = pixels.reshape(-1), guides, columns.view(-1).numpy(), channels
+    on_two_threads(lambda first: _sample(*given, first, 2), 0, 1)  # every other row of pixels each
     matrix = weight.permute(2, 3, 1, 0).reshape(TAPS * channels, -1)
     return (columns.view(-1, TAPS * channels) @ matrix).add_(bias).view(batch, height, width, -1).permute(0, 3, 1, 2)

@@ -7,7 +7,7 @@ from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.hexplane import (
     HexPlane,
-    HexPlaneDeformation,
+    HexPlaneMotion,
     HexPlaneSettings,
     HexPlaneShape,
     hexplane_shape,
@@ -38,8 +38,9 @@ def gaussians(n: int = 50) -> Gaussians:
     )
 
 
-def motion() -> HexPlaneDeformation:
-    return HexPlaneDeformation(SHAPE, -torch.ones(3), torch.ones(3), 2.0, rng())
+def motion() -> HexPlaneMotion:
+    box = Extent(-torch.ones(3), torch.ones(3), 2.0, n_ticks=96, width=27)
+    return HexPlaneMotion(box, HexPlaneSettings(features=6, mlp_width=16), rng())
 
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
