@@ -22,6 +22,7 @@ from spike4dgs.benchmark.untrusted import MAX_LENGTH, positive, whole
 from spike4dgs.method.models.fitted_model import count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, make_filled, write_model
 from spike4dgs.method.motion.hexplane import HexPlaneShape
+from spike4dgs.method.starts.plane_sweep import pixels_of
 from spike4dgs.method.torch_state import one_torch_thread
 
 _MOST_LAYERS, _MOST_SAMPLES = 64, 4096  # that a file may state; published are 8 layers and 192 samples
@@ -158,8 +159,8 @@ def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Ten
     """
     depths, corners = [], []
     for camera in cameras:
-        uv, z = camera.project(points.astype(np.float64))
-        depths.append(z[(z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)])
+        inside, _, _, z = pixels_of(camera, points.astype(np.float64))
+        depths.append(z[inside])
     a, b = np.quantile(np.concatenate(depths), [0.005, 0.995])
     near, far = max(a - 0.05 * (b - a), 0.5 * a), b + 0.05 * (b - a) + 1e-3 * scale
     for camera in cameras:

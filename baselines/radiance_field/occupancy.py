@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.starts.plane_sweep import pixels_of
 
 DECAY = 0.8  # of the remembered density at each update of a cell: matter that has gone is forgotten after a few updates
 
@@ -110,9 +111,7 @@ def may_move(grid: Occupancy, cameras: Sequence[Camera], moving: NDArray[np.bool
     seen, static = np.zeros(len(centers), bool), np.zeros(len(centers), bool)
     for camera, mask in zip(cameras, moving, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
-            uv, z = camera.project(centers)
-            inside = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
-        u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+            inside, u, v, _ = pixels_of(camera, centers)
         seen |= inside
         static |= inside & ~mask[v, u]
     return torch.from_numpy(seen & ~static).to(grid.low.device)

@@ -115,8 +115,8 @@ def physical_loss(
         terms = physical_terms(graph, before, means, quats)
         return torch.stack([w * term for w, term in zip(weights, terms, strict=True)]).sum()
     turn = multiply(unit_quaternions(quats), before.inverse)
-    pairs = (graph.index, graph.root, graph.rest, graph.unit)
-    return weighted_terms(pairs, before.offsets, means, turn, rotation_matrices(turn), weights)
+    value: Tensor = _Terms.apply(means, turn, rotation_matrices(turn), graph, before.offsets, weights)
+    return value
 
 
 def _offsets(graph: Neighbours, means: Tensor) -> Tensor:
@@ -136,24 +136,12 @@ def color_term(colors: Tensor, before: Tensor) -> Tensor:
     return (colors - before).abs().sum(-1).mean()
 
 
-def weighted_terms(
-    graph: tuple[Tensor, Tensor, Tensor, float],
-    offsets: Tensor,
-    means: Tensor,
-    turns: Tensor,
-    rotations: Tensor,
-    weights: tuple[float, float, float],
-) -> Tensor:
+class _Terms(torch.autograd.Function):
     """weights . (rigidity, rotation, isometry), differentiable in means [N, 3], turns [N, 4], rotations [N, 3, 3].
 
-    graph: (index [N, k], root [N, k], rest [N, k], unit); offsets [N, k, 3] of the time before. float32 on the CPU.
+    `offsets` [N, k, 3] are those of the time before. float32 on the CPU. The gradient is made together with the value,
+    while the pairs are at hand.
     """
-    value: Tensor = _Terms.apply(means, turns, rotations, graph, offsets, weights)  # type: ignore[no-untyped-call]
-    return value
-
-
-class _Terms(torch.autograd.Function):
-    """The gradient is made together with the value, while the pairs are at hand."""
 
     @staticmethod
     def forward(
@@ -161,16 +149,15 @@ class _Terms(torch.autograd.Function):
         means: Tensor,
         turns: Tensor,
         rotations: Tensor,
-        graph: tuple[Tensor, Tensor, Tensor, float],
+        graph: Neighbours,
         offsets: Tensor,
         weights: tuple[float, float, float],
     ) -> Tensor:
-        index, root, rest, unit = graph
         moved = [t.detach().contiguous().numpy() for t in (means, turns, rotations)]
         gradients = [np.zeros_like(a) for a in moved]
-        fixed = [t.contiguous().numpy() for t in (index, root, rest, offsets)]
-        parts = tuple(np.float32(w / root.numel()) for w in weights)
-        total = _pairs(*fixed, *moved, *parts, np.float32(1 / unit), *gradients)
+        fixed = [t.contiguous().numpy() for t in (graph.index, graph.root, graph.rest, offsets)]
+        parts = tuple(np.float32(w / graph.root.numel()) for w in weights)
+        total = _pairs(*fixed, *moved, *parts, np.float32(1 / graph.unit), *gradients)
         ctx.save_for_backward(*map(torch.from_numpy, gradients))
         return torch.tensor(total, dtype=means.dtype)
 

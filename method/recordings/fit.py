@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -31,11 +30,10 @@ from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.predictions import MethodInfo
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
-from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.models.saved_model import SavedModel, load_model
-from spike4dgs.method.recordings.comparison import compare, mean_residual, residuals, write_sheet
+from spike4dgs.method.recordings.comparison import compare, mean_residual, write_sheet
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores, held_out_views, judge_held_out
 from spike4dgs.method.recordings.recording import Recording, open_recording
 from spike4dgs.method.recordings.report_page import Report, write_report
@@ -92,14 +90,10 @@ def fit_recording(
             about=saved.provenance,
             source=scene,
             poses=origin,
-            given=checked.given,
-            held_out=recording.held_out,
+            checked=checked,
+            found=found,
             judged=judged,
-            notes=(*recording.notes, f"the video is {slow_motion:.0f} times slower than the world"),
-            facts=recording.facts,
-            columns=checked.columns,
-            residuals=residuals(found),
-            maker=found.maker,
+            slow_motion=slow_motion,
             seconds=times,
             model_mb=(out / MODEL).stat().st_size / 1e6,
             environment=environment(request.device),
@@ -107,10 +101,8 @@ def fit_recording(
             video=VIDEO,
         )
         write_report(out / REPORT, report, out / SHEET)
-    _say(
-        console,
-        f"fit: {times['fit']:.1f} s; residual of the training views {mean_residual(found):.2f} dB (not a score)",
-    )
+    residual = f"{mean_residual(found):.2f} dB (not a score)"
+    _say(console, f"fit: {times['fit']:.1f} s; residual of the training views {residual}")
     if judged:
         _say(console, f"held-out {', '.join(recording.held_out)} by their own spikes: {_scores(judged)}")
     _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
@@ -153,16 +145,11 @@ def _fitted(
         model, fit_seconds = timed_fit(method, recording.training, watched, work, shown.note)
     if not isinstance(model, Savable):
         raise problem(f"method {method.name}", "a method whose models can be saved", "none", "choose another --method")
-    cameras = _fitted_cameras(model, about.cameras)
+    cameras = getattr(model, "cameras", ()) or about.cameras  # as the fit left them, where the model knows
     about = replace(about, cameras=cameras, fit_seconds=fit_seconds, created=utc_now())
     model.save(path, about)
     shutil.rmtree(out / "work")
     return SavedModel(model, about)
-
-
-def _fitted_cameras(model: Any, given: tuple[Camera, ...]) -> tuple[Camera, ...]:
-    """Return the training cameras as the fit left them, where the model knows them."""
-    return getattr(model, "cameras", ()) or given
 
 
 def _provenance(method: Method, recording: Recording, request: FitRequest, changed: tuple[str, ...]) -> Provenance:

@@ -22,6 +22,7 @@ from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.recordings.camera_facts import CameraFacts, camera_facts
 from spike4dgs.method.recordings.survey import survey_gains, survey_streams
+from spike4dgs.method.starts.plane_sweep import widest_baseline
 from spike4dgs.method.starts.structure_from_motion import FEATURES, FOCAL_PRIOR, clip_means, map_views
 
 GIVEN = "given by the scene"
@@ -114,7 +115,6 @@ def own_frame(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
 
     The origin is the mean centre, the unit of length the largest distance between two cameras.
     """
-    W, centers = array_axes(cameras), np.stack([c.center for c in cameras])
-    size = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
-    frame = Sim3(1 / size, W, -W @ centers.mean(axis=0) / size)
+    W, size = array_axes(cameras), widest_baseline(cameras)
+    frame = Sim3(1 / size, W, -W @ np.mean([c.center for c in cameras], axis=0) / size)
     return tuple(map(frame.camera, cameras))

@@ -9,22 +9,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import new_figure
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes
-from spike4dgs.method.recordings.camera_facts import CameraFacts
+from spike4dgs.method.recordings.comparison import Comparison, mean_residual, residuals
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from spike4dgs.method.recordings.self_calibrated import Calibrated
 
 ABOVE, BEHIND = (0, 1), (0, 2)  # of right, forward and up, the axes that a plot shows
 
@@ -49,19 +46,15 @@ img, video { max-width: 100%; height: auto; background: #fff; }
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Everything that the page shows. `given` are the cameras of the recording, `about.cameras` those of the fit."""
+    """Everything that the page shows. `about.cameras` are those of the fit."""
 
     about: Provenance
     source: Path  # the folder of the recording
     poses: str  # where they come from
-    given: tuple[Camera, ...]
-    held_out: tuple[str, ...]
+    checked: Calibrated  # the recording, and the cameras as it gave them
+    found: Comparison  # with the images that residuals are against
     judged: HeldOutScores | None  # the held-out cameras by their own spikes
-    notes: tuple[str, ...]
-    facts: Sequence[CameraFacts]
-    columns: Mapping[str, Mapping[str, str]]  # more of the table of cameras: head -> camera -> cell
-    residuals: Mapping[str, float]  # dB, by camera
-    maker: str  # of the images that residuals are against
+    slow_motion: float  # how many times slower than the world the video is
     seconds: Mapping[str, float]  # by step
     model_mb: float
     environment: Mapping[str, Any]
@@ -71,24 +64,24 @@ class Report:
 
 def write_report(path: Path, report: Report, sheet: Path) -> None:
     """Write the page; `sheet` is the PNG that it embeds."""
-    about = report.about
+    about, maker = report.about, report.found.maker
     title = f"{about.name} on {about.scene}"
-    notes = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    slow = f"the video is {report.slow_motion:.0f} times slower than the world"
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p>Fitted {escape(about.created)}. Files: <code>model.safetensors</code>, <code>sheet.png</code>, "
         f"<code>{escape(report.video)}</code>.</p>",
         _facts_table(_summary(report)),
-        f"<h2>Notes</h2><ul>{notes}</ul>" if notes else "",
+        f"<h2>Notes</h2>{_list([*report.checked.recording.notes, slow])}",
         "<h2>Video</h2>",
         f'<video src="{escape(report.video)}" controls loop muted playsinline></video>',
         "<h2>Training views</h2>",
-        f"<p>The {escape(report.maker)} image made from the spikes, the model's render, and their absolute "
+        f"<p>The {escape(maker)} image made from the spikes, the model's render, and their absolute "
         "difference, at three times. Pixels that were left out are white in the difference.</p>",
         f'<a href="{escape(sheet.name)}">{_image(sheet.read_bytes(), "training views")}</a>',
         "<h2>Cameras</h2>",
         _cameras_table(report),
-        f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {report.maker} "
+        f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {maker} "
         "images of the same camera. It is a residual of the fit and not a score: the model has seen these images, and "
         "their noise is in it. Dead pixels never fire under uniform light, hot ones fire in the dark five times as "
         "often as the median pixel, the rate of flickering ones is not steady. Without recordings of light and "
@@ -99,7 +92,7 @@ def write_report(path: Path, report: Report, sheet: Path) -> None:
         _held_out(report.judged) if report.judged else "",
         "<h2>Poses</h2>",
         f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
-        _image(poses_plot(about.cameras, report.given), "the array from above and from behind"),
+        _image(poses_plot(about.cameras, report.checked.given), "the array from above and from behind"),
         "<h2>Program</h2>",
         _facts_table(_program(report)),
     ]
@@ -114,11 +107,11 @@ def _summary(report: Report) -> list[tuple[str, str]]:
     about = report.about
     first = about.cameras[0]
     clip = f"{about.n_ticks} ticks at {about.rate_hz:g} Hz: {about.duration_us / 1e3:g} ms"
-    mean = _decibel(float(np.mean(list(report.residuals.values()))))
+    mean = _decibel(mean_residual(report.found))
     steps = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in report.seconds.items())
     cameras = f"{len(about.cameras)} of {first.width}x{first.height}"
-    if report.held_out:
-        cameras += f"; held out: {', '.join(report.held_out)}"
+    if held_out := report.checked.recording.held_out:
+        cameras += f"; held out: {', '.join(held_out)}"
     return [
         ("recording", str(report.source)),
         ("cameras", cameras),
@@ -152,38 +145,42 @@ def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
 
 def _cameras_table(report: Report) -> str:
     heads = ["camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %"]
-    heads += ["dead", "hot", "flickering", "gain", *report.columns, "residual, dB"]
-    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
-    focal = {camera.id: camera.fx for camera in report.about.cameras}
-    for f in report.facts:
+    heads += ["dead", "hot", "flickering", "gain", *report.checked.columns, "residual, dB"]
+    focal, residual = {camera.id: camera.fx for camera in report.about.cameras}, residuals(report.found)
+    rows = []
+    for f in report.checked.recording.facts:
         cells = [f.camera, f"{focal[f.camera]:.1f}", f"{f.missing}", *(f"{v:.4f}" for v in (f.mean, f.low, f.high))]
         cells += [*(f"{n}" for n in (f.dead, f.hot, f.flickering)), f"{f.gain:.3f}"]
-        cells += [column.get(f.camera, "-") for column in report.columns.values()]
-        cells.append(_decibel(report.residuals[f.camera]))
-        lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
-    rows = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f'<div class="scroll"><table>{rows}</table></div>'
+        cells += [column.get(f.camera, "-") for column in report.checked.columns.values()]
+        rows.append([*cells, _decibel(residual[f.camera])])
+    return _table(heads, rows)
 
 
 def _held_out(judged: HeldOutScores) -> str:
     """Return the section of the held-out cameras: a row for each, and their mean."""
     heads = ["camera", "images", *(f"{METRICS[m].title}{', dB' if METRICS[m].unit else ''}" for m in SHOWN)]
-    rows = [(camera, str(judged.images[camera]), values) for camera, values in judged.cameras.items()]
-    rows.append(("mean", str(sum(judged.images.values())), judged.mean))
-    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
-    for name, images, values in rows:
-        cells = [name, images, *(METRICS[m].format(values[m]) for m in SHOWN)]
-        lines.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
-    table = "".join(f"<tr>{line}</tr>" for line in lines)
-    notes = "".join(f"<li>{escape(METRICS[m].title)}: {escape(note)}</li>" for m, note in judged.notes.items())
+    found = [(camera, judged.images[camera], values) for camera, values in judged.cameras.items()]
+    found.append(("mean", sum(judged.images.values()), judged.mean))
+    rows = [[name, f"{n}", *(METRICS[m].format(values[m]) for m in SHOWN)] for name, n, values in found]
+    notes = [f"{METRICS[m].title}: {note}" for m, note in judged.notes.items()]
     return (
-        f'<h2>Held-out cameras</h2><div class="scroll"><table>{table}</table></div>'
+        f"<h2>Held-out cameras</h2>{_table(heads, rows)}"
         "<p>The fit has not seen these cameras. Their renders are compared with the spikes that they recorded "
         "themselves, without any ground truth. The spike PSNR (higher is better) compares counts over 5, 20 and 80 "
         "ticks; the noise of counting is in it, so compare it between models of one recording only. The spike deviance "
         "(lower is better) is what the recorded intervals lose in likelihood against the recorded rates.</p>"
-        + (f"<ul>{notes}</ul>" if notes else "")
+        + (_list(notes) if notes else "")
     )
+
+
+def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
+    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def _list(notes: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>"
 
 
 def _decibel(value: float) -> str:
@@ -200,11 +197,23 @@ def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
     moved = [(c, g) for c, g in zip(cameras, given, strict=True) if not np.allclose(c.w2c, g.w2c, atol=1e-9)]
     middle, frame = np.mean([c.center for c in given], axis=0), array_axes(given)
     above, behind = figure.subplots(1, 2)
+
+    def show(ax: Any, shown: Sequence[Camera], plane: tuple[int, int], color: str, label: str) -> None:
+        """Plot centres with their viewing directions, in two of the array's axes."""
+        centers = (np.stack([c.center for c in shown]) - middle) @ frame.T
+        ahead = np.stack([c.R[2] for c in shown]) @ frame.T
+        length = 0.25 * float(np.linalg.norm(centers, axis=1).max() or 1.0)
+        (x, y), (dx, dy) = centers[:, plane].T, length * ahead[:, plane].T
+        ax.scatter(x, y, s=18, color=color, label=label)
+        ax.update_datalim(np.stack([x + dx, y + dy], axis=1))
+        ax.quiver(x, y, dx, dy, color=color, angles="xy", scale_units="xy", scale=1, width=0.004)
+        for camera, a, b in zip(shown, x, y, strict=True) if plane == BEHIND else ():
+            ax.annotate(camera.id, (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7, color=color)
+
     for ax, plane, title in ((above, ABOVE, "from above"), (behind, BEHIND, "from behind")):
         if moved:
-            _show(ax, given, middle, frame, plane, "0.6", "given")
-        label = "estimated" if moved else "cameras"
-        _show(ax, cameras, middle, frame, plane, "tab:blue", label)
+            show(ax, given, plane, "0.6", "given")
+        show(ax, cameras, plane, "tab:blue", "estimated" if moved else "cameras")
         ax.set(title=title, aspect="equal", xlabel="right", ylabel="forward" if plane == ABOVE else "up")
         ax.margins(0.25)
         ax.grid(alpha=0.3)
@@ -216,24 +225,3 @@ def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def _show(
-    ax: Axes,
-    cameras: Sequence[Camera],
-    middle: Float64,
-    frame: Float64,
-    plane: tuple[int, int],
-    color: str,
-    label: str,
-) -> None:
-    """Plot centres with their viewing directions, in two of the array's axes."""
-    centers = (np.stack([c.center for c in cameras]) - middle) @ frame.T
-    ahead = np.stack([c.R[2] for c in cameras]) @ frame.T
-    length = 0.25 * float(np.linalg.norm(centers, axis=1).max() or 1.0)
-    (x, y), (dx, dy) = centers[:, plane].T, length * ahead[:, plane].T
-    ax.scatter(x, y, s=18, color=color, label=label)
-    ax.update_datalim(np.stack([x + dx, y + dy], axis=1))
-    ax.quiver(x, y, dx, dy, color=color, angles="xy", scale_units="xy", scale=1, width=0.004)
-    for camera, a, b in zip(cameras, x, y, strict=True) if plane == BEHIND else ():
-        ax.annotate(camera.id, (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7, color=color)

@@ -1,12 +1,8 @@
 """Small squares of the views that an array of cameras sees together: where they are, and what each camera sees there.
 
-Images of one camera at a time of its own clock, with their derivatives, for the estimate of clocks.
-
 An image is the mean rate of a window of ticks, blurred a little: the spikes' quantisation is white, and what moves is
 not. Windows are whole: a time whose window leaves the clip or touches a gap has no image. Pixels that say nothing are
 NaN, and so is what the blur takes from them.
-
-Small squares of the views that an array of cameras sees together: where they are, and what each camera sees there.
 
 A patch belongs to a view and a time of the array. It is a piece of a plane: its inverse depth in that view is linear in
 the pixel. The slants matter: where depth and velocity both change along a patch, as on a turntable, one depth for all

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Float64, Mask
+from spike4dgs.benchmark.arrays import Float32, Float64, Int64, Mask
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.kernels.threads import get_threads
@@ -199,6 +199,14 @@ def lift(camera: Camera, inverse: Float32, pixels: Mask) -> Float64:
     return camera.unproject(np.stack([u + 0.5, v + 0.5], axis=-1), depth)
 
 
+def pixels_of(camera: Camera, points: Float64) -> tuple[Mask, Int64, Int64, Float64]:
+    """Return which points [N, 3] a camera sees, their pixels' columns and rows (0 for others), and their depths."""
+    uv, z = camera.project(points)
+    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+    u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    return inside, u, v, z
+
+
 def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int, settings: SweepSettings = DEFAULTS) -> Mask:
     """Return the pixels [H, W] of view `index` on whose depth at least `min_agree` other views agree."""
     camera, own = cameras[index], maps[index]
@@ -209,9 +217,7 @@ def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int, sett
     for other, other_map in enumerate(maps):
         if other == index:
             continue
-        uv, z = cameras[other].project(points)
-        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [cameras[other].width, cameras[other].height]).all(axis=1)
-        u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+        inside, u, v, z = pixels_of(cameras[other], points)
         inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
         votes += inside & (np.abs(other_map.inverse[v, u] - inverse) < tolerance)
     believed[believed] = votes >= settings.min_agree

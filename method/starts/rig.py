@@ -33,6 +33,7 @@ from spike4dgs.method.starts.plane_sweep import (
     find_range,
     inverse_depth_step,
     lift,
+    pixels_of,
     sweep_all,
     widest_baseline,
 )
@@ -249,7 +250,5 @@ def fill(cameras: Sequence[Camera], mean: Float32, cloud: Cloud, settings: Cloud
 
 def look_up(camera: Camera, image: Float32, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gray value [N] of the pixel that sees each point; NaN outside the image, and where it is negative."""
-    uv, z = camera.project(points)
-    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
-    u, v = np.where(inside[:, None], uv, 0).astype(np.int64).T
+    inside, u, v, _ = pixels_of(camera, points)
     return np.where(inside & (image[v, u] >= 0), image[v, u], np.nan)

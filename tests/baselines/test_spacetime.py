@@ -28,7 +28,6 @@ from spike4dgs.baselines.spacetime import (
 )
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
-from spike4dgs.method.gaussians.optimizer import apply_edit, make_adam
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.polynomial import move_to
@@ -138,19 +137,6 @@ def test_extra_parameters_stay_with_their_gaussians_through_all_edits(seed: int,
         else:
             g = concatenate([g, g.rows(mask)])
         assert torch.equal(g.extra["a"], g.colors[:, 0]) and torch.equal(g.extra["b"], g.colors.repeat(1, 3))
-
-
-def test_moments_of_extra_parameters_follow_an_edit() -> None:
-    g = cloud(6).trainable()
-    adam = make_adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
-    sum((v * v).sum() for v in g.tensors().values()).backward()
-    adam.step()
-    before = {k: adam.state[v]["exp_avg"].clone() for k, v in g.extra.items()}
-    keep = torch.tensor([0, 1, 1, 0, 1, 1]).bool()
-    new = apply_edit(adam, prune(g, keep))
-    assert set(new.extra) == {"times", "log_temporal_scales", "coefficients", "angular_velocities", "features"}
-    for name, leaf in new.extra.items():
-        assert leaf.requires_grad and torch.equal(adam.state[leaf]["exp_avg"], before[name][keep])
 
 
 def test_what_densification_adds_gets_random_times_and_keeps_to_its_path() -> None:

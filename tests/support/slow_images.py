@@ -14,11 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows
 from spike4dgs.method.images.intervals import IntervalSettings
 
 Spikes = NDArray[np.generic]
 PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # TFSTP's u0, f, D, F
+
+
+def stream_of(spikes: Spikes, bottom_up: bool = True) -> SpikeStream:
+    """Return spikes [T, H, W] as a stream in memory."""
+    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20_000.0, bottom_up)
 
 
 def slow_tfp(spikes: Spikes, tick: int, half_window: int) -> Float64:

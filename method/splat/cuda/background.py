@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.method.splat.cuda.prepare import Lists, all_tiles, make_pairs, sort_pairs
-from spike4dgs.method.splat.cuda.render import Behind, Job, blend, grid_of, project_splats
+from spike4dgs.method.splat.cuda.prepare import Lists, sort_pairs
+from spike4dgs.method.splat.cuda.render import Behind, Job, blend, project_splats
 from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views
 
 
@@ -35,11 +35,10 @@ def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Layer
     """Render the background once into all views."""
     device = splats.means.device
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
-    p, grid = project_splats(splats, views, pixel_filter), grid_of(views)
+    p = project_splats(splats, views, pixel_filter)
     layers = splats.colors[p.seen.index].float()
-    pairs = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
-    lists = sort_pairs(grid, pairs.keys, pairs.rows, torch.full_like(pairs.rows, -1), all_tiles(grid, device))
-    image, alpha = blend(p.records, layers, Job(lists, pairs.starts))
+    lists = sort_pairs(p.grid, p.pairs.keys, p.pairs.rows, torch.full_like(p.pairs.rows, -1))
+    image, alpha = blend(p.records, layers, Job(lists, p.pairs.starts))
     return Layer(views, pixel_filter, p.records, layers, lists, image, alpha)
 
 
@@ -47,14 +46,14 @@ def render_over(layer: Layer, splats: Splats, chosen: Sequence[int]) -> RenderOu
     """Render `splats` and the background into the views `chosen`: see `Background.render`."""
     device, pick = splats.means.device, torch.tensor(list(chosen), device=splats.means.device)
     views = Views(layer.views.w2c[pick], layer.views.K[pick], layer.views.width, layer.views.height)
-    p, grid = project_splats(splats, views, layer.pixel_filter), grid_of(views)
-    own = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
+    p = project_splats(splats, views, layer.pixel_filter)
+    own = p.pairs
     touched = torch.unique(own.keys >> 32)
     keys, rows = _behind_pairs(layer, pick, touched)
     slots = torch.cat([torch.full_like(rows, -1), torch.arange(len(own.keys), device=device)])
     both = (torch.cat([keys, own.keys]), torch.cat([rows, own.rows + len(layer.records)]))
     job = Job(
-        sort_pairs(grid, *both, slots, touched),
+        sort_pairs(p.grid, *both, slots, touched),
         own.starts,
         Behind(layer.records, layer.layers, layer.image[pick], layer.alpha[pick]),
     )

@@ -1,14 +1,11 @@
 """What the CUDA back end does first: project by torch, list the tiles' Gaussians, launch kernels on torch's stream.
 
-Launching numba's CUDA kernels on torch tensors: on torch's current stream, or in numba's simulator.
-
 With NUMBA_ENABLE_CUDASIM=1 numba runs a kernel as Python threads on NumPy arrays. That shows the arithmetic on a
 machine without a device, slowly, and nothing else: neither the compilation nor the speed.
 
-Projection into all views at once, by differentiable torch operations in float64, on any device.
-
-The formulas are those of `reference.py`; its docstring has the symbols. Here only Gaussians that are seen are kept, as
-M rows of (view, Gaussian), and each becomes what the kernels need: a centre and whitened coordinates.
+Projection into all views at once is differentiable, in float64, on any device. The formulas are those of
+`reference.py`; its docstring has the symbols. Here only Gaussians that are seen are kept, as M rows of (view,
+Gaussian), and each becomes what the kernels need: a centre and whitened coordinates.
 """
 
 from __future__ import annotations
@@ -135,11 +132,9 @@ class Pairs:
     starts: Tensor  # [M + 1] the pairs of row m are starts[m]:starts[m + 1]
 
 
-def make_pairs(view: Tensor, box: Tensor, depth: Tensor, grid: Grid) -> Pairs:
-    """Return the pairs of M Gaussians.
-
-    view [M]: image of each; box [M, 4]: first and last + 1 pixel column, then row; depth [M], positive.
-    """
+def make_pairs(seen: Seen, grid: Grid) -> Pairs:
+    """Return the pairs of M Gaussians."""
+    view, box = seen.view, seen.box
     first, last = box[:, 0::2] // TILE, (box[:, 1::2] - 1) // TILE + 1  # [M, 2] tiles in x and y
     width, height = (last - first).unbind(-1)
     starts = torch.zeros(len(view) + 1, dtype=torch.int64, device=view.device)
@@ -150,7 +145,7 @@ def make_pairs(view: Tensor, box: Tensor, depth: Tensor, grid: Grid) -> Pairs:
     wide = width[rows]
     column, row = first[rows, 0] + inside % wide, first[rows, 1] + inside // wide
     tile = (view[rows] * grid.down + row) * grid.across + column
-    bits = depth.detach().float().view(torch.int32).long()[rows]
+    bits = seen.depth.detach().float().view(torch.int32).long()[rows]
     return Pairs((tile << 32) | bits, rows, starts)
 
 
@@ -166,13 +161,13 @@ class Lists:
     tiles: Tensor  # [K] the numbers of the tiles to render
 
 
-def all_tiles(grid: Grid, device: torch.device) -> Tensor:
-    """Return the numbers of all tiles."""
-    return torch.arange(len(grid), device=device)
+def sort_pairs(grid: Grid, keys: Tensor, rows: Tensor, slots: Tensor, tiles: Tensor | None = None) -> Lists:
+    """Return the lists of pairs in any order of tiles; pairs of one tile and depth keep their order.
 
-
-def sort_pairs(grid: Grid, keys: Tensor, rows: Tensor, slots: Tensor, tiles: Tensor) -> Lists:
-    """Return the lists of pairs in any order of tiles; pairs of one tile and depth keep their order."""
+    `tiles` are those to render, else all.
+    """
+    if tiles is None:
+        tiles = torch.arange(len(grid), device=keys.device)
     ordered, order = torch.sort(keys, stable=True)
     bounds = torch.arange(len(grid) + 1, device=keys.device) << 32
     return Lists(grid, ordered, rows[order], slots[order], torch.searchsorted(ordered, bounds), tiles)

@@ -18,8 +18,8 @@ from spike4dgs.method.splat.cuda.prepare import (
     TILE,
     Grid,
     Lists,
+    Pairs,
     Seen,
-    all_tiles,
     launch,
     make_pairs,
     project,
@@ -127,7 +127,9 @@ def blend(records: Tensor, layers: Tensor, job: Job) -> tuple[Tensor, Tensor]:
 class Projected:
     """The visible Gaussians of some splats in some views, ready for the kernels, and their statistics."""
 
+    grid: Grid
     seen: Seen
+    pairs: Pairs
     records: Tensor  # [M, 6] float64
     radii: Tensor  # [C, N] px
     means2d: Tensor  # [C, N, 2] px
@@ -148,7 +150,8 @@ def project_splats(splats: Splats, views: Views, pixel_filter: PixelFilter) -> P
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*splats.tensors, views.w2c)):
         means2d.requires_grad_()
         center = center + (means2d - means2d.detach())[at].double()  # adds 0, and receives the centre's gradient
-    return Projected(seen, torch.cat([center, seen.shape], -1), radii, means2d)
+    grid = Grid(len(views), views.width, views.height)
+    return Projected(grid, seen, make_pairs(seen, grid), torch.cat([center, seen.shape], -1), radii, means2d)
 
 
 def render_cuda(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
@@ -161,19 +164,13 @@ def render_cuda(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: 
             fix = f"{missing.fix}, or move the tensors to the CPU"
             raise problem("back end cuda", missing.expected, missing.found, fix)
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
-    p, grid = project_splats(splats, views, pixel_filter), grid_of(views)
+    p = project_splats(splats, views, pixel_filter)
     layers = splats.colors[p.seen.index].float()
     if depth:
         layers = torch.cat([layers, p.seen.depth[:, None].float()], -1)
-    pairs = make_pairs(p.seen.view, p.seen.box, p.seen.depth, grid)
-    slots = torch.arange(len(pairs.keys), device=device)
-    job = Job(sort_pairs(grid, pairs.keys, pairs.rows, slots, all_tiles(grid, device)), pairs.starts)
-    image, alpha = blend(p.records, layers, job)
+    slots = torch.arange(len(p.pairs.keys), device=device)
+    lists = sort_pairs(p.grid, p.pairs.keys, p.pairs.rows, slots)
+    image, alpha = blend(p.records, layers, Job(lists, p.pairs.starts))
     image = image.permute(0, 2, 3, 1)
     image, far = (image[..., :-1], image[..., -1]) if depth else (image, None)
     return RenderOutput(image, alpha, far, p.radii, p.means2d)
-
-
-def grid_of(views: Views) -> Grid:
-    """Return the tiles of all views."""
-    return Grid(len(views), views.width, views.height)

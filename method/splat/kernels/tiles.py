@@ -1,6 +1,4 @@
-"""The tiles' lists of Gaussians, nearest first: offsets from block histograms, filling, and a radix sort.
-
-The blocks of a tile, 8 pixels wide, that a Gaussian meets, as lists for the inner loops of blend_ir.py.
+"""The tiles' lists of Gaussians, nearest first, by a radix sort; and the blocks of a tile that a Gaussian meets.
 
 A Gaussian visits only the blocks of the rows that its opacity-aware ellipse meets: 1.6 to 2 lanes are computed per
 useful pixel, against 6 to 13 for whole 16 x 16 tiles.

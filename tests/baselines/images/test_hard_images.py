@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from hard_case import BYTES, REFUSAL, HardCase
 from numpy.typing import NDArray
-from slow_images import slow_adaptive, slow_intervals, slow_tfi, slow_tfp, slow_tfstp
+from slow_images import slow_adaptive, slow_intervals, slow_tfi, slow_tfp, slow_tfstp, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfp import TfpSettings
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 
 Spikes = NDArray[np.uint8]
 Float64 = NDArray[np.float64]
@@ -65,11 +64,6 @@ _TWINS: dict[str, Callable[[Spikes, int], Float64]] = {
 }
 _SHAPE = (64, 96)  # of the networks' images
 _LEVELS = {"dark": 0.0, "even": 0.3, "saturated": 1.0}  # spikes per tick
-
-
-def stream_of(spikes: Spikes) -> SpikeStream:
-    """Return a stream of spikes [T, H, W] in memory."""
-    return SpikeStream(pack(spikes), spikes.shape[2], spikes.shape[1], 20_000.0)
 
 
 @pytest.mark.hard_case(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from slow_images import stream_of
 from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
 
 from spike4dgs.baselines.images.spk2img import maker
@@ -29,14 +30,9 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli.options import Compute
 from spike4dgs.cli.train_spk2img import train_spk2img
 from spike4dgs.method.images.base import window
-
-
-def stream_of(spikes: np.ndarray) -> SpikeStream:
-    return SpikeStream(pack(spikes), spikes.shape[2], spikes.shape[1], 20000.0)
 
 
 @pytest.mark.parametrize("n", [3, 25, 41, 60])

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slow_images import slow_tfi, slow_tfp
+from slow_images import slow_tfi, slow_tfp, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.images.tfp import TfpSettings, tfp_image
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.settings import Settings
 
 
@@ -21,10 +20,6 @@ def random_spikes(n: int, height: int, width: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     rate = rng.choice([0, 0.02, 0.1, 0.4, 0.9, 1], (height, width))
     return (rng.random((n, height, width)) < rate).astype(np.uint8)
-
-
-def stream_of(spikes: np.ndarray, bottom_up: bool = True) -> SpikeStream:
-    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20000.0, bottom_up)
 
 
 @settings(max_examples=40, deadline=None)

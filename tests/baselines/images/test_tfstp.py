@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slow_images import slow_tfstp_pixel
+from slow_images import slow_tfstp_pixel, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.images.tfp import tfp_image
 from spike4dgs.baselines.images.tfstp import TfstpSettings, tfstp_image
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-
-
-def stream_of(spikes: np.ndarray, bottom_up: bool = True) -> SpikeStream:
-    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20000.0, bottom_up)
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 
 def one_row(n: int, *pixels: Any) -> SpikeStream:

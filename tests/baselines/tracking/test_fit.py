@@ -22,16 +22,14 @@ from spike4dgs.baselines.tracking.fit import (
 from spike4dgs.baselines.tracking.losses import find_neighbours
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
+from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import FitJob, Parts, RecipeMethod, measure
+from spike4dgs.method.fit import FitJob, measure
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
-from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.starts.base import Start
 from spike4dgs.method.supervision.pixel import PixelSettings
-from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.training_views.foreground import foreground_masks
 from spike4dgs.method.training_views.training_images import TrainingImages
 
@@ -251,20 +249,6 @@ def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
     assert torch.equal(model.at(9999.0).means, model.at(2500.0).means)
     assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
     assert model.size_bytes == 4 * (6 * 12 + 3 * (4 * 7 + 5))
-
-
-def test_a_recipe_runs_it_from_spikes_to_images() -> None:
-    images = ImageMaker(name="mean", rate=lambda stream, t, _: stream.counts(t - 10, t + 10) / np.float32(20))
-    parts = Parts(
-        {"mean": images}, {"true": Initialization(lambda request: shown()[1])}, {}, SUPERVISIONS, {"tracking": TRACKING}
-    )
-    settings = {**{f"motion.{name}": value for name, value in TINY.items()}, "images.time_spacing_ticks": 110}
-    recipe = Recipe("test", "mean", "true", "tracking", "pixel", settings)
-    model = RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest(Budget(2.0)))
-    image = model.render(WORLD.held_out, 6000.0)
-    truth = WORLD.trace(WORLD.held_out, 0.5)[0]
-    assert len(model.tracks.times_us) == 3
-    assert -10 * np.log10(((image - truth) ** 2).mean()) > 12  # after six steps
 
 
 def test_budget_scales_steps_only_and_the_publications_counts_are_settings() -> None:

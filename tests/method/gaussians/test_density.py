@@ -35,6 +35,7 @@ def cloud(n: int, seed: int = 0) -> Gaussians:
         quats=torch.randn(n, 4, generator=rng),
         logits=torch.logit(0.1 + 0.8 * torch.rand(n, generator=rng)),
         colors=torch.rand(n, 1, generator=rng),
+        extra={"times": torch.rand(n, generator=rng), "coefficients": torch.randn(n, 9, generator=rng)},
     )
 
 

@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from slow_images import slow_adaptive, slow_intervals
+from slow_images import slow_adaptive, slow_intervals, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.images.adaptive import AdaptiveSettings, adaptive_image, half_windows, spike_times
+from spike4dgs.method.images.adaptive import AdaptiveSettings, adaptive_image, half_windows
 from spike4dgs.method.images.intervals import IntervalSettings, intervals
-
-
-def stream_of(spikes, bottom_up=True):
-    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20000.0, bottom_up)
 
 
 def fire(rates, charge):
@@ -78,14 +73,6 @@ def test_a_dark_stripe_between_bright_ones_is_dark():
     stream = stream_of(fire(rates, np.random.default_rng(4).random((24, 24))))
     assert adaptive_image(stream, 195).max() < 0.08
     np.testing.assert_allclose(adaptive_image(stream, 160), 0.5, atol=0.02)
-
-
-def test_spike_times_are_those_of_the_plain_array():
-    spikes = np.random.default_rng(3).random((70, 30, 41)) < 0.3
-    found = spike_times(stream_of(spikes, bottom_up=False))
-    pixel, tick = np.nonzero(spikes.reshape(70, -1).T)
-    np.testing.assert_array_equal(found.ticks, tick)
-    np.testing.assert_array_equal(found.starts, np.searchsorted(pixel, np.arange(30 * 41 + 1)))
 
 
 def test_the_last_window_covers_the_clip_from_anywhere():

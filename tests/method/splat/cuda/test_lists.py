@@ -8,8 +8,7 @@ from splat_scenes import HARD, random_splats, views
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import render
-from spike4dgs.method.splat.cuda.prepare import TILE, all_tiles, make_pairs, project, sort_pairs
-from spike4dgs.method.splat.cuda.render import grid_of
+from spike4dgs.method.splat.cuda.prepare import TILE, Grid, make_pairs, project, sort_pairs
 from spike4dgs.method.splat.reference import project as project_reference
 from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter
 
@@ -30,10 +29,10 @@ def test_projection_equals_the_reference(scene, antialiased: bool) -> None:  # t
 
 def test_every_tile_lists_what_its_pixels_may_see_nearest_first() -> None:
     splats, v = random_splats(200, seed=3), views(2)
-    seen, grid = project(splats, v, CUSTOMARY), grid_of(v)
-    pairs = make_pairs(seen.view, seen.box, seen.depth, grid)
+    seen, grid = project(splats, v, CUSTOMARY), Grid(len(v), v.width, v.height)
+    pairs = make_pairs(seen, grid)
     slots = torch.arange(len(pairs.keys))
-    lists = sort_pairs(grid, pairs.keys, pairs.rows, slots, all_tiles(grid, torch.device("cpu")))
+    lists = sort_pairs(grid, pairs.keys, pairs.rows, slots)
     assert len(lists.tiles) == len(grid) == 2 * grid.across * grid.down
     for tile in range(len(grid)):
         view, at = divmod(tile, grid.across * grid.down)
