@@ -53,7 +53,7 @@ def board_clip(
         place = place_board(array(width, height, seed), columns, rows, square_m, DISTANCE_M)
     else:
         place = place_board(tuple(open_scene(like).cameras.values()), columns, rows, square_m)
-    path = write_board_clip(out, place.cameras, place.board, place.motion, n_ticks, seed)
+    path = write_board_clip(out, place.cameras, place.board, place.distance_m, n_ticks, seed)
     print(f"{path}: {n_ticks} ticks of {len(place.cameras)} cameras")
     print(
         f"board of {columns} x {rows} corners at {place.distance_m:.2f} m; each camera sees all of it for "

@@ -27,7 +27,7 @@ from spike4dgs.generators.recorder.resources import buffer_seconds, real_time
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.sync import Rate
 from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
-from spike4dgs.generators.recorder.usb.transport import UsbLink, open_link
+from spike4dgs.generators.recorder.usb.transport import Link, open_link
 
 FRAME_BYTES = 12500
 _WIDTH, _HEIGHT = 400, 250
@@ -121,7 +121,7 @@ class _SentReads:
 
 
 @dataclass(eq=False)
-class _Link(UsbLink):
+class _Link(Link):
     """A link whose reads have true times, and which measures the cost of emulating its camera."""
 
     emulated: EmulatedCamera

@@ -28,9 +28,7 @@ from spike4dgs.generators.recorder.usb.reader import Reader
 from spike4dgs.generators.recorder.usb.reads import OK, TIME_OUT
 from spike4dgs.generators.recorder.usb.transport import Link
 
-__all__ = ["STATES", "CameraClip", "CameraStats", "Clip", "Rate", "Sink", "capture"]
-
-OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = STATES = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
+OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
 
 _POLL_S = 0.005  # interval at which this thread checks the others
 # Counters set by one trigger differ by what a camera sends before the last one is started; others differ by anything.
@@ -183,7 +181,7 @@ class _Capture:
         for reader in self.readers.values():
             if keep:
                 reader.keep.set()
-                if not self.layout.has_tags():  # the first byte begins tick 0
+                if not self.layout.has_tags:  # the first byte begins tick 0
                     reader.wanted = self.n_ticks * self.layout.frame_bytes
             reader.begin()
         for reader in self.readers.values():
@@ -220,7 +218,7 @@ class _Capture:
             return
         found = {c: f for c, f in firsts.items() if f is not None}
         origin = None
-        if self.layout.count_tags() and found:
+        if self.layout.count_tags and found:
             origin = agree([f.counter for f in found.values()], round(_SKEW_S * self.profile.fps))
             self.sync = ARRIVAL_TIMES if origin is None else FRAME_TAGS
         for camera, reader in self.readers.items():
@@ -272,7 +270,7 @@ def _nothing() -> UserError:
 
 def _compile(layout: Layout) -> None:
     """Compile the layout's kernels before a camera sends."""
-    if layout.has_tags():
+    if layout.has_tags:
         frame = layout.pack(np.zeros((1, layout.payload_bytes), np.uint8), 0)
         layout.find(frame[0])
         layout.unpack(frame, np.empty((1, layout.payload_bytes), np.uint8))
@@ -285,7 +283,7 @@ def _primary(camera: CameraProfile) -> bool:
 def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
     """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
     ticks = buffer_seconds(profile, n_ticks / profile.fps) * profile.fps if continuous else float(n_ticks)
-    if layout.count_tags() and not continuous:
+    if layout.count_tags and not continuous:
         ticks += _SKEW_S * profile.fps  # frames before the tick that all cameras have
     slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)
     return max(slots, 2 * profile.transfers) if continuous else slots + profile.transfers + _SPARE_SLOTS

@@ -6,7 +6,6 @@ Ticks that were never written are zeros, and listed as gaps.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import check_new, locked, writing
 from spike4dgs.benchmark.scene.writer import stream_name
-from spike4dgs.generators.recorder.clip_record import ClipRecord, gaps_of, write_description
+from spike4dgs.generators.recorder.clip_record import ClipRecord, write_description
 from spike4dgs.generators.recorder.disk import Buffers, DiskFile
 from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
 from spike4dgs.generators.recorder.frames.layouts import make_layout
@@ -103,7 +102,7 @@ class StreamFiles:
         for start in range(0, len(frames), _FRAMES):
             raw = frames[start : start + _FRAMES]
             packed = raw
-            if self._layout.has_tags():
+            if self._layout.has_tags:
                 packed = self._unpacked[: len(raw)]
                 self._layout.unpack(raw, packed)
             self.append(camera, first_tick + start, orient(packed, p.width, p.height, c.rows == TOP_DOWN, c.mirrored))
@@ -182,21 +181,6 @@ class StreamFiles:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
         self._lock.close()
-
-
-def write_clip(out: Path, profile: RigProfile, streams: Mapping[str, UInt8], record: ClipRecord) -> Path:
-    """Write a recording whose packed streams [n_ticks, payload_bytes], bottom-up and not mirrored, are in memory.
-
-    Ticks within gaps are written as zeros, whatever the streams hold. Raises UserError where `out` is not new or cannot
-    be written.
-    """
-    with StreamFiles(out, profile, record.n_ticks) as files:
-        for camera in profile.cameras:
-            at = 0
-            for gap in (*gaps_of(camera.id, record.gaps), Gap(camera.id, record.n_ticks, 0, "")):
-                files.append(camera.id, at, streams[camera.id][at : gap.first_tick])
-                at = gap.stop_tick
-        return files.finish(record)
 
 
 def _check_folder(out: Path, profile: RigProfile) -> None:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
-from spike4dgs.benchmark.untrusted import MAX_SIDE, shown
-from spike4dgs.generators.recorder.calibration_maps import read_maps
+from spike4dgs.benchmark.untrusted import MAX_SIDE, Expected, read_npz, shown
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.toml_table import (
     FLAG,
@@ -29,6 +29,7 @@ from spike4dgs.generators.recorder.toml_table import (
     number,
     read_toml,
     tuple_of,
+    values,
     whole,
 )
 
@@ -45,6 +46,47 @@ _POSITIVE = number(0, 1e12, "a positive number")
 _FINITE = number(-1e12, 1e12, "a finite number")
 _VECTOR = tuple_of(_FINITE, "a list of numbers")
 _LENS = Kind(f"a list of {', '.join(NAMES)}, or of the first of them", lambda v: make_distortion(_VECTOR.read(v)))
+_COMMANDS = values(
+    'a list of commands in hexadecimal digits, such as "00 ff"',
+    lambda v: isinstance(v, list) and all(map(bytes.fromhex, v)),
+    lambda v: tuple(map(bytes.fromhex, v)),
+)
+_RIG: dict[str, Kind[Any]] = {
+    "name": _ID,
+    "width": whole(1, MAX_SIDE),
+    "height": whole(1, MAX_SIDE),
+    "layout": choice(*LAYOUTS),
+    "fps": whole(1, 1_000_000),
+    "title": TEXT,
+    "licence": TEXT,
+    "sensor": TEXT,
+    "radiance_gain": number(0, 1, "a number above 0, 1 at most"),
+    "held_out": tuple_of(_ID, "a list of cameras"),
+}
+_TRANSFER: dict[str, Kind[Any]] = {
+    "bytes": values(
+        f"a multiple of {PACKET_BYTES} bytes, 64 MiB at most",
+        lambda v: type(v) is int and PACKET_BYTES <= v <= 1 << 26 and v % PACKET_BYTES == 0,
+    ),
+    "in_flight": whole(1, 256),
+    "ring_seconds": number(0, 3600, "seconds, 3600 at most"),
+    "timeout_ms": whole(1, 600_000),
+}
+_TRANSFER_FIELDS = {"bytes": "transfer_bytes", "in_flight": "transfers"}  # whose key has another name
+_CAMERA: dict[str, Kind[Any]] = {
+    "serial": TEXT,
+    "vendor_id": whole(0, 0xFFFF),
+    "product_id": whole(0, 0xFFFF),
+    "interface": whole(0, 255),
+    "control_interface": whole(0, 255),
+    "endpoint_in": whole(0x81, 0x8F),
+    "endpoint_out": whole(0x01, 0x0F),
+    "start": _COMMANDS,
+    "stop": _COMMANDS,
+    "role": choice(PRIMARY, SECONDARY),
+    "rows": choice(BOTTOM_UP, TOP_DOWN),
+    "mirrored": FLAG,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +101,15 @@ class CameraProfile:
     serial: str
     vendor_id: int
     product_id: int
-    interface: int
-    control_interface: int | None  # of endpoint_out, if it is not `interface`
     endpoint_in: int
-    endpoint_out: int | None
-    start: tuple[bytes, ...]
-    stop: tuple[bytes, ...]
-    role: str  # "primary" (makes the trigger) or "secondary"
-    rows: str  # "bottom-up" or "top-down"
-    mirrored: bool
+    endpoint_out: int | None = None
+    interface: int = 0
+    control_interface: int | None = None  # of endpoint_out, if it is not `interface`
+    start: tuple[bytes, ...] = ()
+    stop: tuple[bytes, ...] = ()
+    role: str = SECONDARY  # or "primary", which makes the trigger
+    rows: str = BOTTOM_UP  # or "top-down"
+    mirrored: bool = False
     calibration: Camera | None = None  # intrinsics and pose
     maps: Path | None = None  # .npz with gain [H, W] and dark [H, W] (spikes per tick), as `calibrate` writes it
 
@@ -109,26 +151,11 @@ def load_profile(path: Path) -> RigProfile:
     """
     top = read_toml(path, "a rig profile")
     top.take("schema", choice(SCHEMA))
-    width, height = (top.take(name, whole(1, MAX_SIDE)) for name in ("width", "height"))
-    cameras = _read_cameras(top, width, height)
+    facts = top.fields(_RIG, ("name", "width", "height", "layout"))
+    cameras = _read_cameras(top, facts["width"], facts["height"])
     transfer = top.table("transfer") or Table(path, "transfer", {})
-    profile = RigProfile(
-        name=top.take("name", _ID),
-        width=width,
-        height=height,
-        layout=top.take("layout", choice(*LAYOUTS)),
-        cameras=cameras,
-        fps=top.get("fps", whole(1, 1_000_000), RigProfile.fps),
-        title=top.get("title", TEXT, RigProfile.title),
-        licence=top.get("licence", TEXT, RigProfile.licence),
-        sensor=top.get("sensor", TEXT, RigProfile.sensor),
-        radiance_gain=top.get("radiance_gain", number(0, 1, "a number above 0, 1 at most"), RigProfile.radiance_gain),
-        held_out=top.get("held_out", tuple_of(_ID, "a list of cameras"), RigProfile.held_out),
-        transfer_bytes=transfer.get("bytes", _TRANSFER, RigProfile.transfer_bytes),
-        transfers=transfer.get("in_flight", whole(1, 256), RigProfile.transfers),
-        ring_seconds=transfer.get("ring_seconds", number(0, 3600, "seconds, 3600 at most"), RigProfile.ring_seconds),
-        timeout_ms=transfer.get("timeout_ms", whole(1, 600_000), RigProfile.timeout_ms),
-    )
+    reads = {_TRANSFER_FIELDS.get(key, key): value for key, value in transfer.fields(_TRANSFER, ()).items()}
+    profile = RigProfile(**facts, cameras=cameras, **reads)
     transfer.close()
     top.close()
     _check_whole(top, profile)
@@ -160,15 +187,6 @@ def _plain(value: Any) -> str:
     return f"[{', '.join(map(_plain, value))}]" if isinstance(value, list) else repr(float(value))
 
 
-def _transfer_bytes(value: Any) -> int:
-    if type(value) is not int or not PACKET_BYTES <= value <= 1 << 26 or value % PACKET_BYTES:
-        raise ValueError
-    return value
-
-
-_TRANSFER = Kind(f"a multiple of {PACKET_BYTES} bytes, 64 MiB at most", _transfer_bytes)
-
-
 # ------------------------------------------------------------ cameras
 
 
@@ -194,18 +212,7 @@ def _read_camera(table: Table, known: dict[str, Camera], width: int, height: int
     maps = table.get("maps", TEXT, None)
     camera = CameraProfile(
         id=id,
-        serial=table.take("serial", TEXT),
-        vendor_id=table.take("vendor_id", whole(0, 0xFFFF)),
-        product_id=table.take("product_id", whole(0, 0xFFFF)),
-        interface=table.get("interface", whole(0, 255), 0),
-        control_interface=table.get("control_interface", whole(0, 255), None),
-        endpoint_in=table.take("endpoint_in", whole(0x81, 0x8F)),
-        endpoint_out=table.get("endpoint_out", whole(0x01, 0x0F), None),
-        start=table.get("start", _COMMANDS, ()),
-        stop=table.get("stop", _COMMANDS, ()),
-        role=table.get("role", choice(PRIMARY, SECONDARY), SECONDARY),
-        rows=table.get("rows", choice(BOTTOM_UP, TOP_DOWN), BOTTOM_UP),
-        mirrored=table.get("mirrored", FLAG, False),
+        **table.fields(_CAMERA, ("serial", "vendor_id", "product_id", "endpoint_in")),
         calibration=_read_calibration(own, id, width, height) if own else known.get(id),
         maps=table.path.parent / maps if maps else None,
     )
@@ -213,17 +220,18 @@ def _read_camera(table: Table, known: dict[str, Camera], width: int, height: int
     if (camera.start or camera.stop) and camera.endpoint_out is None:
         raise table.error("endpoint_out", "an endpoint for the start and stop sequences", "none", "add it")
     if camera.maps:
-        read_maps(camera.maps, width, height)
+        _check_maps(camera.maps, width, height)
     return camera
 
 
-def _command(value: Any) -> bytes:
-    if not isinstance(value, str) or not (command := bytes.fromhex(value)):
-        raise ValueError
-    return command
-
-
-_COMMANDS = tuple_of(Kind("hexadecimal digits", _command), 'a list of commands in hexadecimal digits, such as "00 ff"')
+def _check_maps(path: Path, width: int, height: int) -> None:
+    """Raise UserError unless the file has finite maps `gain` (mean 1) and `dark` (spikes per tick), each [H, W]."""
+    what = f"an .npz of the maps gain and dark, {width}x{height} pixels each"
+    fix = "make it with `spike4dgs calibrate`"
+    shapes = dict.fromkeys(("gain", "dark"), Expected("fiu", (height, width)))
+    for name, image in read_npz(path, what, shapes, fix).items():
+        if not np.isfinite(image).all():
+            raise problem(path, what, f"{name} not finite", fix)
 
 
 def _read_calibration(table: Table, id: str, width: int, height: int) -> Camera:
@@ -242,7 +250,7 @@ def _read_calibration(table: Table, id: str, width: int, height: int) -> Camera:
     return camera
 
 
-def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _array(value: Any, shape: tuple[int, ...]) -> Float64:
     rows = tuple_of(_VECTOR, "").read(value) if len(shape) == 2 else _VECTOR.read(value)
     array = np.array(rows, np.float64)  # ValueError where rows differ in length
     if array.shape != shape:
@@ -259,8 +267,8 @@ def _check_whole(top: Table, p: RigProfile) -> None:
         second = p.fps * make_layout(p.layout, p.width, p.height).frame_bytes
     except UserError as e:
         raise UserError(f"{top.path}, key layout: {e}") from None
-    for key, values in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
-        if twice := _twice(values):
+    for key, names in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
+        if twice := _twice(names):
             raise top.error(f"camera.{key}", "another one for each camera", f"{twice!r} twice")
     if (primaries := [c.id for c in p.cameras if c.role == PRIMARY]) != primaries[:1] or not primaries:
         found = ", ".join(primaries) or "none"
@@ -268,12 +276,10 @@ def _check_whole(top: Table, p: RigProfile) -> None:
     ids = {c.id for c in p.cameras}
     if _twice(p.held_out) or not set(p.held_out) < ids:
         raise top.error("held_out", "some of the cameras, each once, and not all", ", ".join(p.held_out))
-    if bare := [c.id for c in p.cameras if c.calibration is None]:
-        if len(bare) < len(p.cameras):
-            found = f"none of {', '.join(bare)}"
-            raise top.error(
-                "calibration", "intrinsics and poses of all cameras, or of none", found, "calibrate the rig"
-            )
+    bare = [c.id for c in p.cameras if c.calibration is None]
+    if bare and len(bare) < len(p.cameras):
+        expected, found = "intrinsics and poses of all cameras, or of none", f"none of {', '.join(bare)}"
+        raise top.error("calibration", expected, found, "calibrate the rig")
     if p.ring_seconds is not None and p.ring_seconds * second < p.transfers * p.transfer_bytes:
         found = f"{p.ring_seconds:g} s, {p.ring_seconds * second / 1e6:.3g} MB"
         expected = f"room for {p.transfers} reads of {p.transfer_bytes} bytes in flight"

@@ -29,7 +29,7 @@ from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, mak
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
 
-CLIP, FLAT, DARK = MODES = ("clip", "flat", "dark")
+CLIP, FLAT, DARK = ("clip", "flat", "dark")
 SECONDS = 0.5  # default length of a recording
 _READ_S = 1e-3
 

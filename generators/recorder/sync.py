@@ -77,7 +77,7 @@ def spikes_per_tick(layout: Layout, block: Block | None) -> float:
         return math.nan
     size = layout.frame_bytes
     data = block.data[: (_FRAMES + 1) * size]
-    start = layout.find(data) if layout.has_tags() else -block.position % size
+    start = layout.find(data) if layout.has_tags else -block.position % size
     n = (len(data) - start) // size if start >= 0 else 0
     if n < 1:
         return math.nan

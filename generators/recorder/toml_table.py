@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -24,6 +24,46 @@ class Kind(Generic[T]):
 
     expected: str
     read: Callable[[Any], T]
+
+
+def values(expected: str, fits: Callable[[Any], object], read: Callable[[Any], T] = lambda value: value) -> Kind[T]:
+    """Return the kind of the values that `fits` accepts, as `read` converts them."""
+
+    def checked(value: Any) -> T:
+        if not fits(value):
+            raise ValueError
+        return read(value)
+
+    return Kind(expected, checked)
+
+
+def whole(low: int, high: int) -> Kind[int]:
+    """Return the kind of integers of [low, high]."""
+    return values(f"a whole number from {low} to {high}", lambda v: type(v) is int and low <= v <= high)
+
+
+def number(low: float, high: float, expected: str) -> Kind[float]:
+    """Return the kind of finite numbers of (low, high]."""
+    return values(expected, lambda v: type(v) in (int, float) and math.isfinite(v) and low < v <= high, float)
+
+
+def choice(*names: str) -> Kind[str]:
+    """Return the kind of these words."""
+    return values(f"one of {', '.join(names)}", lambda v: v in names)
+
+
+def matching(expected: str, fits: Callable[[str], object]) -> Kind[str]:
+    """Return the kind of strings that `fits` accepts."""
+    return values(expected, lambda v: isinstance(v, str) and fits(v))
+
+
+def tuple_of(kind: Kind[T], expected: str) -> Kind[tuple[T, ...]]:
+    """Return the kind of lists of values of one kind."""
+    return values(expected, lambda v: isinstance(v, list), lambda v: tuple(map(kind.read, v)))
+
+
+FLAG: Kind[bool] = values("true or false", lambda v: isinstance(v, bool))
+TEXT = matching("a text that is not empty", str.strip)
 
 
 class Table:
@@ -54,15 +94,20 @@ class Table:
         except (TypeError, ValueError, OverflowError):
             raise self.error(key, kind.expected, shown(value)) from None
 
+    def fields(self, kinds: Mapping[str, Kind[Any]], required: Collection[str]) -> dict[str, Any]:
+        """Return the values of the keys that are there, for fields of these names; `required` keys must be."""
+        self._known.update(kinds)
+        return {key: self.take(key, kind) for key, kind in kinds.items() if key in self._left or key in required}
+
     def tables(self, key: str) -> list[Table]:
         """Return the tables of an array of tables, [[key]]."""
-        values = self.get(key, Kind(f"tables [[{key}]]", _list_of_tables), [])
-        return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(values)]
+        are_tables = values(f"tables [[{key}]]", lambda v: isinstance(v, list) and all(isinstance(t, dict) for t in v))
+        return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(self.get(key, are_tables, []))]
 
     def table(self, key: str) -> Table | None:
         """Return a table in this one, or None where it is absent."""
-        values = self.get(key, Kind(f"a table [{key}]", _table), None)
-        return None if values is None else Table(self.path, f"{self._name}.{key}".lstrip("."), values)
+        found = self.get(key, values(f"a table [{key}]", lambda v: isinstance(v, dict)), None)
+        return None if found is None else Table(self.path, f"{self._name}.{key}".lstrip("."), found)
 
     def items(self) -> list[tuple[str, Table]]:
         """Take all remaining keys, each a table, and return them by name."""
@@ -91,80 +136,3 @@ def read_toml(path: Path, what: str) -> Table:
         raise problem(path, f"{what} (TOML)", "values nested too deep", "correct the file") from None
     except ValueError as e:  # bad syntax, bad UTF-8
         raise problem(path, f"{what} (TOML)", f"damaged text ({str(e)[:200]})", "correct the file") from None
-
-
-def whole(low: int, high: int) -> Kind[int]:
-    """Return the kind of integers of [low, high]."""
-
-    def read(value: Any) -> int:
-        if type(value) is not int or not low <= value <= high:
-            raise ValueError
-        return value
-
-    return Kind(f"a whole number from {low} to {high}", read)
-
-
-def number(low: float, high: float, expected: str) -> Kind[float]:
-    """Return the kind of finite numbers of (low, high]."""
-
-    def read(value: Any) -> float:
-        if type(value) not in (int, float) or not (math.isfinite(value) and low < value <= high):
-            raise ValueError
-        return float(value)
-
-    return Kind(expected, read)
-
-
-def choice(*names: str) -> Kind[str]:
-    """Return the kind of these words."""
-
-    def read(value: Any) -> str:
-        if value not in names:
-            raise ValueError
-        return str(value)
-
-    return Kind(f"one of {', '.join(names)}", read)
-
-
-def matching(expected: str, fits: Callable[[str], object]) -> Kind[str]:
-    """Return the kind of strings that `fits` accepts."""
-
-    def read(value: Any) -> str:
-        if not isinstance(value, str) or not fits(value):
-            raise ValueError
-        return value
-
-    return Kind(expected, read)
-
-
-def tuple_of(kind: Kind[T], expected: str) -> Kind[tuple[T, ...]]:
-    """Return the kind of lists of values of one kind."""
-
-    def read(value: Any) -> tuple[T, ...]:
-        if not isinstance(value, list):
-            raise TypeError
-        return tuple(kind.read(v) for v in value)
-
-    return Kind(expected, read)
-
-
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError
-    return value
-
-
-def _table(value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise TypeError
-    return value
-
-
-def _list_of_tables(value: Any) -> list[dict[str, Any]]:
-    if not isinstance(value, list):
-        raise TypeError
-    return [_table(v) for v in value]
-
-
-FLAG = Kind("true or false", _flag)
-TEXT = matching("a text that is not empty", str.strip)

@@ -25,15 +25,11 @@ def rig(n: int, layout: str = "plain", **changes: object) -> RigProfile:
             serial=f"S{i}",
             vendor_id=0x0403,
             product_id=0x601F,
-            interface=0,
-            control_interface=None,
             endpoint_in=0x82,
             endpoint_out=0x02,
             start=(b"go",),
             stop=(b"halt",),
             role="primary" if i == min(1, n - 1) else "secondary",
-            rows="bottom-up",
-            mirrored=False,
         )
         for i in range(n)
     )
@@ -69,10 +65,6 @@ class FakeCamera:
     position: int = 0
 
     queued = True
-
-    @property
-    def serial(self) -> str:
-        return self.camera.serial
 
     def start(self) -> None:
         self.log.append(f"start {self.camera.id}")

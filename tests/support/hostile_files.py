@@ -27,6 +27,7 @@ from typing import Any
 
 import mutations as m
 import numpy as np
+from rig_text import POSED
 
 MOST_SECONDS, MOST_MB = 60, 1000  # of processor time for one input; of memory at the peak
 Read = Callable[[Path, Path], Any]  # folder of the files, folder for what is made of them
@@ -392,57 +393,15 @@ def read_imports(folder: Path, out: Path) -> None:
         raise refused
 
 
-RIG = """schema = "spike4dgs-rig/1"
-name = "pair"
-width = 40
-height = 24
-layout = "plain"
-fps = 20000
-held_out = ["left"]
-
-[transfer]
-bytes = 1024
-in_flight = 2
-
-[defaults]
-vendor_id = 0x0403
-product_id = 0x601f
-endpoint_in = 0x82
-
-[[camera]]
-id = "left"
-serial = "A1"
-role = "primary"
-maps = "left.npz"
-[camera.calibration]
-fx = 50
-fy = 50.5
-cx = 20
-cy = 12
-rotation = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-translation = [0.1, -2, 3.5]
-distortion = [0.01, 0.0]
-
-[[camera]]
-id = "right"
-serial = "A2"
-rows = "top-down"
-[camera.calibration]
-fx = 50
-fy = 50.5
-cx = 20
-cy = 12
-rotation = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-translation = [0.1, -2, 3.5]
-"""
-
-
 def make_recording(folder: Path) -> None:
     from spike4dgs.benchmark.spikes.folder import write_stream_folder
     from spike4dgs.benchmark.spikes.gaps import Gap
     from spike4dgs.benchmark.spikes.stream import open_stream, pack
 
-    (folder / "rig.toml").write_text(RIG)
+    rig = POSED.replace('role = "primary"', 'role = "primary"\nmaps = "left.npz"').replace(
+        "3.5]", "3.5]\ndistortion = [0.01, 0.0]"
+    )
+    (folder / "rig.toml").write_text(rig.replace('"plain"', '"plain"\nfps = 20000\nheld_out = ["left"]'))
     np.savez_compressed(folder / "left.npz", gain=np.ones((24, 40)), dark=np.zeros((24, 40)))
     streams = {}
     for name in ("left", "right"):

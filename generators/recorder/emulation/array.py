@@ -20,7 +20,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation.camera import FAULTS, EmulatedCamera, Fault
 from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
-from spike4dgs.generators.recorder.rig_profile import BOTTOM_UP, PRIMARY, SECONDARY, CameraProfile, RigProfile
+from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, CameraProfile, RigProfile
 
 
 class EmulatedArray:
@@ -88,19 +88,17 @@ class EmulatedArray:
 def camera_profile(name: str, serial: str, role: str) -> CameraProfile:
     """Return an emulated camera's profile: the usual numbers of a bridge, and readable commands."""
     return CameraProfile(
-        id=name,
-        serial=serial,
+        name,
+        serial,
         vendor_id=0x0403,
         product_id=0x601F,
-        interface=1,
-        control_interface=0,
         endpoint_in=0x82,
         endpoint_out=0x01,
+        interface=1,
+        control_interface=0,
         start=(b"start",),
         stop=(b"stop",),
         role=role,
-        rows=BOTTOM_UP,
-        mirrored=False,
     )
 
 

@@ -48,6 +48,15 @@ class _Plug:
     speed: int
 
 
+class _Descriptor(SimpleNamespace):
+    """A USB descriptor; what is not given is 0."""
+
+    extra_descriptors = ()
+
+    def __getattr__(self, name: str) -> int:
+        return 0
+
+
 class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
     """The devices of an emulated array, one for each camera of its profile."""
 
@@ -66,19 +75,13 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
     def get_parent(self, dev: _Plug) -> None:
         """Return None: emulated devices are on no hub."""
 
-    def get_device_descriptor(self, dev: _Plug) -> SimpleNamespace:
+    def get_device_descriptor(self, dev: _Plug) -> _Descriptor:
         """Return the descriptor of a vendor-specific USB 3.1 device, with its position on the bus."""
-        camera = dev.camera.profile
-        return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=usb.util.DESC_TYPE_DEVICE,
+        return _Descriptor(
             bcdUSB=0x0310 if dev.speed == _SPEED_SUPER else 0x0210,
-            bDeviceClass=0,
-            bDeviceSubClass=0,
-            bDeviceProtocol=0,
             bMaxPacketSize0=9,
-            idVendor=camera.vendor_id,
-            idProduct=camera.product_id,
+            idVendor=dev.camera.profile.vendor_id,
+            idProduct=dev.camera.profile.product_id,
             bcdDevice=0x0100,
             iManufacturer=1,
             iProduct=2,
@@ -91,52 +94,26 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
             speed=dev.speed,
         )
 
-    def get_configuration_descriptor(self, dev: _Plug, config: int) -> SimpleNamespace:
+    def get_configuration_descriptor(self, dev: _Plug, config: int) -> _Descriptor:
         """Return the only configuration."""
         if config:
             raise IndexError(config)
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=usb.util.DESC_TYPE_CONFIG,
-            wTotalLength=0,
-            bNumInterfaces=len(interfaces(dev.camera.profile)),
-            bConfigurationValue=1,
-            iConfiguration=0,
-            bmAttributes=0x80,
-            bMaxPower=50,
-            extra_descriptors=[],
-        )
+        count = len(interfaces(dev.camera.profile))
+        return _Descriptor(bNumInterfaces=count, bConfigurationValue=1, bmAttributes=0x80, bMaxPower=50)
 
-    def get_interface_descriptor(self, dev: _Plug, intf: int, alt: int, config: int) -> SimpleNamespace:
+    def get_interface_descriptor(self, dev: _Plug, intf: int, alt: int, config: int) -> _Descriptor:
         """Return the interfaces that the rig profile names."""
         number, endpoints = list(interfaces(dev.camera.profile).items())[intf]
         if alt:
             raise IndexError(alt)
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=usb.util.DESC_TYPE_INTERFACE,
-            bInterfaceNumber=number,
-            bAlternateSetting=0,
-            bNumEndpoints=len(endpoints),
-            bInterfaceClass=0xFF,
-            bInterfaceSubClass=0,
-            bInterfaceProtocol=0,
-            iInterface=0,
-            extra_descriptors=[],
-        )
+        return _Descriptor(bInterfaceNumber=number, bNumEndpoints=len(endpoints), bInterfaceClass=0xFF)
 
-    def get_endpoint_descriptor(self, dev: _Plug, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+    def get_endpoint_descriptor(self, dev: _Plug, ep: int, intf: int, alt: int, config: int) -> _Descriptor:
         """Return bulk endpoints."""
-        return SimpleNamespace(
-            bLength=7,
-            bDescriptorType=usb.util.DESC_TYPE_ENDPOINT,
+        return _Descriptor(
             bEndpointAddress=list(interfaces(dev.camera.profile).values())[intf][ep],
             bmAttributes=usb.util.ENDPOINT_TYPE_BULK,
             wMaxPacketSize=1024 if dev.speed == _SPEED_SUPER else 512,
-            bInterval=0,
-            bRefresh=0,
-            bSynchAddress=0,
-            extra_descriptors=[],
         )
 
     def open_device(self, dev: _Plug) -> _Plug:

@@ -99,7 +99,7 @@ def draw(worse: Imperfections, profile: RigProfile, n_ticks: int, seed: int) -> 
     """
     check(worse)
     layout = make_layout(profile.layout, profile.width, profile.height)
-    if worse.dropped and not layout.count_tags():
+    if worse.dropped and not layout.count_tags:
         fix = "use such a layout, or leave out --worse.dropped"
         raise problem(f"rig {profile.name}", "frames with a counter, for losses to be seen", layout.name, fix)
     if worse.bad_pixels > profile.width * profile.height:

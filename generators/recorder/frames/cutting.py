@@ -83,7 +83,7 @@ def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
     if not blocks:
         return None
     position = blocks[0].position
-    if not layout.has_tags():  # frames have followed each other since the stream's first byte
+    if not layout.has_tags:  # frames have followed each other since the stream's first byte
         lead = -position % layout.frame_bytes
         return First(position + lead, lead, 0)
     data = np.empty(0, np.uint8)

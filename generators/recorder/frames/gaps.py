@@ -1,28 +1,16 @@
-"""Gaps while recording: their reasons, and the ticks of a clip that were not received."""
+"""Gaps while recording: their reasons, and their union."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spike4dgs.benchmark.spikes.gaps import Gap
 
-__all__ = ["REASONS", "Gap", "missing", "merged"]
+__all__ = ["Gap", "merged"]
 
 OVERFLOW, STALL, UNPLUGGED, TIME_OUT = "overflow", "stall", "unplugged", "time-out"
 SHORT_READ, TORN_FRAME, INTERRUPTED = "short read", "torn frame", "interrupted"
 DISK = "disk"  # received, but not stored by the disk
-REASONS = (OVERFLOW, STALL, UNPLUGGED, TIME_OUT, SHORT_READ, TORN_FRAME, INTERRUPTED, DISK)
-
-
-def missing(camera: str, ticks: NDArray[np.int64], n_ticks: int, reason: str) -> tuple[Gap, ...]:
-    """Return the ticks of [0, n_ticks) that are not among `ticks` (ascending), as gaps of one reason."""
-    inside = ticks[(ticks >= 0) & (ticks < n_ticks)]
-    edges = np.concatenate([[-1], inside, [n_ticks]])
-    holes = np.nonzero(np.diff(edges) > 1)[0]
-    return tuple(Gap(camera, int(edges[i]) + 1, int(edges[i + 1] - edges[i]) - 1, reason) for i in holes)
 
 
 def merged(gaps: Iterable[Gap], n_ticks: int) -> tuple[Gap, ...]:

@@ -27,7 +27,6 @@ Pixels are row-major and least significant bit first in every layout, as in `ben
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,19 +63,13 @@ class Layout:
     width: int
     height: int
     frame_bytes: int
+    has_tags: bool = False  # they locate and check frames; without tags a stream's first byte begins a frame
+    count_tags: bool = False  # every frame carries a counter
 
     @property
     def payload_bytes(self) -> int:
         """Bytes of one packed tick."""
         return bytes_per_tick(self.width, self.height)
-
-    def count_tags(self) -> bool:
-        """Return whether every frame carries a counter."""
-        return False
-
-    def has_tags(self) -> bool:
-        """Return whether tags locate and check frames; without tags a stream's first byte begins a frame."""
-        return False
 
     def find(self, data: UInt8) -> int:
         """Return the offset of the first whole frame in a byte stream [n]; -1 if there is none. Only with tags."""
@@ -86,13 +79,9 @@ class Layout:
         """Return the counters [n] of raw frames [n, frame_bytes]: 0 without counters, TORN where tags disagree."""
         return np.zeros(len(raw), np.int64)
 
-    def unpack(self, raw: UInt8, out: UInt8) -> Int64 | None:
-        """Write the pixels of raw frames [n, frame_bytes] to out [n, payload_bytes], C-contiguous.
-
-        Return their counters [n] (TORN where a frame's tags disagree), or None where the layout has none.
-        """
+    def unpack(self, raw: UInt8, out: UInt8) -> None:
+        """Write the pixels of raw frames [n, frame_bytes] to out [n, payload_bytes], C-contiguous."""
         np.copyto(out, raw)
-        return None
 
     def pack(self, payload: UInt8, first_count: int = 0) -> UInt8:
         """Return packed ticks [n, payload_bytes] as raw frames [n, frame_bytes], counted from `first_count`."""
@@ -104,12 +93,6 @@ class _TaggedRows(Layout):
     def _row_bytes(self) -> int:
         return self.width // 8 + _TAG_BYTES
 
-    def count_tags(self) -> bool:
-        return True
-
-    def has_tags(self) -> bool:
-        return True
-
     def find(self, data: UInt8) -> int:
         return int(find_tagged(rows(data), self.height, self._row_bytes))
 
@@ -118,12 +101,11 @@ class _TaggedRows(Layout):
         count_tagged(rows(raw), self.height, self._row_bytes, out)
         return out
 
-    def unpack(self, raw: UInt8, out: UInt8) -> Int64:
+    def unpack(self, raw: UInt8, out: UInt8) -> None:
         n, pixels = len(raw), self._row_bytes - _TAG_BYTES
         target = out.view()
         target.shape = n, self.height, pixels  # never a copy
         np.copyto(target, raw.reshape(n, self.height, self._row_bytes)[:, :, :pixels])
-        return self.counts(raw)
 
     def pack(self, payload: UInt8, first_count: int = 0) -> UInt8:
         n, pixels = len(payload), self._row_bytes - _TAG_BYTES
@@ -138,9 +120,6 @@ class _TaggedRows(Layout):
 
 
 class _LineTagged(Layout):
-    def has_tags(self) -> bool:
-        return True
-
     def find(self, data: UInt8) -> int:
         return int(find_lines(rows(data), self.width, self.height))
 
@@ -160,36 +139,24 @@ class _LineTagged(Layout):
         return np.packbits(bits.reshape(n, -1), axis=1, bitorder="little")
 
 
+LAYOUTS = (PLAIN, TAGGED_ROWS, LINE_TAGGED)
+
+
 def make_layout(name: str, width: int, height: int) -> Layout:
     """Return the layout of that name for an image size. Raises UserError for an unknown name or an impossible size."""
-    if name not in _MAKERS:
-        raise problem("layout", f"one of {', '.join(_MAKERS)}", repr(name), "correct the name")
+    if name not in LAYOUTS:
+        raise problem("layout", f"one of {', '.join(LAYOUTS)}", repr(name), "correct the name")
+    size, fix = f"{width}x{height}", "correct the size or the layout"
     if width < 1 or height < 1 or width * height > 1 << 26:
-        raise problem(f"layout {name}", "a width and a height of a camera", f"{width}x{height}", "correct the size")
-    return _MAKERS[name](width, height)
-
-
-def _plain(width: int, height: int) -> Layout:
-    return Layout(PLAIN, width, height, bytes_per_tick(width, height))
-
-
-def _tagged_rows(width: int, height: int) -> Layout:
-    if width % 8 or height < 4:  # two rows give the counter, the others confirm it
-        expected = "a width that is a multiple of 8, and 4 rows or more"
-        raise problem(f"layout {TAGGED_ROWS}", expected, f"{width}x{height}", "correct the size or the layout")
-    return _TaggedRows(TAGGED_ROWS, width, height, height * (width // 8 + _TAG_BYTES))
-
-
-def _line_tagged(width: int, height: int) -> Layout:
+        raise problem(f"layout {name}", "a width and a height of a camera", size, "correct the size")
+    if name == PLAIN:
+        return Layout(PLAIN, width, height, bytes_per_tick(width, height))
+    if name == TAGGED_ROWS:
+        if width % 8 or height < 4:  # two rows give the counter, the others confirm it
+            expected = "a width that is a multiple of 8, and 4 rows or more"
+            raise problem(f"layout {name}", expected, size, fix)
+        return _TaggedRows(name, width, height, height * (width // 8 + _TAG_BYTES), has_tags=True, count_tags=True)
     if width % 16 != 8 or height % 2 or height // 2 >= 1 << LINE_BITS:
         expected = f"a width of 8 more than a multiple of 16, and an even height below {2 << LINE_BITS}"
-        raise problem(f"layout {LINE_TAGGED}", expected, f"{width}x{height}", "correct the size or the layout")
-    return _LineTagged(LINE_TAGGED, width, height, 2 * height * (width // 2 + LINE_BITS + 2) // 8)
-
-
-_MAKERS: dict[str, Callable[[int, int], Layout]] = {
-    PLAIN: _plain,
-    TAGGED_ROWS: _tagged_rows,
-    LINE_TAGGED: _line_tagged,
-}
-LAYOUTS = tuple(_MAKERS)
+        raise problem(f"layout {name}", expected, size, fix)
+    return _LineTagged(name, width, height, 2 * height * (width // 2 + LINE_BITS + 2) // 8, has_tags=True)

@@ -47,7 +47,7 @@ class TickCounter:
         self._counter = None if origin is None else origin - 1  # of the last frame that was numbered
         self._tick = -1  # of the same frame; without counters, of the last frame that arrived or was skipped
         self._next = 0  # the tick after the last frame that was returned
-        self._synced = not layout.has_tags()  # whether the beginning of the next frame is known
+        self._synced = not layout.has_tags  # whether the beginning of the next frame is known
         self._ended = False  # lost for good
         self._part = _NOTHING  # the beginning of a frame, or while out of step a possible one
         self._ahead = 0  # bytes to drop before the next frame begins
@@ -89,7 +89,7 @@ class TickCounter:
         offset = have - self._ahead + n_bytes  # from the start of the frame that was being collected
         lost = max(-(-offset // self._layout.frame_bytes), 0)
         self._ahead = lost * self._layout.frame_bytes - offset
-        if not self._layout.count_tags():
+        if not self._layout.count_tags:
             self._tick += lost
 
     def lose(self, reason: str) -> None:
@@ -97,7 +97,7 @@ class TickCounter:
         self._reason = self._reason or reason
         self._part, self._ahead = _NOTHING, 0
         # Before the first frame nothing can be lost: tick 0 is still to come.
-        self._ended = self._ended or (self._synced and not self._layout.count_tags())
+        self._ended = self._ended or (self._synced and not self._layout.count_tags)
         self._synced = False
 
     def finish(self, n_ticks: int, reason: str = INTERRUPTED) -> tuple[Gap, ...]:
@@ -127,7 +127,7 @@ class TickCounter:
         kept = np.nonzero(ticks > late)[0]  # a counter that goes back or repeats is no new tick
         if not len(kept):
             return
-        if self._layout.count_tags():
+        if self._layout.count_tags:
             self._counter = int(counts[kept[-1]])
         self._tick = int(ticks[kept[-1]])
         breaks = np.nonzero((np.diff(ticks[kept]) != 1) | (np.diff(kept) != 1))[0] + 1
@@ -141,7 +141,7 @@ class TickCounter:
 
     def _ticks(self, counts: Int64) -> Int64:
         """Return the true ticks of frames with these counters [n], negative before tick 0."""
-        if not self._layout.count_tags():
+        if not self._layout.count_tags:
             return self._tick + 1 + np.arange(len(counts))
         if self._counter is None and len(counts):
             self._counter = int(counts[0]) - 1

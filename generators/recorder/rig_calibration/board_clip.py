@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+from spike4dgs.generators.worlds.meshes import rotation
 
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
 WHITE, DARK, WALL = 0.85, 0.04, 0.25  # radiance
@@ -36,35 +37,25 @@ DISTANCE_M, SPACING_M, FIELD_DEG = 1.0, 0.12, 34.0  # of the array; the field of
 _PER_CAMERA_SPREAD = (0.02, 0.01, 1.0)  # standard deviations: focal length, principal point / width, degrees of turn
 
 
-@dataclass(frozen=True)
-class BoardMotion:
-    """Motion of the board over the clip, at shares `s` in 0..1: it sways, moves to and fro, tilts both ways and rolls.
+def board_pose(s: float, distance_m: float = DISTANCE_M) -> tuple[Float64, Float64]:
+    """Return rotation [3, 3] and translation [3] from board to world (z up, viewing direction +y) at a share 0..1.
 
-    Every swing has its own number of cycles in a clip, so that position and tilt are uncorrelated, which separates
-    focal lengths from distances.
+    The board sways, moves to and fro, tilts both ways and rolls. Every swing has its own number of cycles in a clip, so
+    that position and tilt are uncorrelated, which separates focal lengths from distances.
     """
 
-    distance_m: float = DISTANCE_M
+    def swing(amplitude: float, cycles: float, phase: float) -> float:
+        return amplitude * math.sin(2 * math.pi * (cycles * s + phase))
 
-    def pose(self, s: float) -> tuple[Float64, Float64]:
-        """Return rotation [3, 3] and translation [3] from board to world coordinates (z up, viewing direction +y)."""
-
-        def swing(amplitude: float, cycles: float, phase: float) -> float:
-            return amplitude * math.sin(2 * math.pi * (cycles * s + phase))
-
-        d = self.distance_m
-        position = np.array([swing(0.10 * d, 2, 0.1), swing(0.15 * d, 1, 0.3), swing(0.05 * d, 3, 0.4)])
-        tilt = _turn(0, swing(35, 2, 0.35)) @ _turn(1, swing(35, 3, 0.0)) @ _turn(2, swing(15, 1, 0.6))
-        upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the board's y is down, its z away
-        return upright @ tilt, position
+    d = distance_m
+    position = np.array([swing(0.10 * d, 2, 0.1), swing(0.15 * d, 1, 0.3), swing(0.05 * d, 3, 0.4)])
+    tilt = _turn("x", swing(35, 2, 0.35)) @ _turn("y", swing(35, 3, 0.0)) @ _turn("z", swing(15, 1, 0.6))
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the board's y is down, its z away
+    return upright @ tilt, position
 
 
-def _turn(axis: int, degrees: float) -> Float64:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    turned = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    turned[i, i], turned[i, j], turned[j, i], turned[j, j] = c, -s, s, c
-    return turned
+def _turn(axis: str, degrees: float) -> Float64:
+    return rotation(axis, math.radians(degrees))[:3, :3]
 
 
 def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M) -> tuple[Camera, ...]:
@@ -84,10 +75,8 @@ def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M
         f_spread, c_spread, turn_deg = _PER_CAMERA_SPREAD
         f = focal * (1 + f_spread * rng.normal())
         cx, cy = np.array([c.cx, c.cy]) + c_spread * width * rng.normal(size=2)
-        wobble = (
-            _turn(0, turn_deg * rng.normal()) @ _turn(1, turn_deg * rng.normal()) @ _turn(2, turn_deg * rng.normal())
-        )
-        R = wobble @ c.R
+        x, y, z = (_turn(axis, turn_deg * rng.normal()) for axis in "xyz")
+        R = x @ y @ z @ c.R
         cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ center))
     return tuple(cameras)
 
@@ -161,13 +150,13 @@ def _light(h: Float64, columns: int, rows: int, x: float, y: float) -> float:
 
 
 def write_board_clip(
-    out: Path, cameras: tuple[Camera, ...], board: Board, motion: BoardMotion, n_ticks: int, seed: int = 0
+    out: Path, cameras: tuple[Camera, ...], board: Board, distance_m: float, n_ticks: int, seed: int = 0
 ) -> Path:
     """Write the clip as a scene folder and return its path. Raises UserError where the folder exists."""
     check_new(out)
-    spacing = key_spacing(cameras, board, motion, n_ticks)
+    spacing = key_spacing(cameras, board, distance_m, n_ticks)
     key_ticks = list(range(0, n_ticks + spacing, spacing))
-    poses = [motion.pose(tick / n_ticks) for tick in key_ticks]
+    poses = [board_pose(tick / n_ticks, distance_m) for tick in key_ticks]
     for camera in cameras:
         size, entropy = (camera.height, camera.width), [seed, *f"board {camera.id}".encode()]
         sensor = Sensor(
@@ -195,23 +184,17 @@ def write_board_clip(
             radiance_gain=SENSOR.radiance_gain,
             targets=(),
             sensor={"model": "integrate-and-fire/2", "rows_bottom_up": True},
-            source={
-                "kind": "board",
-                "columns": board.columns,
-                "rows": board.rows,
-                "square_m": board.square_m,
-                "seed": seed,
-            },
+            source={"kind": "board", **asdict(board), "seed": seed},
         ),
     )
     return out
 
 
-def key_spacing(cameras: Sequence[Camera], board: Board, motion: BoardMotion, n_ticks: int) -> int:
+def key_spacing(cameras: Sequence[Camera], board: Board, distance_m: float, n_ticks: int) -> int:
     """Return the ticks between key frames: no corner of the board moves by more than `KEY_PX` in any camera."""
     ticks = np.linspace(0, n_ticks, _POSES)
     corners = board.corners[[0, board.columns - 1, -board.columns, -1]]
-    poses = [motion.pose(tick / n_ticks) for tick in ticks]
+    poses = [board_pose(tick / n_ticks, distance_m) for tick in ticks]
     world = np.concatenate([corners @ R.T + t for R, t in poses])
     tracks = np.stack([c.project(world)[0].reshape(_POSES, len(corners), 2) for c in cameras])
     fastest = float(np.linalg.norm(np.diff(tracks, axis=1), axis=-1).max()) / (ticks[1] - ticks[0])  # px a tick

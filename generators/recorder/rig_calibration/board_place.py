@@ -17,7 +17,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.metrics.pose_error import Sim3
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes
 from spike4dgs.generators.recorder.rig_calibration.board import Board
-from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, FIELD_DEG, BoardMotion
+from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, FIELD_DEG, board_pose
 
 SQUARE_M = 0.04  # of the board at the nearest place
 LEAST_SEEN = 0.7  # share of the clip in which each camera sees the whole board
@@ -36,11 +36,6 @@ class Place:
     board: Board
     distance_m: float
     seen: Mapping[str, float]
-
-    @property
-    def motion(self) -> BoardMotion:
-        """The board's motion at this distance."""
-        return BoardMotion(self.distance_m)
 
     @property
     def square_px(self) -> float:
@@ -63,7 +58,7 @@ def place_board(
     def at(distance: float, square: float) -> Place:
         placed = _in_front(cameras, distance) if distance_m is None else tuple(cameras)
         board = Board(columns, rows, square)
-        return Place(placed, board, distance, _seen(placed, board, BoardMotion(distance)))
+        return Place(placed, board, distance, _seen(placed, board, distance))
 
     def fitting() -> Place | None:
         return _first_good(at(d, _rounded(SQUARE_M * share * d / nearest)) for share in _SHARES for d in distances)
@@ -111,11 +106,11 @@ def _in_front(cameras: Sequence[Camera], distance_m: float) -> tuple[Camera, ...
     return tuple(map(frame.camera, cameras))
 
 
-def _seen(cameras: Sequence[Camera], board: Board, motion: BoardMotion) -> dict[str, float]:
+def _seen(cameras: Sequence[Camera], board: Board, distance_m: float) -> dict[str, float]:
     """Return the share of the motion in which each camera sees all corners and half a square around, from the front."""
     half = np.array([board.columns, board.rows]) / 2 * board.square_m
     outline = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
-    poses = [motion.pose(s) for s in np.linspace(0, 1, _INSTANTS)]
+    poses = [board_pose(s, distance_m) for s in np.linspace(0, 1, _INSTANTS)]
     corners = np.stack([outline @ R.T + t for R, t in poses])  # [n, 4, 3]
     normals, middles = np.stack([-R[:, 2] for R, _ in poses]), np.stack([t for _, t in poses])  # towards the cameras
     seen = {}

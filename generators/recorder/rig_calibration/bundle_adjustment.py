@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spike4dgs.benchmark.arrays import Float64, Int64, Mask
 
@@ -216,15 +217,8 @@ def _moved(rig: Rig, step: Float64, columns: _Columns) -> Rig:
 
 def _nudged(R: Float64, t: Float64, motion: Float64) -> tuple[Float64, Float64]:
     """Return poses [n] after small motions [n, 6] from the left."""
-    turn = exp_so3(motion[:, :3])
+    turn = Rotation.from_rotvec(motion[:, :3]).as_matrix()
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + motion[:, 3:]
-
-
-def exp_so3(w: Float64) -> Float64:
-    """Return rotation matrices [n, 3, 3] of rotation vectors [n, 3] (Rodrigues)."""
-    angle = np.linalg.norm(w, axis=1)[:, None, None]
-    W = _cross(w)
-    return np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * W @ W
 
 
 def _deviations(covariance: Float64, columns: _Columns) -> tuple[Float64, Float64, Float64]:

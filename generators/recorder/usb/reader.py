@@ -62,7 +62,7 @@ class Reader:
         self.newest: Block | None = None
         self.blocks = self.short_reads = 0
         self.idle = Idle()
-        self._frame_bytes, self._tags = layout.frame_bytes, layout.has_tags()
+        self._frame_bytes, self._tags = layout.frame_bytes, layout.has_tags
         self._timeout_ns = timeout_ms * 1_000_000
         self._last_ns = 0  # when the last bytes arrived
         self._thread = threading.Thread(target=self._run, name=camera, daemon=True)

@@ -18,45 +18,12 @@ import usb.util
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb import queued as libusb
-from spike4dgs.generators.recorder.usb.reads import Completion, SingleReads, Transfers
-
-__all__ = ["Completion", "Link", "QueueingBackend", "Transfers", "UsbLink", "open_link"]
+from spike4dgs.generators.recorder.usb.reads import SingleReads, Transfers
 
 _DRAIN_MS = 20  # a device that is silent for so long has sent the rest of its data
 _DRAIN_BYTES = 64 << 20  # more than a bridge or a camera holds: a device that sends so much was not stopped
 
 _FIX_START = "check endpoint_out and start in the rig profile, then plug the camera in again"
-
-
-class Link(Protocol):
-    """One opened camera."""
-
-    @property
-    def serial(self) -> str:
-        """The camera's serial number."""
-
-    @property
-    def queued(self) -> bool:
-        """True if several reads can be in flight."""
-
-    @property
-    def restartable(self) -> bool:
-        """True if the camera can be stopped and restarted, and then begins with a whole frame."""
-
-    def start(self) -> None:
-        """Send the camera's start sequence. Raises UserError where the camera refuses it."""
-
-    def stop(self) -> None:
-        """Send the stop sequence; a camera that is gone has already stopped."""
-
-    def drain(self) -> int:
-        """Read and drop the rest of the camera's data after `stop`. Return the number of bytes."""
-
-    def transfers(self) -> Transfers:
-        """Return new reads on this camera, for one pass."""
-
-    def close(self) -> None:
-        """Release the device."""
 
 
 @runtime_checkable
@@ -68,26 +35,21 @@ class QueueingBackend(Protocol):
 
 
 @dataclass(eq=False)
-class UsbLink:
-    """A `Link` on a pyusb device whose interfaces are claimed."""
+class Link:
+    """One opened camera: a pyusb device whose interfaces are claimed."""
 
     device: usb.core.Device
     camera: CameraProfile
     profile: RigProfile
-    queued: bool
-
-    @property
-    def serial(self) -> str:
-        """The camera's serial number."""
-        return self.camera.serial
+    queued: bool  # several reads can be in flight
 
     @property
     def restartable(self) -> bool:
-        """True if the profile has its start and stop sequences."""
+        """True if the profile has its start and stop sequences. It then begins anew with a whole frame."""
         return bool(self.camera.start and self.camera.stop)
 
     def start(self) -> None:
-        """Send the start sequence."""
+        """Send the start sequence. Raises UserError where the camera refuses it."""
         try:
             self._write(self.camera.start)
         except usb.core.USBError as e:
@@ -95,12 +57,12 @@ class UsbLink:
             raise problem(where, "a camera that takes its start sequence", found, _FIX_START) from e
 
     def stop(self) -> None:
-        """Send the stop sequence."""
+        """Send the stop sequence; a camera that is gone has already stopped."""
         with contextlib.suppress(usb.core.USBError):
             self._write(self.camera.stop)
 
     def drain(self) -> int:
-        """Read until the camera is silent, but at most 64 MiB."""
+        """Read and drop data until the camera is silent, but at most 64 MiB. Return the number of bytes."""
         size = self.profile.transfer_bytes
         reads = SingleReads(self.device, self.camera.endpoint_in, size, _DRAIN_MS)
         into, total = np.empty(size, np.uint8), 0
@@ -113,7 +75,7 @@ class UsbLink:
         return total
 
     def transfers(self) -> Transfers:
-        """Return queued reads, or single ones."""
+        """Return new reads, queued or single ones, for one pass."""
         endpoint, size, depth = self.camera.endpoint_in, self.profile.transfer_bytes, self.profile.transfers
         if not self.queued:
             return SingleReads(self.device, endpoint, size, self.profile.timeout_ms)
@@ -145,7 +107,7 @@ def open_link(device: usb.core.Device, camera: CameraProfile, profile: RigProfil
     if queued and reason:
         usb.util.dispose_resources(device)
         raise problem(_name(camera), "queued reads", reason, "install pyusb 1.3.1 with libusb-1.0, or do not insist")
-    return UsbLink(device, camera, profile, queued=not reason if queued is None else queued)
+    return Link(device, camera, profile, queued=not reason if queued is None else queued)
 
 
 def _claim(device: usb.core.Device, camera: CameraProfile) -> None:

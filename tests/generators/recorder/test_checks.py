@@ -165,13 +165,13 @@ class Bus:
         raise NotImplementedError
 
 
-def opened(monkeypatch: pytest.MonkeyPatch, bus: Bus, queued: bool | None = None, **changes: Any) -> transport.UsbLink:
+def opened(monkeypatch: pytest.MonkeyPatch, bus: Bus, queued: bool | None = None, **changes: Any) -> transport.Link:
     monkeypatch.setattr(usb.util, "claim_interface", lambda device, i: device.claimed.append(i))
     monkeypatch.setattr(usb.util, "dispose_resources", lambda device: device.claimed.clear())
     profile = rig(1)
     camera = replace(profile.cameras[0], control_interface=3, **changes)
     link = transport.open_link(bus, camera, profile, queued)
-    assert isinstance(link, transport.UsbLink)
+    assert isinstance(link, transport.Link)
     return link
 
 
@@ -209,7 +209,7 @@ def test_a_link_starts_stops_and_drains_its_camera(monkeypatch: pytest.MonkeyPat
     late = usb.core.USBTimeoutError("late", None, errno.ETIMEDOUT)
     bus = Bus(bytes(1024), bytes(300), late)
     link = opened(monkeypatch, bus, start=(b"a", b"b"), stop=(b"refused",))
-    assert bus.claimed == [0, 3] and not link.queued and link.restartable and link.serial == "S0"
+    assert bus.claimed == [0, 3] and not link.queued and link.restartable and link.camera.serial == "S0"
     link.start()
     link.stop()  # a camera that refuses it is left as it is
     assert bus.written == [(0x02, b"a"), (0x02, b"b"), (0x02, b"refused")]

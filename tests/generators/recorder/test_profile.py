@@ -10,50 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_text import POSE, POSED, RIG
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.rig_profile import RigProfile, calibration_toml, load_profile, read_calibration
+from spike4dgs.generators.recorder.rig_profile import calibration_toml, load_profile, read_calibration
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-
-RIG = """
-schema = "spike4dgs-rig/1"
-name = "pair"
-width = 40
-height = 24
-layout = "plain"
-
-[transfer]
-bytes = 1024
-in_flight = 2
-
-[defaults]
-vendor_id = 0x0403
-product_id = 0x601f
-endpoint_in = 0x82
-
-[[camera]]
-id = "left"
-serial = "A1"
-role = "primary"
-
-[[camera]]
-id = "right"
-serial = "A2"
-rows = "top-down"
-"""
-
-POSE = """
-[camera.calibration]
-fx = 50
-fy = 50.5
-cx = 20
-cy = 12
-rotation = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-translation = [0.1, -2, 3.5]
-"""
 
 
 def save(folder: Path, text: str) -> Path:
@@ -97,13 +61,8 @@ def test_defaults_and_own_keys(tmp_path: Path) -> None:
     assert not rig.calibrated and rig.camera("right") is right
 
 
-def calibrated(folder: Path) -> RigProfile:
-    left, right = RIG.rsplit("\n[[camera]]", 1)
-    return load_profile(save(folder, f"{left}{POSE}\n[[camera]]{right}{POSE}"))
-
-
 def test_a_pose_in_the_profile(tmp_path: Path) -> None:
-    camera = calibrated(tmp_path).cameras[1].calibration
+    camera = load_profile(save(tmp_path, POSED)).cameras[1].calibration
     assert camera is not None and (camera.id, camera.width, camera.height) == ("right", 40, 24)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 50.5, 20, 12)
     np.testing.assert_array_equal(camera.R @ [0, 0, 1.0] + camera.t, [0.1, -3, 3.5])
@@ -152,11 +111,7 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut("width = 40", "width = 40.0"), "width", "expected a whole number from 1 to 16384, found 40.0"),
         (cut("width = 40", "width = true"), "width", "found True"),
         (cut("plain", "striped"), "layout", "expected one of plain, tagged-rows, line-tagged, found 'striped'"),
-        (
-            cut("in_flight = 2", "in_flight = 2\nring_seconds = 1e-4"),
-            "transfer.ring_seconds",
-            "room for 2 reads of 1024",
-        ),
+        (cut("flight = 2", "flight = 2\nring_seconds = 1e-4"), "transfer.ring_seconds", "room for 2 reads of 1024"),
         (cut("24", "23"), None, None),
         (cut('"plain"', '"tagged-rows"'), None, None),
         (cut('height = 24\nlayout = "plain"', 'height = 3\nlayout = "tagged-rows"'), "layout", "4 rows or more"),

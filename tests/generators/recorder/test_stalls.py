@@ -23,11 +23,12 @@ from recorder_rig import check_identical, source_scene
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.cli import main
 from spike4dgs.generators.recorder import disk as disk
-from spike4dgs.generators.recorder.capture import CameraClip, Clip, Sink, capture
+from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_profile
 from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
+from spike4dgs.generators.recorder.frames.clip import CameraClip, Clip, Sink
 from spike4dgs.generators.recorder.record import _interruptible
 from spike4dgs.generators.recorder.resources import real_time
 from spike4dgs.generators.recorder.rig_profile import RigProfile

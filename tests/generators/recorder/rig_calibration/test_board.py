@@ -6,16 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_array import BOARD, CAMERAS, MOTION, projected
+from board_array import BOARD, CAMERAS, projected
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.generators.recorder.rig_calibration.board import Board, find_corners
 from spike4dgs.generators.recorder.rig_calibration.board_clip import (
     DARK,
+    DISTANCE_M,
     WALL,
     WHITE,
     array,
+    board_pose,
     key_spacing,
     render_board,
 )
@@ -29,7 +31,7 @@ def test_a_board_that_half_a_turn_does_not_change_is_refused(columns, rows, squa
 
 def test_a_rendered_board_is_the_mean_of_its_samples():
     camera, board = replace(CAMERAS[1], width=60, height=40, cx=30.0, cy=20.0, fx=70.0, fy=70.0), Board(4, 3, 0.05)
-    R, t = MOTION.pose(0.17)
+    R, t = board_pose(0.17)
     y, x = (np.mgrid[: 4 * 40, : 4 * 60] + 0.5) / 4
     ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1) @ camera.R
     normal = R[:, 2]
@@ -56,7 +58,7 @@ def test_a_board_partly_behind_the_camera_is_rendered_in_front_of_it_only():
 @pytest.mark.parametrize("s", [0.0, 0.3, 0.75])
 def test_corners_are_found_to_a_tenth_of_a_pixel_in_the_boards_order(s):
     camera = array(320, 200)[3]
-    R, t = MOTION.pose(s)
+    R, t = board_pose(s)
     image = render_board(camera, BOARD, R, t)
     uv, whole = projected(camera, s)
     assert whole
@@ -69,7 +71,7 @@ def test_corners_are_found_to_a_tenth_of_a_pixel_in_the_boards_order(s):
 
 
 def test_a_board_that_is_partly_covered_is_not_found():
-    image = render_board(CAMERAS[4], BOARD, *MOTION.pose(0.0))
+    image = render_board(CAMERAS[4], BOARD, *board_pose(0.0))
     uv, _ = projected(CAMERAS[4], 0.0)
     covered = image.copy()
     covered[:, : int(uv[:, 0].min()) + 8] = WALL
@@ -79,9 +81,9 @@ def test_a_board_that_is_partly_covered_is_not_found():
 
 def test_keys_are_as_dense_as_the_board_is_fast():
     cameras, ticks = CAMERAS[::4], 4000
-    spacing = key_spacing(cameras, BOARD, MOTION, ticks)
+    spacing = key_spacing(cameras, BOARD, DISTANCE_M, ticks)
     assert 1 < spacing < 20
     at = [projected(c, s / ticks)[0] for c in cameras for s in range(0, ticks + spacing, spacing)]
     moved = np.linalg.norm(np.diff(np.reshape(at, (len(cameras), -1, 40, 2)), axis=1), axis=-1)
     assert 0.5 < moved.max() < 1.02
-    assert key_spacing(cameras, BOARD, MOTION, 10**6) == 20 and key_spacing(cameras, BOARD, MOTION, 20) == 1
+    assert key_spacing(cameras, BOARD, DISTANCE_M, 10**6) == 20 and key_spacing(cameras, BOARD, DISTANCE_M, 20) == 1

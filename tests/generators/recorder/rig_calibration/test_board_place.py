@@ -9,7 +9,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
-from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, array
+from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, array, board_pose
 from spike4dgs.generators.recorder.rig_calibration.board_place import LEAST_SEEN, place_board
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import OURS
@@ -27,7 +27,7 @@ def visible(place, n=60):
     for c in place.cameras:
         inside = 0
         for s in np.linspace(0, 1, n):
-            R, t = place.motion.pose(s)
+            R, t = board_pose(s, place.distance_m)
             uv, z = c.project(place.board.corners @ R.T + t)
             inside += bool((z > 0).all() and (uv > 0).all() and (uv < [c.width, c.height]).all())
         shares.append(inside / n)

@@ -19,7 +19,6 @@ from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Freedom,
     Rig,
     adjust,
-    exp_so3,
     rms_px,
     trimmed,
 )
@@ -44,11 +43,6 @@ def adjusted():
     detections = detections_of(cameras, shares, 0.05)
     rig, reference = initial(cameras, detections)
     return cameras, detections, rig, reference, adjust(rig, detections, BOARD.corners, reference)
-
-
-def test_rotations_are_those_of_their_vectors():
-    w = np.random.default_rng(0).normal(size=(50, 3)) * np.geomspace(1e-9, 3, 50)[:, None]
-    np.testing.assert_allclose(exp_so3(w), Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
 
 
 def moved(rig, x, reference):

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from board_array import BOARD, CAMERAS, HEIGHT, MOTION, WIDTH
+from board_array import BOARD, CAMERAS, HEIGHT, WIDTH
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
@@ -15,7 +15,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
-from spike4dgs.generators.recorder.rig_calibration.board_clip import write_board_clip
+from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, write_board_clip
 from spike4dgs.generators.recorder.rig_calibration.board_views import (
     BoardRecording,
     View,
@@ -57,7 +57,9 @@ def test_clips_of_different_arrays_are_refused():
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     """Four of the nine cameras, 0.3 s: the board is so fast that its image blurs over a pixel."""
-    return write_board_clip(tmp_path_factory.mktemp("board") / "clip", CAMERAS[::2][:4], BOARD, MOTION, 6000, seed=1)
+    return write_board_clip(
+        tmp_path_factory.mktemp("board") / "clip", CAMERAS[::2][:4], BOARD, DISTANCE_M, 6000, seed=1
+    )
 
 
 def test_the_command_finds_the_array_from_spikes(clip, tmp_path, capsys):
