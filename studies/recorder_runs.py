@@ -19,15 +19,15 @@ from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.disk import BUFFER_BYTES, Buffers, DiskFile
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_profile
-from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera
+from spike4dgs.generators.recorder.emulation.ports import emulated_ports
 from spike4dgs.generators.recorder.frames.clip import Clip
 from spike4dgs.generators.recorder.frames.layouts import PLAIN
 from spike4dgs.generators.recorder.resources import buffer_seconds, real_time
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, RigProfile
 from spike4dgs.generators.recorder.sync import Rate
+from spike4dgs.generators.recorder.usb.link import Link
 from spike4dgs.generators.recorder.usb.reads import Completion, Transfers
-from spike4dgs.generators.recorder.usb.transport import Link, open_link
 
 FRAME_BYTES = 12500
 _WIDTH, _HEIGHT = 400, 250
@@ -160,18 +160,15 @@ class _Watch:
         self.backlog.append((time.monotonic() + self.seconds, waiting))
 
 
-def run(load: Load, seconds: float, queued: bool, folder: Path | None = None) -> Outcome:
+def run(load: Load, seconds: float, folder: Path | None = None) -> Outcome:
     """Capture `seconds` of paced cameras into memory, or in continuous mode to files in `folder`, which are removed."""
     profile = array_profile(load)
     profile = replace(profile, ring_seconds=buffer_seconds(profile, seconds))
     rng = np.random.default_rng(0)
     sources = {c.id: rng.integers(0, 256, (_SOURCE_TICKS, FRAME_BYTES), dtype=np.uint8) for c in profile.cameras}
     array = EmulatedArray(profile, sources, memory_bytes=load.memory_bytes)
-    devices = find_cameras(profile, EmulatedBackend(array))
-    links = {}
-    for camera in profile.cameras:
-        link = open_link(devices[camera.id], camera, profile, queued)
-        links[camera.id] = _Link(devices[camera.id], camera, profile, link.queued, array.cameras[camera.id])
+    ports = find_cameras(profile, emulated_ports(array))
+    links = {c.id: _Link(ports[c.id], c, profile, array.cameras[c.id]) for c in profile.cameras}
     watch = _Watch(load, links)
     if folder is None:
         with real_time() as watch.urgent:

@@ -24,9 +24,9 @@ from spike4dgs.generators.recorder.frames.ticks import Run
 from spike4dgs.generators.recorder.resources import buffer_seconds
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.sync import Rate, Rates
+from spike4dgs.generators.recorder.usb.link import Link
 from spike4dgs.generators.recorder.usb.reader import Reader
 from spike4dgs.generators.recorder.usb.reads import OK, TIME_OUT
-from spike4dgs.generators.recorder.usb.transport import Link
 
 OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
 
@@ -253,7 +253,6 @@ class _Capture:
             idle_mean_ms=idle.total_ns / max(idle.reads, 1) * 1e-6,
             idle_worst_ms=idle.worst_ns * 1e-6,
             starved=idle.starved,
-            queued=reader.link.queued,
             end=end,
         )
         return CameraClip(camera, frames, ticks, gaps, cutter.arrival, stats)

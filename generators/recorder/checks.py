@@ -5,34 +5,35 @@ from __future__ import annotations
 import math
 import shutil
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import usb.core
+import usb1
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.resources import buffer_seconds, free_bytes, least_seconds
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
-from spike4dgs.generators.recorder.usb.transport import udev_fix
+from spike4dgs.generators.recorder.usb.link import udev_fix
+from spike4dgs.generators.recorder.usb.ports import Port
 
 USBFS_LIMIT = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
 
-SUPER_SPEED = 4  # LIBUSB_SPEED_SUPER; 5 is SuperSpeed+
-_SPEEDS = {1: "Low Speed", 2: "Full Speed", 3: "High Speed (480 Mbit/s)"}
+_SPEEDS = {usb1.SPEED_LOW: "Low Speed", usb1.SPEED_FULL: "Full Speed", usb1.SPEED_HIGH: "High Speed (480 Mbit/s)"}
 _SPARE_BYTES = 256 << 20  # for the program itself, the buffers of its files, and other programs
 
 
-def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, usb.core.Device]:
-    """Return the devices of the profile's cameras, camera id -> device.
+def find_cameras(profile: RigProfile, ports: Sequence[Port]) -> dict[str, Port]:
+    """Return which of the devices on the bus are the profile's cameras, camera id -> device.
 
     Raises UserError, which names all cameras concerned, where a serial number is absent or twice on the bus, where a
     link is slower than SuperSpeed, or where the devices cannot be queried.
     """
-    found: dict[tuple[int, int, str], list[usb.core.Device]] = defaultdict(list)
-    for vendor, product in sorted({(c.vendor_id, c.product_id) for c in profile.cameras}):
-        for device in _devices(vendor, product, backend):
-            found[vendor, product, _serial(device)].append(device)
+    found: dict[tuple[int, int, str], list[Port]] = defaultdict(list)
+    kinds = {(c.vendor_id, c.product_id) for c in profile.cameras}
+    for port in ports:
+        if (port.vendor_id, port.product_id) in kinds:
+            found[port.vendor_id, port.product_id, _serial(port)].append(port)
     of = {c.id: found.get((c.vendor_id, c.product_id, c.serial), []) for c in profile.cameras}
     cameras = {c.id: c for c in profile.cameras}
     if missing := [cameras[i] for i, devices in of.items() if not devices]:
@@ -40,11 +41,11 @@ def find_cameras(profile: RigProfile, backend: Any | None = None) -> dict[str, u
         fix = "check cable and power, or correct the serial in the rig profile"
         raise problem(_names(missing), "a device with this serial number", f"only the serials {others}", fix)
     if twice := [cameras[i] for i, devices in of.items() if len(devices) > 1]:
-        addresses = ", ".join(_bus_address(d) for c in twice for d in of[c.id])
+        addresses = ", ".join(d.where for c in twice for d in of[c.id])
         fix = "give each camera a serial number of its own (the bridge's EEPROM), or unplug one"
         raise problem(_names(twice), "one device with this serial number", f"several, at {addresses}", fix)
-    if slow := [cameras[i] for i, devices in of.items() if (devices[0].speed or 0) < SUPER_SPEED]:
-        speeds = ", ".join(sorted({_SPEEDS.get(of[c.id][0].speed or 0, "an unknown speed") for c in slow}))
+    if slow := [cameras[i] for i, devices in of.items() if devices[0].speed < usb1.SPEED_SUPER]:
+        speeds = ", ".join(sorted({_SPEEDS.get(of[c.id][0].speed, "an unknown speed") for c in slow}))
         fix = "use a USB 3 port and cable, without a USB 2 hub in between"
         raise problem(_names(slow), "a SuperSpeed link (5 Gbit/s)", speeds, fix)
     return {camera: devices[0] for camera, devices in of.items()}
@@ -117,24 +118,11 @@ def check_ring(profile: RigProfile) -> UserError | None:
     return problem(f"rig {profile.name}", expected, f"{profile.ring_seconds:.3g} s", fix)
 
 
-def _devices(vendor: int, product: int, backend: Any | None) -> list[usb.core.Device]:
+def _serial(port: Port) -> str:
     try:
-        return list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product, backend=backend))
-    except usb.core.NoBackendError:
-        fix = "install it (Debian, Ubuntu: sudo apt install libusb-1.0-0)"
-        raise problem("pyusb", "the library libusb-1.0", "no such library", fix) from None
-
-
-def _serial(device: usb.core.Device) -> str:
-    """Return the serial number. pyusb raises ValueError where it may not read the device's strings."""
-    try:
-        return str(device.serial_number)
-    except (usb.core.USBError, ValueError) as e:
-        raise problem(_bus_address(device), "a serial number", str(e), udev_fix(device.idVendor)) from None
-
-
-def _bus_address(device: usb.core.Device) -> str:
-    return f"bus {device.bus} address {device.address}"
+        return port.serial()
+    except usb1.USBError as e:
+        raise problem(port.where, "a serial number", str(e), udev_fix(port.vendor_id)) from None
 
 
 def _names(cameras: list[CameraProfile]) -> str:

@@ -73,7 +73,7 @@ def _source(profile: RigProfile, record: ClipRecord) -> dict[str, Any]:
         "recorded": utc_now(),
         "command": command_line(),
         "harness": harness(),
-        "environment": {**environment("cpu"), "pyusb": version("pyusb")},
+        "environment": {**environment("cpu"), "libusb1": version("libusb1")},
         "cameras": cameras,
     }
 

@@ -6,12 +6,12 @@ import math
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -42,7 +42,8 @@ from spike4dgs.generators.recorder.sources import (
     truth,
 )
 from spike4dgs.generators.recorder.sync import SyncReport, fit_arrival
-from spike4dgs.generators.recorder.usb.transport import Link, open_link
+from spike4dgs.generators.recorder.usb.link import Link, open_link
+from spike4dgs.generators.recorder.usb.ports import Port, usb_ports
 
 LOST_DATA = 3  # exit code
 _PATIENCE = 3  # presses of Ctrl-C that abort even the writing of captured data
@@ -101,7 +102,7 @@ def record(
     if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulate is not None):
         raise UserError("; ".join(map(str, problems)))
     with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
-        links = _open(profile, source.backend)
+        links = open_links(profile, usb_ports() if source.ports is None else source.ports)
         with Watch(profile, live=preview) as watch:
             sink = _sink(files, stop) if continuous else None
             with real_time() as urgent:
@@ -173,9 +174,9 @@ def _light(profile: RigProfile, flat: Path | None, dark: Path | None, flat_radia
     return Truth()
 
 
-def _open(profile: RigProfile, backend: Any | None) -> dict[str, Link]:
+def open_links(profile: RigProfile, ports: Sequence[Port]) -> dict[str, Link]:
     """Return the opened links of all cameras. Closes them if one cannot be opened."""
-    devices = find_cameras(profile, backend)
+    devices = find_cameras(profile, ports)
     links: dict[str, Link] = {}
     try:
         for camera in profile.cameras:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from spike4dgs.benchmark.spikes.counted_recording import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.untrusted import MAX_GAIN
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
-from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
 from spike4dgs.generators.recorder.emulation.imperfections import (
     PERFECT,
     Imperfections,
@@ -24,10 +23,12 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
     truth_record,
     with_wrong_calibrations,
 )
+from spike4dgs.generators.recorder.emulation.ports import emulated_ports
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
+from spike4dgs.generators.recorder.usb.ports import Port
 
 CLIP, FLAT, DARK = ("clip", "flat", "dark")
 SECONDS = 0.5  # default length of a recording
@@ -40,14 +41,14 @@ _EXTRAS = ("ground_truth", "calibration", "instances")  # of scene.json, which d
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """An array to record. `backend` is pyusb's, None for the system's own; `seconds` is its default length of a clip.
+    """An array to record. `ports`: its devices, None for those on the bus. `seconds`: the default length of a clip.
 
     `scene` is the scene that an emulated array shows, if its cameras are the scene's own: then the truth is known.
     `worse_truth` is what was done to the cameras of an array with imperfections, which is no part of a recording.
     """
 
     profile: RigProfile
-    backend: Any | None = None
+    ports: Sequence[Port] | None = None
     seconds: float = SECONDS
     scene: Scene | None = None
     worse_truth: Mapping[str, Any] = field(default_factory=dict)
@@ -84,7 +85,7 @@ def emulated_source(path: Path, rig: Path | None, mode: str, worse: Imperfection
     if worse != PERFECT:
         return _worse_source(profile, streams, ticks, mode, worse, seed)
     array = EmulatedArray(profile, streams)
-    return Source(profile, EmulatedBackend(array), ticks / profile.fps, scene if rig is None and mode == CLIP else None)
+    return Source(profile, emulated_ports(array), ticks / profile.fps, scene if rig is None and mode == CLIP else None)
 
 
 def _worse_source(
@@ -104,7 +105,7 @@ def _worse_source(
         ppm={name: camera.clock.drift_ppm for name, camera in cameras.items()},
     )
     done = truth_record(worse, seed, cameras, profile.width)
-    return Source(with_wrong_calibrations(profile, cameras), EmulatedBackend(array), ticks / profile.fps, None, done)
+    return Source(with_wrong_calibrations(profile, cameras), emulated_ports(array), ticks / profile.fps, None, done)
 
 
 def _scene_profile(scene: Scene, layout: str) -> RigProfile:

@@ -101,7 +101,9 @@ class Table:
 
     def tables(self, key: str) -> list[Table]:
         """Return the tables of an array of tables, [[key]]."""
-        are_tables = values(f"tables [[{key}]]", lambda v: isinstance(v, list) and all(isinstance(t, dict) for t in v))
+        are_tables: Kind[list[dict[str, Any]]] = values(
+            f"tables [[{key}]]", lambda v: isinstance(v, list) and all(isinstance(t, dict) for t in v)
+        )
         return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(self.get(key, are_tables, []))]
 
     def table(self, key: str) -> Table | None:

@@ -23,14 +23,14 @@ SLOW = Load(cameras=2, fps=400, transfer_bytes=16384, transfers=16, memory_bytes
 
 
 def test_a_clip_in_memory_has_every_frame() -> None:
-    outcome = run(SLOW, 0.1, queued=True)
+    outcome = run(SLOW, 0.1)
     assert outcome.clip.complete and outcome.unseen_bytes == 0 and outcome.wrong_frames == 0
     assert outcome.clip.n_ticks == 40 and outcome.seconds > 0.08
     assert 0 < outcome.emulator_cpu < outcome.cpu < 16
 
 
 def test_a_recording_to_disk_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    outcome = run(SLOW, 0.5, True, tmp_path / "clip")
+    outcome = run(SLOW, 0.5, tmp_path / "clip")
     assert outcome.clip.complete and (outcome.clip.n_ticks, outcome.wrong_frames) == (200, 0)
     assert outcome.flush_s > 0 and outcome.seconds > 0.45 + outcome.flush_s
     assert len(outcome.backlog) >= 1 and outcome.backlog[-1, 0] < outcome.seconds
@@ -44,7 +44,7 @@ def test_a_recording_to_disk_is_read_again(tmp_path: Path, monkeypatch: pytest.M
         write(files, camera, first_tick, frames ^ 1 if camera == "cam_01" and first_tick < 100 else frames)
 
     monkeypatch.setattr(StreamFiles, "write", damage)
-    assert 100 <= run(SLOW, 0.5, True, tmp_path / "clip").wrong_frames < 120
+    assert 100 <= run(SLOW, 0.5, tmp_path / "clip").wrong_frames < 120
 
 
 LOAD = Load(1, 20_000, 1 << 20, 16, 65536)

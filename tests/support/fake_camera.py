@@ -64,8 +64,6 @@ class FakeCamera:
     begun: float | None = None
     position: int = 0
 
-    queued = True
-
     def start(self) -> None:
         self.log.append(f"start {self.camera.id}")
         self.starts, self.begun, self.position = self.starts + 1, time.monotonic(), 0

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from small_scenes import array_cameras
@@ -15,13 +13,13 @@ from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.stream import SpikeWriter, pack
 from spike4dgs.generators.recorder.capture import capture
-from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.clip_record import ClipRecord
 from spike4dgs.generators.recorder.frames.clip import CameraClip, Clip
 from spike4dgs.generators.recorder.frames.gaps import Gap
+from spike4dgs.generators.recorder.record import open_links
 from spike4dgs.generators.recorder.rig_profile import RigProfile
-from spike4dgs.generators.recorder.usb.transport import open_link
+from spike4dgs.generators.recorder.usb.ports import Port
 
 WIDTH, HEIGHT, TICKS = 40, 24, 64
 FRAME = WIDTH * HEIGHT // 8
@@ -55,20 +53,15 @@ def source_scene(root: Path, cameras: int = 9, ticks: int = TICKS) -> Scene:
     return open_scene(root)
 
 
-def record(out: Path, profile: RigProfile, backend: Any, ticks: int, queued: bool | None = None) -> Clip:
+def record(out: Path, profile: RigProfile, ports: Sequence[Port], ticks: int) -> Clip:
     """Find the cameras, capture, write the scene folder."""
-    try:
-        devices = find_cameras(profile, backend)
-        links = {c.id: open_link(devices[c.id], c, profile, queued) for c in profile.cameras}
-        with StreamFiles(out, profile, ticks) as files:
-            clip = capture(profile, links, ticks / profile.fps)
-            for camera in clip.cameras:
-                files.write_ticks(camera.camera, camera.ticks, camera.frames)
-            finish(files, clip)
-        return clip
-    finally:
-        devices = links = {}
-        gc.collect()  # devices are released before the backend that found them
+    links = open_links(profile, ports)
+    with StreamFiles(out, profile, ticks) as files:
+        clip = capture(profile, links, ticks / profile.fps)
+        for camera in clip.cameras:
+            files.write_ticks(camera.camera, camera.ticks, camera.frames)
+        finish(files, clip)
+    return clip
 
 
 def finish(files: StreamFiles, clip: Clip) -> None:

@@ -4,14 +4,12 @@ their own, which has the library preloaded; they are not collected otherwise.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-import usb.backend.libusb1 as libusb1
 from recorder_rig import FRAME, TICKS, check_identical, check_recording, record, source_scene
 from usb_mock import UsbMock
 
@@ -21,6 +19,7 @@ from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_p
 from spike4dgs.generators.recorder.emulation.camera import Fault
 from spike4dgs.generators.recorder.frames.clip import CameraClip
 from spike4dgs.generators.recorder.rig_profile import RigProfile
+from spike4dgs.generators.recorder.usb.ports import UsbPort, usb_ports
 
 BLOCK, QUEUED = 1024, 4
 
@@ -36,21 +35,18 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Plug an array in, and return the mock and pyusb's own backend, made after the devices, as libusb needs it."""
-    opened: list[tuple[UsbMock, Any]] = []
+def bus() -> Iterator[Any]:
+    """Plug an array in, and return the mock and the devices that libusb finds then."""
+    with ExitStack() as mocks:
 
-    def plug_in(scene: Scene, profile: RigProfile, *faults: Fault) -> tuple[UsbMock, Any]:
-        mock = UsbMock(EmulatedArray(profile, scene_streams(scene), paced=False, faults=faults)).__enter__()
-        monkeypatch.setattr(libusb1, "_lib_object", None)  # pyusb keeps one backend for the life of a process
-        backend = libusb1.get_backend()
-        opened.append((mock, backend))
-        return mock, backend
+        def plug_in(scene: Scene, profile: RigProfile, *faults: Fault) -> tuple[UsbMock, list[UsbPort]]:
+            mock = UsbMock(EmulatedArray(profile, scene_streams(scene), paced=False, faults=faults))
+            mocks.enter_context(mock)
+            ports = usb_ports()
+            mocks.callback(lambda: ports[0]._bus.close())  # before the devices go
+            return mock, ports
 
-    yield plug_in
-    for mock, backend in opened:
-        backend.finalize()
-        mock.__exit__(None, None, None)
+        yield plug_in
 
 
 def profile_of(scene: Scene, **changes: object) -> RigProfile:
@@ -58,23 +54,13 @@ def profile_of(scene: Scene, **changes: object) -> RigProfile:
     return scene_profile(scene, **({"transfer_bytes": BLOCK, "transfers": QUEUED, "timeout_ms": 60000} | changes))
 
 
-@contextmanager
-def raised(kind: type[Exception]) -> Iterator[list[str]]:
-    """Collect the message of an error; pytest.raises would keep devices alive beyond their backend."""
-    messages: list[str] = []
-    try:
-        yield messages
-    except kind as e:
-        messages.append(str(e))
-
-
 def test_nine_superspeed_devices_are_found_by_serial_and_recorded_bit_for_bit(
     nine: Scene, bus: Any, tmp_path: Path
 ) -> None:
     profile = profile_of(nine)
-    mock, backend = bus(nine, profile)
-    clip = record(tmp_path / "clip", profile, backend, TICKS)
-    assert clip.complete and all(c.stats.queued for c in clip.cameras)
+    mock, ports = bus(nine, profile)
+    clip = record(tmp_path / "clip", profile, ports, TICKS)
+    assert clip.complete
     check_identical(tmp_path / "clip", nine)
     assert [d.most_queued for d in mock.devices] == [QUEUED] * 9
     assert not any(d.unhandled for d in mock.devices), "requests that the mock does not know"
@@ -84,17 +70,16 @@ def test_nine_superspeed_devices_are_found_by_serial_and_recorded_bit_for_bit(
 
 def test_frame_tags_travel_too(two: Scene, bus: Any, tmp_path: Path) -> None:
     profile = profile_of(two, layout="tagged-rows")
-    _, backend = bus(two, profile, Fault("cam_01", "lost bytes", 20, 33, lost=3 * 168))
-    clip = record(tmp_path / "clip", profile, backend, TICKS)
+    _, ports = bus(two, profile, Fault("cam_01", "lost bytes", 20, 33, lost=3 * 168))
+    clip = record(tmp_path / "clip", profile, ports, TICKS)
     check_recording(tmp_path / "clip", two, clip)
     assert [[(g.first_tick, g.ticks) for g in c.gaps] for c in clip.cameras] == [[], [(20, 4)]]
 
 
 def test_one_read_at_a_time_records_the_same(two: Scene, bus: Any, tmp_path: Path) -> None:
-    profile = profile_of(two)
-    mock, backend = bus(two, profile)
-    clip = record(tmp_path / "clip", profile, backend, TICKS, queued=False)
-    assert not any(c.stats.queued for c in clip.cameras)
+    profile = profile_of(two, transfers=1)
+    mock, ports = bus(two, profile)
+    record(tmp_path / "clip", profile, ports, TICKS)
     check_identical(tmp_path / "clip", two)
     assert [d.most_queued for d in mock.devices] == [1, 1]
 
@@ -102,8 +87,8 @@ def test_one_read_at_a_time_records_the_same(two: Scene, bus: Any, tmp_path: Pat
 def fail(scene: Scene, bus: Any, out: Path, fault: Fault, **changes: object) -> CameraClip:
     """Record with a fault of cam_01, which stops alone. Return its clip."""
     profile = profile_of(scene, **changes)
-    _, backend = bus(scene, profile, fault)
-    clip = record(out, profile, backend, TICKS)
+    _, ports = bus(scene, profile, fault)
+    clip = record(out, profile, ports, TICKS)
     check_recording(out, scene, clip)
     sound, failed = clip.cameras
     assert not sound.gaps and sound.stats.end == "ok"
@@ -143,8 +128,7 @@ def test_an_array_that_differs_from_its_profile_is_not_recorded(
     two: Scene, bus: Any, tmp_path: Path, kind: str, message: str
 ) -> None:
     profile = profile_of(two)
-    _, backend = bus(two, profile, Fault("cam_01", kind))
-    with raised(UserError) as errors:
-        record(tmp_path / "clip", profile, backend, TICKS)
-    assert len(errors) == 1 and re.search(rf"camera cam_01 \(serial EMULATED0001\): {message}", errors[0]), errors
+    _, ports = bus(two, profile, Fault("cam_01", kind))
+    with pytest.raises(UserError, match=rf"camera cam_01 \(serial EMULATED0001\): {message}"):
+        record(tmp_path / "clip", profile, ports, TICKS)
     assert not (tmp_path / "clip").exists()

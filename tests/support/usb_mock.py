@@ -1,7 +1,7 @@
-"""An emulated array as devices of the kernel's usbfs, by libumockdev: libusb and pyusb run on it unchanged.
+"""An emulated array as devices of the kernel's usbfs, by libumockdev: libusb runs on it unchanged.
 
     with UsbMock(EmulatedArray(profile, streams, paced=False)):
-        usb.core.find(find_all=True, backend=...)  # a backend that was made after this
+        usb_ports()
 
 libumockdev's preloaded library sends every ioctl on a device node here. Works only in a process that was started with
 `LD_PRELOAD=libumockdev-preload.so.0`, and on 64-bit machines; written against umockdev 0.17.
@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from usb_testbed import (
     CAPABILITIES,
-    CLEAR_HALT,
     CONTROL,
     DISCARD,
     GET_DRIVER,
@@ -33,9 +32,9 @@ from usb_testbed import (
 )
 
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
-from spike4dgs.generators.recorder.emulation.backend import interfaces, string_descriptor
 from spike4dgs.generators.recorder.emulation.camera import DUPLICATE, HIGH_SPEED, MISSING, EmulatedCamera
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, UNPLUGGED
+from spike4dgs.generators.recorder.rig_profile import CameraProfile
 
 # Zero packets, bulk continuation, no packet size limit, scatter-gather, reaping after a disconnect.
 _CAPABILITIES = 0x01 | 0x02 | 0x04 | 0x08 | 0x10
@@ -153,9 +152,6 @@ class MockDevice:
         if request == CAPABILITIES:
             c.c_uint32.from_address(self._resolve(argument, 0, 4).contents.data).value = _CAPABILITIES
             return 0
-        if request == CLEAR_HALT:
-            self.camera.clear_halt()
-            return 0
         if request in GRANTED:
             return 0
         if request == GET_DRIVER:
@@ -237,6 +233,23 @@ class MockDevice:
         if not found:
             raise OSError("the client's memory cannot be read")
         return found
+
+
+def interfaces(camera: CameraProfile) -> dict[int, list[int]]:
+    """Return interface number -> endpoint addresses, as the profile names them."""
+    out: dict[int, list[int]] = {camera.interface: [camera.endpoint_in]}
+    if camera.endpoint_out is not None:
+        control = camera.interface if camera.control_interface is None else camera.control_interface
+        out.setdefault(control, []).append(camera.endpoint_out)
+    return dict(sorted(out.items()))
+
+
+def string_descriptor(camera: CameraProfile, index: int) -> bytes:
+    """Return the answer to a request for a string: languages (US English), manufacturer, product, serial number."""
+    if index == 0:
+        return b"\x04\x03\x09\x04"
+    text = ("", "Spike4DGS", "emulated spike camera", camera.serial)[index].encode("utf-16-le")
+    return struct.pack("<BB", 2 + len(text), 3) + text
 
 
 def descriptors(camera: EmulatedCamera, slow: bool) -> bytes:

@@ -53,7 +53,6 @@ def _ioctl(number: int, size: int = 0, direction: int = 2) -> int:
 SUBMIT, DISCARD = _ioctl(10, c.sizeof(Urb)), _ioctl(11)
 REAP, REAP_NOW = _ioctl(12, 8, 1), _ioctl(13, 8, 1)
 CAPABILITIES, GET_DRIVER = _ioctl(26, 4), _ioctl(8, 260, 1)
-CLEAR_HALT = _ioctl(21, 4)
 # Claim, release, set configuration, set interface, disconnect and claim, reset the device, reset an endpoint.
 GRANTED = {_ioctl(15, 4), _ioctl(16, 4), _ioctl(5, 4), _ioctl(4, 8), _ioctl(27, 264), _ioctl(20), _ioctl(3, 4)}
 

@@ -1,1 +1,1 @@
-"""An array of emulated cameras behind a pyusb backend."""
+"""An array of emulated cameras as devices on a bus."""

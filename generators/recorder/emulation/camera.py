@@ -1,7 +1,7 @@
 """An emulated camera behind the USB plug: its data, their timing, and its faults.
 
 It sends the ticks of a packed stream in an endless loop; its first frame after a start is tick 0 of the stream.
-`array.py` joins cameras to an array, `backend.py` puts them behind a pyusb backend; this module does not depend on how
+`array.py` joins cameras to an array, `ports.py` shows them as devices on a bus; this module does not depend on how
 a camera is read. Not modelled: the time that a bus takes.
 """
 
@@ -119,11 +119,6 @@ class EmulatedCamera:
                 self._held = self._bytes(self._at, self._at + n)
             self._begun = None
             self.changed.notify_all()
-
-    def clear_halt(self) -> None:
-        """Clear a stall."""
-        with self.changed:
-            self.dead = None if self.dead == STALL else self.dead
 
     def due_s(self, n: int) -> float:
         """Return when a read of `n` bytes ends by itself (clock of time.monotonic()); infinite where it never does."""

@@ -31,7 +31,6 @@ class CameraStats:
     idle_mean_ms: float  # time from one read's end to the next read's submission while none was in flight: mean, worst
     idle_worst_ms: float
     starved: int  # how often no read was in flight
-    queued: bool
     end: str  # "ok", or the reason that stopped this camera alone; "disk" where only its file ended
 
 

@@ -8,8 +8,8 @@ from collections import deque
 
 from spike4dgs.generators.recorder.frames.layouts import Layout
 from spike4dgs.generators.recorder.frames.ring import Block, Ring
+from spike4dgs.generators.recorder.usb.link import Link
 from spike4dgs.generators.recorder.usb.reads import FATAL, OK, SHORT, TIME_OUT, Completion, Transfers
-from spike4dgs.generators.recorder.usb.transport import Link
 
 _POLL_S = 0.05  # interval at which a thread that waits for data checks whether to end
 

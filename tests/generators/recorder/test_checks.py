@@ -2,88 +2,92 @@
 
 from __future__ import annotations
 
-import array
-import errno
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
-import usb.core
-import usb.util
+import usb1
 from fake_camera import rig
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder import checks
-from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, STALL, TIME_OUT, UNPLUGGED
-from spike4dgs.generators.recorder.usb import queued, transport
-from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion, SingleReads
+from spike4dgs.generators.recorder.usb.link import Link, open_link
+from spike4dgs.generators.recorder.usb.ports import usb_ports
+from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion
 
 ARRAY = rig(9, transfer_bytes=262144, transfers=16)
 
 
-def device(serial: Any, speed: int | None = 4, address: int = 1) -> Any:
-    """Return a device for `find_cameras`; a serial that is an exception is raised."""
+class FakePort:
+    """A device; `serial` and `refuses` may be errors, which are raised."""
 
-    class Device(SimpleNamespace):
-        @property
-        def serial_number(self) -> str:
-            if isinstance(serial, Exception):
-                raise serial
-            return str(serial)
+    def __init__(self, serial: Any = "S0", speed: int = 4, address: int = 1) -> None:
+        self.vendor_id, self.product_id, self.speed, self.where = 0x0403, 0x601F, speed, f"bus 2 address {address}"
+        self.name, self.refuses, self.ends = serial, None, list[Completion]()
+        self.written, self.claimed = list[tuple[int, bytes]](), list[int]()
 
-    return Device(speed=speed, bus=2, address=address, idVendor=0x0403)
+    def serial(self) -> str:
+        if isinstance(self.name, Exception):
+            raise self.name
+        return str(self.name)
+
+    def open(self, interfaces: Collection[int]) -> None:
+        if self.refuses:
+            raise self.refuses
+        self.claimed += interfaces
+
+    def write(self, endpoint: int, data: bytes, timeout_ms: int) -> None:
+        self.written.append((endpoint, data))
+        if data == b"refused":
+            raise usb1.USBErrorPipe
+
+    def transfers(self, endpoint: int, transfer_bytes: int, depth: int) -> Any:
+        assert (endpoint, transfer_bytes) == (0x82, 1024)
+        rest = [Completion(7, 0, "cancelled")]
+        ends = iter(self.ends)
+        return SimpleNamespace(depth=depth, submit=lambda b: None, wait=lambda s: next(ends, None), cancel=lambda: rest)
+
+    def close(self) -> None:
+        self.claimed.clear()
 
 
-def plug(monkeypatch: pytest.MonkeyPatch, devices: list[Any]) -> None:
-    def find(find_all: bool, idVendor: int, idProduct: int, backend: Any) -> list[Any]:  # noqa: N803 - pyusb's names
-        assert find_all and (idVendor, idProduct, backend) == (0x0403, 0x601F, None)
-        return devices
-
-    monkeypatch.setattr(usb.core, "find", find)
-
-
-def test_cameras_are_found_by_their_serial_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    devices = [device("S2"), device("another"), device("S0", speed=5), device("S1")]
-    plug(monkeypatch, devices)
-    assert checks.find_cameras(rig(3)) == {"cam_00": devices[2], "cam_01": devices[3], "cam_02": devices[0]}
+def test_cameras_are_found_by_their_serial_numbers() -> None:
+    ports = [FakePort("S2"), FakePort("another"), FakePort("S0", speed=5), FakePort("S1")]
+    keyboard = FakePort(ValueError("never asked"))
+    keyboard.vendor_id = 0x046D
+    assert checks.find_cameras(rig(3), [keyboard, *ports]) == {
+        "cam_00": ports[2],
+        "cam_01": ports[3],
+        "cam_02": ports[0],
+    }
 
 
 @pytest.mark.parametrize(
-    ("devices", "message"),
+    ("ports", "message"),
     [
         (["S0"], r"camera cam_01 \(serial S1\), cam_02 \(serial S2\): .* found only the serials S0; check cable"),
         ([], "found only the serials none; check"),
         (["S0", "S1", "S2", "S1"], r"cam_01 \(serial S1\): .* several, at bus 2 address 1, bus 2 address 3; give each"),
-        (
-            ["S0", ("S1", 3), ("S2", None)],
-            "cam_01 .*, cam_02 .* SuperSpeed .* High Speed.*, an unknown speed; use",
-        ),
-        (
-            [usb.core.USBError("Access denied", None, errno.EACCES)],
-            'found .*Access denied; put the line SUBSYSTEM=="usb"',
-        ),
-        ([ValueError("The device has no langid")], "a serial number, found The device has no langid; put the line"),
+        (["S0", ("S1", 3), ("S2", 0)], "cam_01 .*, cam_02 .* SuperSpeed .* High Speed.*, an unknown speed; use"),
+        ([usb1.USBErrorAccess()], 'found LIBUSB_ERROR_ACCESS.*; put the line SUBSYSTEM=="usb"'),
     ],
 )
-def test_an_array_that_is_not_complete_is_refused(
-    monkeypatch: pytest.MonkeyPatch, devices: list[Any], message: str
-) -> None:
-    made = [d if isinstance(d, tuple) else (d, 4) for d in devices]
-    plug(monkeypatch, [device(serial, speed, address=i) for i, (serial, speed) in enumerate(made)])
+def test_an_array_that_is_not_complete_is_refused(ports: list[Any], message: str) -> None:
+    made = [d if isinstance(d, tuple) else (d, 4) for d in ports]
     with pytest.raises(UserError, match=message):
-        checks.find_cameras(rig(3))
+        checks.find_cameras(rig(3), [FakePort(serial, speed, address=i) for i, (serial, speed) in enumerate(made)])
 
 
 def test_a_machine_without_libusb_gets_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def find(**_: Any) -> list[Any]:
-        raise usb.core.NoBackendError("No backend available")
+    def load() -> None:
+        raise OSError("no libusb-1.0.so.0")
 
-    monkeypatch.setattr(usb.core, "find", find)
+    monkeypatch.setattr(usb1, "loadLibrary", load)
     with pytest.raises(UserError, match="apt install libusb-1.0-0"):
-        checks.find_cameras(rig(1))
+        usb_ports()
 
 
 @pytest.mark.parametrize(("limit", "refused"), [("16\n", True), ("36", False), ("0", False), (None, False)])
@@ -133,146 +137,45 @@ def test_all_of_a_machines_problems_are_listed(monkeypatch: pytest.MonkeyPatch, 
     assert [str(e)[:6] for e in found] == ["memory", "rig te"]
 
 
-class Bus:
-    """A device that answers each read with the next of `answers`: bytes, or an exception."""
-
-    def __init__(self, *answers: Any) -> None:
-        self.answers, self.written, self.claimed = list(answers), [], []
-        self.backend: Any = SimpleNamespace()
-        self.busy: usb.core.USBError | None = None
-
-    def read(self, endpoint: int, into: array.array[int], timeout_ms: int) -> int:
-        assert isinstance(into, array.array) and endpoint == 0x82
-        answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
-            raise answer
-        into[: len(answer)] = array.array("B", answer)
-        return len(answer)
-
-    def write(self, endpoint: int, data: bytes, timeout_ms: int) -> None:
-        self.written.append((endpoint, data))
-        if data == b"refused":
-            raise usb.core.USBError("Pipe error", None, errno.EPIPE)
-
-    def get_active_configuration(self) -> None:
-        if self.busy:
-            raise self.busy
-
-    def set_configuration(self) -> None:
-        self.claimed.append("configuration")
-
-    def is_kernel_driver_active(self, interface: int) -> bool:
-        raise NotImplementedError
-
-
-def opened(monkeypatch: pytest.MonkeyPatch, bus: Bus, queued: bool | None = None, **changes: Any) -> transport.Link:
-    monkeypatch.setattr(usb.util, "claim_interface", lambda device, i: device.claimed.append(i))
-    monkeypatch.setattr(usb.util, "dispose_resources", lambda device: device.claimed.clear())
+def opened(port: FakePort, **changes: Any) -> Link:
     profile = rig(1)
-    camera = replace(profile.cameras[0], control_interface=3, **changes)
-    link = transport.open_link(bus, camera, profile, queued)
-    assert isinstance(link, transport.Link)
-    return link
+    return open_link(port, replace(profile.cameras[0], control_interface=3, **changes), profile)
 
 
-@pytest.mark.parametrize(
-    ("answer", "n", "status"),
-    [
-        (bytes(range(8)), 8, OK),
-        (b"abc", 3, SHORT),
-        (usb.core.USBTimeoutError("late", None, errno.ETIMEDOUT), 0, TIME_OUT),
-        (usb.core.USBError("pipe", None, errno.EPIPE), 0, STALL),
-        (usb.core.USBError("io", None, errno.EIO), 0, STALL),
-        (usb.core.USBError("babble", None, errno.EOVERFLOW), 0, OVERFLOW),
-        (usb.core.USBError("gone", None, errno.ENODEV), 0, UNPLUGGED),
-    ],
-)
-def test_a_single_read_ends_as_pyusb_says(answer: Any, n: int, status: str) -> None:
-    reads = SingleReads(Bus(answer), 0x82, 8, 10_000)
-    into = np.zeros(8, np.uint8)
-    assert reads.wait(0) is None
-    reads.submit(into)
-    assert reads.in_flight == 1
-    done = reads.wait(0)
-    assert done is not None and (done.bytes, done.status) == (n, status)
-    assert into[:n].tobytes() == (answer if n else b"") and reads.in_flight == 0
-
-
-def test_bytes_before_a_time_out_are_good() -> None:
-    reads = SingleReads(Bus(b"abc"), 0x82, 8, 0)
-    reads.submit(np.zeros(8, np.uint8))
-    done = reads.wait(0)
-    assert done is not None and (done.bytes, done.status) == (3, TIME_OUT)
-
-
-def test_a_link_starts_stops_and_drains_its_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    late = usb.core.USBTimeoutError("late", None, errno.ETIMEDOUT)
-    bus = Bus(bytes(1024), bytes(300), late)
-    link = opened(monkeypatch, bus, start=(b"a", b"b"), stop=(b"refused",))
-    assert bus.claimed == [0, 3] and not link.queued and link.restartable and link.camera.serial == "S0"
+def test_a_link_starts_stops_and_drains_its_camera() -> None:
+    port = FakePort()
+    link = opened(port, start=(b"a", b"b"), stop=(b"refused",))
+    assert port.claimed == [0, 3] and link.restartable and link.transfers().depth == 3
     link.start()
     link.stop()  # a camera that refuses it is left as it is
-    assert bus.written == [(0x02, b"a"), (0x02, b"b"), (0x02, b"refused")]
-    assert link.drain() == 1324
+    assert port.written == [(0x02, b"a"), (0x02, b"b"), (0x02, b"refused")]
+    port.ends = [Completion(1024, 0, OK), Completion(300, 0, SHORT)]
+    assert link.drain() == 1331, "with what a read has when it is cancelled"
     link.close()
-    assert not bus.claimed
+    assert not port.claimed
 
 
-def test_a_refused_start_sequence_names_the_keys_to_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = opened(monkeypatch, Bus(), start=(b"refused",))
-    with pytest.raises(UserError, match=r"camera cam_00 \(serial S0\): .* Pipe error while it was started; check"):
-        link.start()
+def test_a_camera_that_was_not_stopped_is_not_drained_for_ever() -> None:
+    port = FakePort()
+    port.ends = [Completion(1 << 20, 0, OK)] * 100
+    assert opened(port).drain() == (64 << 20) + 7
 
 
-@pytest.mark.parametrize(
-    ("number", "message"),
-    [(errno.EACCES, 'found no permission; put .* ATTR{idVendor}=="0403"'), (errno.ENODEV, "plug the camera in again")],
-)
-def test_a_device_that_cannot_be_opened(monkeypatch: pytest.MonkeyPatch, number: int, message: str) -> None:
-    bus = Bus()
-    bus.busy = usb.core.USBError("No", None, number)
-    with pytest.raises(UserError, match=message):
-        opened(monkeypatch, bus)
-
-
-def test_a_device_without_configuration_gets_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = Bus()
-    bus.busy = usb.core.USBError("Configuration not set")
-    opened(monkeypatch, bus)
-    assert bus.claimed[0] == "configuration"
-
-
-def _library(*names: str) -> SimpleNamespace:
-    return SimpleNamespace(**dict.fromkeys(names))
-
-
-ALL = tuple(queued._FUNCTIONS)
+def test_a_refused_start_sequence_names_the_keys_to_check() -> None:
+    with pytest.raises(UserError, match=r"camera cam_00 \(serial S0\): .*PIPE.* while it was started; check"):
+        opened(FakePort(), start=(b"refused",)).start()
 
 
 @pytest.mark.parametrize(
-    ("backend", "context", "reason"),
+    ("error", "message"),
     [
-        (SimpleNamespace(), None, "backend SimpleNamespace has no lib and no ctx"),
-        (SimpleNamespace(ctx=1, lib=_library(*ALL[1:])), None, "this libusb has no libusb_alloc_transfer"),
-        (SimpleNamespace(ctx=1, lib=_library(*ALL)), None, "this version of pyusb keeps its libusb handle elsewhere"),
-        (SimpleNamespace(ctx=1, lib=_library(*ALL)), SimpleNamespace(managed_open=object), "handle elsewhere"),
-        (SimpleNamespace(ctx=1, lib=_library(*ALL)), SimpleNamespace(managed_open=lambda: _library("handle")), None),
+        (usb1.USBErrorAccess, 'found no permission; put .* ATTR{idVendor}=="0403"'),
+        (usb1.USBErrorBusy, "found another program holds it; end that program"),
+        (usb1.USBErrorNoDevice, "NO_DEVICE.*; plug the camera in again"),
     ],
 )
-def test_a_pyusb_that_hides_its_handle_is_read_without_a_queue(backend: Any, context: Any, reason: str | None) -> None:
-    found = queued.unavailable(SimpleNamespace(backend=backend, _ctx=context))
-    assert (reason in found) if reason and found else found is reason
-
-
-def test_insisting_on_a_queue_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UserError, match="expected queued reads, found the pyusb backend SimpleNamespace has no lib"):
-        opened(monkeypatch, Bus(), queued=True)
-
-
-def test_a_backend_with_its_own_queue_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = Bus()
-    bus.backend = SimpleNamespace(open_transfers=lambda *a: Completion(0, 0, repr(a[1:])))
-    link = opened(monkeypatch, bus)
-    assert link.queued and link.transfers() == Completion(0, 0, "(130, 1024, 3)")
-    single = opened(monkeypatch, bus, queued=False)
-    assert not single.queued and isinstance(single.transfers(), SingleReads)
+def test_a_device_that_cannot_be_opened(error: type[Exception], message: str) -> None:
+    port = FakePort()
+    port.refuses = error()
+    with pytest.raises(UserError, match=message):
+        opened(port)

@@ -134,7 +134,7 @@ def test_a_recording_is_a_scene_of_the_same_bits(tmp_path: Path) -> None:
     assert scene.meta["clock"] == {"t0_ns": 7, "source": "CLOCK_MONOTONIC"}
     assert scene.meta["sync"] == SYNC | {"max_error_us": 12.5}
     source = scene.meta["source"]
-    assert (source["kind"], source["rig"]) == ("recorder", "test") and source["environment"]["pyusb"]
+    assert (source["kind"], source["rig"]) == ("recorder", "test") and source["environment"]["libusb1"]
     assert source["cameras"]["cam_02"] == {"serial": "CAM_02", "role": "secondary", "lost_ticks": 0, "drift_ppm": 3.5}
     for i, (name, c) in enumerate(sorted(scene.cameras.items())):
         assert (root / f"spikes/{name}.dat").read_bytes() == packed[name].tobytes()

@@ -1,4 +1,4 @@
-"""`record`, end to end: an emulated array through pyusb into a scene folder that every other command reads."""
+"""`record`, end to end: an emulated array into a scene folder that every other command reads."""
 
 from __future__ import annotations
 

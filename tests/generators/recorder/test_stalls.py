@@ -24,15 +24,13 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.cli import main
 from spike4dgs.generators.recorder import disk as disk
 from spike4dgs.generators.recorder.capture import capture
-from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, camera_profile
-from spike4dgs.generators.recorder.emulation.backend import EmulatedBackend
+from spike4dgs.generators.recorder.emulation.ports import emulated_ports
 from spike4dgs.generators.recorder.frames.clip import CameraClip, Clip, Sink
-from spike4dgs.generators.recorder.record import _interruptible
+from spike4dgs.generators.recorder.record import _interruptible, open_links
 from spike4dgs.generators.recorder.resources import real_time
 from spike4dgs.generators.recorder.rig_profile import RigProfile
-from spike4dgs.generators.recorder.usb.transport import open_link
 
 WIDTH, HEIGHT, FPS = 80, 40, 10_000
 FRAME = WIDTH * HEIGHT // 8  # 4 MB/s a camera
@@ -80,8 +78,7 @@ def run(
     """
     profile = rig(buffer_s)
     array = EmulatedArray(profile, {f"cam_{i:02d}": SOURCE[i] for i in range(2)}, memory_bytes=int(0.6 * FPS * FRAME))
-    devices = find_cameras(profile, EmulatedBackend(array))
-    links = {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}
+    links = open_links(profile, emulated_ports(array))
     with StreamFiles(folder, profile, round(seconds * FPS)) as files:
         sink = StallingSink(files.write, stall_s, during)
         with real_time():  # other tests beside this one must not cost data

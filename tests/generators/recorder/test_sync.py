@@ -28,7 +28,7 @@ def test_spike_rates_are_counted_in_whole_frames(layout: str) -> None:
 
 
 FPS = 20000
-STATS = CameraStats(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, True, "ok")
+STATS = CameraStats(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0, "ok")
 
 
 def arrivals(ppm: float, offset_us: float, late_us: NDArray[np.float64]) -> NDArray[np.int64]:

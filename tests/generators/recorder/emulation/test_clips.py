@@ -16,15 +16,14 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.capture import capture
-from spike4dgs.generators.recorder.checks import find_cameras
 from spike4dgs.generators.recorder.clip_files import StreamFiles
-from spike4dgs.generators.recorder.emulation import backend as emulator
-from spike4dgs.generators.recorder.emulation.backend import EmulatedReads
+from spike4dgs.generators.recorder.emulation import ports as emulator
 from spike4dgs.generators.recorder.emulation.camera import Fault
+from spike4dgs.generators.recorder.emulation.ports import EmulatedReads
 from spike4dgs.generators.recorder.frames.clip import CameraClip
 from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.record import open_links
 from spike4dgs.generators.recorder.usb.reads import Completion
-from spike4dgs.generators.recorder.usb.transport import open_link
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +36,14 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return source_scene(tmp_path_factory.mktemp("two") / "scene", cameras=2, ticks=N)
 
 
-@pytest.mark.parametrize("queued", [True, False])
+@pytest.mark.parametrize("transfers", [4, 1])
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows", "line-tagged"])
 def test_a_recording_of_nine_cameras_is_the_scene_that_they_show(
-    nine: Scene, layout: str, queued: bool, tmp_path: Path
+    nine: Scene, layout: str, transfers: int, tmp_path: Path
 ) -> None:
-    profile = profile_of(nine, layout=layout)
-    clip = record(tmp_path / "clip", profile, emulate(nine, profile), TICKS, queued)
-    assert clip.complete and all(c.stats.queued == queued for c in clip.cameras)
+    profile = profile_of(nine, layout=layout, transfers=transfers)
+    clip = record(tmp_path / "clip", profile, emulate(nine, profile), TICKS)
+    assert clip.complete
     assert clip.sync == ("frame tags" if layout == "tagged-rows" else "arrival times")
     check_identical(tmp_path / "clip", nine)
 
@@ -60,9 +59,7 @@ def test_cameras_that_see_the_scene_upside_down_record_it_upright(two: Scene, tm
 def test_cameras_that_send_from_power_on_agree_on_a_tick(two: Scene) -> None:
     profile = profile_of(two, layout="tagged-rows")
     profile = replace(profile, cameras=tuple(replace(c, start=(), stop=()) for c in profile.cameras))
-    backend = emulate(two, profile)
-    devices = find_cameras(profile, backend)
-    clip = capture(profile, {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}, N / 20000)
+    clip = capture(profile, open_links(profile, emulate(two, profile)), N / 20000)
     assert clip.complete and clip.sync == "frame tags"
     frames, origins = make_layout("tagged-rows", WIDTH, HEIGHT), set()
     for camera in clip.cameras:
@@ -74,10 +71,10 @@ def test_cameras_that_send_from_power_on_agree_on_a_tick(two: Scene) -> None:
     assert len(origins) == 1
 
 
-def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object) -> CameraClip:
+def fail(scene: Scene, out: Path, fault: Fault, **changes: object) -> CameraClip:
     """Record with a fault of cam_01, check that cam_00 is complete, and return cam_01's clip."""
     profile = profile_of(scene, **changes)
-    clip = record(out, profile, emulate(scene, profile, fault), N, queued)
+    clip = record(out, profile, emulate(scene, profile, fault), N)
     check_recording(out, scene, clip)
     sound, failed = clip.cameras
     assert not sound.gaps and sound.stats.end == "ok"
@@ -86,27 +83,13 @@ def fail(scene: Scene, out: Path, fault: Fault, queued: bool, **changes: object)
     return failed
 
 
-@pytest.mark.parametrize("queued", [True, False])
-@pytest.mark.parametrize("kind", ["stall", "overflow", "unplugged"])
-def test_a_camera_that_fails_keeps_earlier_ticks(two: Scene, kind: str, queued: bool, tmp_path: Path) -> None:
-    tick, offset = 77, 33
-    failed = fail(two, tmp_path / "clip", Fault("cam_01", kind, tick, offset), queued)
-    # libusb reports the bytes before a failure for queued reads only.
-    first = tick if queued else (tick * FRAME + offset) // BLOCK * BLOCK // FRAME
-    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(first, N - first, kind)]
+@pytest.mark.parametrize("transfers", [4, 1])
+@pytest.mark.parametrize("kind", ["stall", "overflow", "unplugged", "time-out", "short read"])
+def test_a_camera_that_fails_keeps_every_earlier_tick(two: Scene, kind: str, transfers: int, tmp_path: Path) -> None:
+    silent = {"timeout_ms": 1000} if kind == "time-out" else {}
+    failed = fail(two, tmp_path / "clip", Fault("cam_01", kind, 77, 33), transfers=transfers, **silent)
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, kind)]
     assert failed.stats.end == kind
-
-
-@pytest.mark.parametrize("queued", [True, False])
-def test_a_camera_that_falls_silent_keeps_all_received_ticks(two: Scene, queued: bool, tmp_path: Path) -> None:
-    failed = fail(two, tmp_path / "clip", Fault("cam_01", "time-out", 77, 33), queued, timeout_ms=1000)
-    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, "time-out")]
-
-
-@pytest.mark.parametrize("queued", [True, False])
-def test_a_short_read_in_a_frame_ends_a_camera_without_tags(two: Scene, queued: bool, tmp_path: Path) -> None:
-    failed = fail(two, tmp_path / "clip", Fault("cam_01", "short read", 77, 33), queued)
-    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, "short read")]
 
 
 @pytest.mark.parametrize(
@@ -117,8 +100,7 @@ def test_tags_find_the_next_frame_after_a_loss(
     two: Scene, kind: str, lost: int, gap: list[tuple[int, int]], tmp_path: Path
 ) -> None:
     profile = profile_of(two, layout="tagged-rows")
-    backend = emulate(two, profile, Fault("cam_01", kind, 77, 33, lost))
-    clip = record(tmp_path / "clip", profile, backend, N)
+    clip = record(tmp_path / "clip", profile, emulate(two, profile, Fault("cam_01", kind, 77, 33, lost)), N)
     check_recording(tmp_path / "clip", two, clip)
     assert [(g.first_tick, g.ticks) for g in clip.cameras[1].gaps] == gap
 
@@ -214,10 +196,8 @@ def test_a_consumer_slowed_on_purpose_loses_exactly_the_ticks_without_a_slot(
     two: Scene, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     profile = profile_of(two, layout=layout, transfers=FLYING, ring_seconds=0.002)
-    backend = emulate(two, profile, paced=False)
     monkeypatch.setattr(emulator, "EmulatedReads", SteppedReads)
-    devices = find_cameras(profile, backend)
-    links = {c.id: open_link(devices[c.id], c, profile) for c in profile.cameras}
+    links = open_links(profile, emulate(two, profile, paced=False))
     with StreamFiles(tmp_path / "clip", profile, N) as files:
         steps = Steps(make_layout(layout, WIDTH, HEIGHT).frame_bytes, files)
         monkeypatch.setattr(SteppedReads, "steps", steps, raising=False)

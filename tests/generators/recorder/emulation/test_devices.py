@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import usb.core
-import usb.util
+import usb1
 from emulated_rig import N, emulate, profile_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -182,55 +180,37 @@ def test_bytes_held_at_a_stop_come_before_the_next_start(two: Scene) -> None:
     np.testing.assert_array_equal(into, stream[: len(into)])
 
 
-# The backend.
+# The devices.
 
 
 def test_secondaries_wait_for_the_trigger_of_the_primary(two: Scene) -> None:
-    backend = emulate(two, profile_of(two))
-    cameras = backend.emulated.cameras
-    assert backend.emulated.write("cam_01", b"start") and not cameras["cam_01"].running
-    assert backend.emulated.write("cam_00", b"start") and cameras["cam_00"].running and cameras["cam_01"].running
-    assert backend.emulated.write("cam_01", b"stop") and not cameras["cam_01"].running and cameras["cam_00"].running
-    assert not backend.emulated.write("cam_01", b"begin")
+    array = EmulatedArray(profile_of(two), scene_streams(two))
+    first, second = array.cameras.values()
+    assert array.write("cam_01", b"start") and not second.running
+    assert array.write("cam_00", b"start") and first.running and second.running
+    assert array.write("cam_01", b"stop") and not second.running and first.running
 
 
 def test_commands_that_a_camera_does_not_know_stall(two: Scene) -> None:
-    device = usb.core.find(backend=emulate(two, profile_of(two)), idProduct=0x601F)
-    with pytest.raises(usb.core.USBError) as error:
-        device.write(0x01, b"begin")
-    assert error.value.errno == errno.EPIPE
+    with pytest.raises(usb1.USBErrorPipe):
+        emulate(two, profile_of(two))[0].write(0x01, b"begin", 100)
 
 
-@pytest.mark.parametrize(
-    ("kind", "number"), [("stall", errno.EPIPE), ("overflow", errno.EOVERFLOW), ("unplugged", errno.ENODEV)]
-)
-def test_blocking_reads_fail_with_the_errors_of_libusb(two: Scene, kind: str, number: int) -> None:
-    backend = emulate(two, profile_of(two), Fault("cam_00", kind, 3, start=0), paced=False)
-    device = next(iter(usb.core.find(find_all=True, backend=backend)))
-    buffer = usb.util.create_buffer(2 * FRAME)
-    with pytest.raises(usb.core.USBTimeoutError):
-        device.read(0x82, buffer, 1)
-    device.write(0x01, b"start")
-    assert device.read(0x82, buffer, 1000) == 2 * FRAME
+def test_reads_of_a_camera_that_fails_end_so(two: Scene) -> None:
+    port = emulate(two, profile_of(two), Fault("cam_00", "unplugged", 3, start=0), paced=False)[0]
+    reads, buffer = port.transfers(0x82, 2 * FRAME, 1), np.zeros(2 * FRAME, np.uint8)
+    reads.submit(buffer)
+    assert reads.wait(0.001) is None and reads.in_flight == 1, "before the start"
+    port.write(0x01, b"start", 100)
+    ends = [reads.wait(1)]
     for _ in range(2):
-        with pytest.raises(usb.core.USBError) as error:
-            device.read(0x82, buffer, 1000)
-        assert error.value.errno == number
-    left = [d.address for d in usb.core.find(find_all=True, backend=backend)]
-    assert left == ([2] if kind == "unplugged" else [1, 2])
-    if kind == "stall":
-        device.clear_halt(0x82)
-        assert device.read(0x82, buffer, 1000) == 2 * FRAME
-
-
-def test_a_blocking_read_that_is_cut_off_returns_the_bytes_so_far(two: Scene) -> None:
-    backend = emulate(two, profile_of(two), Fault("cam_00", "time-out", 3, 7, start=0))
-    device = next(iter(usb.core.find(find_all=True, backend=backend)))
-    device.write(0x01, b"start")
-    buffer = usb.util.create_buffer(8 * FRAME)
-    assert device.read(0x82, buffer, 50) == 3 * FRAME + 7
-    with pytest.raises(usb.core.USBTimeoutError):
-        device.read(0x82, buffer, 1)
+        reads.submit(buffer)
+        ends.append(reads.wait(1))
+    expected = [(2 * FRAME, "ok"), (FRAME, "unplugged"), (0, "unplugged")]
+    assert [(e.bytes, e.status) for e in ends if e is not None] == expected
+    for refused in (lambda: port.write(0x01, b"start", 100), lambda: port.open([0])):
+        with pytest.raises(usb1.USBErrorNoDevice):
+            refused()
 
 
 def test_arrays_that_cannot_be(two: Scene) -> None:
