@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json, write_text
@@ -30,19 +31,17 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Freedom
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
 
+_BOARD, _FREEDOM = Board(), Freedom()
+
 
 def calibrate_rig(
     clips: Positional[tuple[Path, ...]],
     *,
     out: Path = Path("runs/rig"),
-    columns: int = 8,
-    rows: int = 5,
-    square_m: float = 0.04,
+    board: OmitArgPrefixes[Board] = _BOARD,
     views: int = 40,
     window_ticks: int = 100,
-    shared_focal: bool = False,
-    centered: bool = False,
-    distortion: bool = False,
+    freedom: OmitArgPrefixes[Freedom] = _FREEDOM,
     allow_gaps: bool = False,
 ) -> int:
     """Calibrate an array from clips of a moving chessboard: OUT/calibration.toml, report.json and corners.png.
@@ -50,26 +49,22 @@ def calibrate_rig(
     Args:
         clips: Recordings of the board (scene folders), all by the same cameras.
         out: Folder for the results.
-        columns: Inner corners of the board from left to right.
-        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres; it sets the scale of the calibration.
+        board: The board.
         views: Number of views (windows of ticks), in all clips together.
         window_ticks: Ticks that an image adds up; more ticks give less noise and more motion blur.
-        shared_focal: One focal length for all cameras.
-        centered: Principal points stay in the middle of the image.
-        distortion: Estimate k1 and k2 of every lens. The board must reach the corners of the images.
+        freedom: What is unknown.
         allow_gaps: Use clips with gaps; images with missing ticks are left out.
     """
     if not clips:
         raise problem("calibrate-rig", "one or more clips", "none", "record the board with `spike4dgs record`")
-    board, recordings = Board(columns, rows, square_m), [open_recording(path, allow_gaps) for path in clips]
+    recordings = [open_recording(path, allow_gaps) for path in clips]
     names, size = common_cameras(recordings)
     chosen = choose_views(recordings, views, window_ticks)
     seen = find_all(recordings, names, chosen, board)
-    found = calibrate_array(seen.detections, board, names, size, Freedom(shared_focal, centered, distortion))
+    found = calibrate_array(seen.detections, board, names, size, freedom)
     report = {
         "clips": [r.name for r in recordings],
-        "board": {"columns": columns, "rows": rows, "square_m": square_m},
+        "board": asdict(board),
         "views": {"looked_at": len(chosen), "with_board": len(seen.views), "window_ticks": window_ticks},
         **_results(found),
         "against_clip": differences(found.cameras, recordings[0].cameras),

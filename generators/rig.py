@@ -8,7 +8,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
-from spike4dgs.generators.worlds import WorldScene
+from spike4dgs.generators.worlds import RigSpec, WorldScene
 
 
 def cameras(scene: WorldScene, width: int, height: int, views: Sequence[int] = tuple(range(9))) -> tuple[Camera, ...]:
@@ -24,11 +24,11 @@ def cameras(scene: WorldScene, width: int, height: int, views: Sequence[int] = t
     wrong = [v for v in views if not 0 <= v < 9]
     if wrong:
         raise problem("views", "numbers 0 to 8 of the 3x3 array", str(wrong), "leave them out")
-    return tuple(_camera(scene, v, width, height) for v in views)
+    return tuple(grid_camera(scene.rig, v, width, height) for v in views)
 
 
-def _camera(scene: WorldScene, view: int, width: int, height: int) -> Camera:
-    rig = scene.rig
+def grid_camera(rig: RigSpec, view: int, width: int, height: int) -> Camera:
+    """Return one of the nine cameras."""
     center, target = np.array(rig.center), np.array(rig.target)
     up = np.array([0.0, 0.0, 1.0])
     forward = (target - center) / np.linalg.norm(target - center)

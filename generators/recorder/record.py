@@ -8,12 +8,12 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Literal
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError, problem
@@ -34,10 +34,12 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import open_recor
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sources import (
     CLIP,
+    NO_LIGHT,
+    Light,
     Source,
     Truth,
-    calibration_truth,
     emulated_source,
+    light_truth,
     real_source,
     truth,
 )
@@ -49,22 +51,46 @@ LOST_DATA = 3  # exit code
 _PATIENCE = 3  # presses of Ctrl-C that abort even the writing of captured data
 
 
+@dataclass(frozen=True)
+class Emulation:
+    """What takes the place of a real array.
+
+    Attributes:
+        emulate: Record an emulated array that sends this scene's streams, to try all steps without hardware.
+        worse_truth: JSON file outside OUT for what was done to each camera, for reports to compare with.
+        seed: Seed of the imperfections. A clip and its flat and dark recordings need the same one.
+    """
+
+    emulate: Path | None = None
+    worse_truth: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Streaming:
+    """How data reach the disk.
+
+    Attributes:
+        continuous: Write to disk while recording, instead of afterwards from memory.
+        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous. By default
+            what half of the free memory holds, 10 at most.
+    """
+
+    continuous: bool = False
+    buffer_s: float | None = None
+
+
 def record(
     rig: Positional[Path | None] = None,
     *,
     out: Path,
     seconds: float | None = None,
     mode: Literal["clip", "flat", "dark"] = "clip",
-    emulate: Path | None = None,
-    continuous: bool = False,
-    buffer_s: float | None = None,
     preview: bool = False,
-    flat: Path | None = None,
-    dark: Path | None = None,
-    flat_radiance: float | None = None,
+    emulation: OmitArgPrefixes[Emulation] = Emulation(),
+    streaming: OmitArgPrefixes[Streaming] = Streaming(),
+    light: OmitArgPrefixes[Light] = NO_LIGHT,
     worse: Imperfections = PERFECT,
-    worse_truth: Path | None = None,
-    seed: int = 0,
 ) -> int:
     """Record all cameras of an array at once: OUT is a scene folder, or streams without poses before the calibration.
 
@@ -76,30 +102,25 @@ def record(
         out: Folder of the recording; its name is the scene's.
         seconds: Length; 0.5 or, with --emulate, the scene's. With --continuous, the greatest length.
         mode: flat and dark record uniform light and darkness, for a later clip's --flat and --dark.
-        emulate: Record an emulated array that sends this scene's streams, to try all steps without hardware.
-        continuous: Write to disk while recording, instead of afterwards from memory.
-        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous. By default
-            what half of the free memory holds, 10 at most.
         preview: Show spike rates while recording, and write OUT/sheet.png.
-        flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
-        dark: The corresponding recording in the dark.
-        flat_radiance: Radiance of that light, 1 is white.
+        emulation: Instead of a real array.
+        streaming: To the disk.
+        light: For a scene.
         worse: Imperfections of an emulated array. Such a capture holds nothing of the scene's truth.
-        worse_truth: JSON file outside OUT for what was done to each camera, for reports to compare with.
-        seed: Seed of the imperfections. A clip and its flat and dark recordings need the same one.
     """
-    source = _source(rig, emulate, mode, worse, worse_truth, seed)
+    source = _source(rig, mode, emulation, worse)
+    worse_truth, continuous = emulation.worse_truth, streaming.continuous
     if worse_truth is not None and out.resolve() in (worse_truth.resolve(), *worse_truth.resolve().parents):
         raise problem("--worse-truth", f"a file outside {out}", str(worse_truth), "choose another place")
     profile = source.profile if mode == CLIP else _without_poses(source.profile)
-    light = _light(profile, flat, dark, flat_radiance)
+    known = light_truth(light, profile)
     length = source.seconds if seconds is None else seconds
     if not 0.5 < length * profile.fps <= MAX_TICKS:
         expected = f"from {1 / profile.fps:g}, one tick, to {MAX_TICKS / profile.fps:g}"
         raise problem("--seconds", expected, f"{length:g}", "record for longer, or shorter")
     n_ticks = round(length * profile.fps)
-    profile = _with_buffer(profile, continuous, buffer_s, length)
-    if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulate is not None):
+    profile = _with_buffer(profile, streaming, length)
+    if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulation.emulate is not None):
         raise UserError("; ".join(map(str, problems)))
     with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
         links = open_links(profile, usb_ports() if source.ports is None else source.ports)
@@ -112,7 +133,7 @@ def record(
         clip = clip.without(files.flush(clip.n_ticks))
         failures, direct, longest_s = files.failures, files.direct, files.longest_write_s
         sync = fit_arrival(clip, profile.fps)
-        files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | light))
+        files.finish(_described(clip, sync, truth(source.scene, clip.n_ticks) | known))
         if preview:
             _write_preview(out)
     if worse_truth is not None:
@@ -130,13 +151,11 @@ def record(
     return 0 if clip.complete else LOST_DATA
 
 
-def _source(
-    rig: Path | None, emulate: Path | None, mode: str, worse: Imperfections, worse_truth: Path | None, seed: int
-) -> Source:
-    if worse_truth is not None and worse == PERFECT:
+def _source(rig: Path | None, mode: str, emulation: Emulation, worse: Imperfections) -> Source:
+    if emulation.worse_truth is not None and worse == PERFECT:
         raise problem("--worse-truth", "imperfections, such as --worse.gain 0.02", "none", "add them, or leave it out")
-    if emulate is not None:
-        return emulated_source(emulate, rig, mode, worse, seed)
+    if emulation.emulate is not None:
+        return emulated_source(emulation.emulate, rig, mode, worse, emulation.seed)
     if worse != PERFECT:
         raise problem("--worse", "--emulate SCENE: no real array is made worse", "none", "add it, or leave out --worse")
     if rig is None:
@@ -150,9 +169,10 @@ def _without_poses(profile: RigProfile) -> RigProfile:
     return replace(profile, cameras=tuple(replace(c, calibration=None) for c in profile.cameras))
 
 
-def _with_buffer(profile: RigProfile, continuous: bool, buffer_s: float | None, length: float) -> RigProfile:
+def _with_buffer(profile: RigProfile, streaming: Streaming, length: float) -> RigProfile:
     """Return the profile with the memory of continuous mode, and print it."""
-    if not continuous:
+    buffer_s = streaming.buffer_s
+    if not streaming.continuous:
         if buffer_s is not None:
             raise problem("--buffer-s", "--continuous beside it", "none", "add --continuous, or leave it out")
         return profile
@@ -162,16 +182,6 @@ def _with_buffer(profile: RigProfile, continuous: bool, buffer_s: float | None, 
     size = seconds * len(profile.cameras) * bytes_per_s(profile)
     print(f"memory for {seconds:.3g} s of all cameras while the disk stalls: {size / 1e9:.2g} GB")
     return replace(profile, ring_seconds=seconds)
-
-
-def _light(profile: RigProfile, flat: Path | None, dark: Path | None, flat_radiance: float | None) -> Truth:
-    given = {"--flat": flat, "--dark": dark, "--flat-radiance": flat_radiance}
-    if flat is not None and dark is not None and flat_radiance is not None:
-        return calibration_truth(flat, dark, flat_radiance, profile)
-    if any(value is not None for value in given.values()):
-        lacks = ", ".join(name for name, value in given.items() if value is None)
-        raise problem("record", f"all of {', '.join(given)}, or none", f"no {lacks}", "add what is missing")
-    return Truth()
 
 
 def open_links(profile: RigProfile, ports: Sequence[Port]) -> dict[str, Link]:
@@ -251,17 +261,8 @@ def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
         s, fit = c.stats, fits[c.camera]
         buffer = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
         idle = f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
-        row = [
-            c.camera,
-            f"{s.bytes / 1e6:.1f}",
-            f"{s.lost_ticks}",
-            fit.drift_text,
-            f"{fit.offset_us:+.0f}",
-            buffer,
-            idle,
-            s.end,
-        ]
-        table.add_row(*row, style="red" if c.gaps else None)
+        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", fit.drift_text, f"{fit.offset_us:+.0f}"]
+        table.add_row(*row, buffer, idle, s.end, style="red" if c.gaps else None)
     console.print(table)
     if any(fit.too_short for fit in sync.cameras):
         print("the clip is too short to tell the drift of every clock; a second or more tells it")

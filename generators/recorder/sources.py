@@ -67,6 +67,24 @@ class Truth:
         return Truth(self.targets + other.targets, {**self.extras, **other.extras}, {**self.files, **other.files})
 
 
+@dataclass(frozen=True)
+class Light:
+    """Recordings of uniform light and of darkness that become part of the scene.
+
+    Attributes:
+        flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
+        dark: The corresponding recording in the dark.
+        flat_radiance: Radiance of that light, 1 is white.
+    """
+
+    flat: Path | None = None
+    dark: Path | None = None
+    flat_radiance: float | None = None
+
+
+NO_LIGHT = Light()
+
+
 def real_source(rig: Path) -> Source:
     """Return the array of a profile."""
     return Source(load_profile(rig))
@@ -150,12 +168,20 @@ def _calibration_streams(scene: Scene, mode: str) -> dict[str, UInt8]:
     return streams
 
 
-def calibration_truth(flat: Path, dark: Path, flat_radiance: float, profile: RigProfile) -> Truth:
-    """Return recordings of uniform light and of darkness, as a scene of this array holds them.
+def light_truth(light: Light, profile: RigProfile) -> Truth:
+    """Return recordings of uniform light and of darkness, if given, as a scene of this array holds them.
 
-    Raises UserError where they are not whole recordings of all its cameras, or where the profile has no poses, so that
-    the recording is not a scene.
+    Raises UserError where one is missing, where they are not whole recordings of all its cameras, or where the profile
+    has no poses, so that the recording is not a scene.
     """
+    flat, dark, flat_radiance = light.flat, light.dark, light.flat_radiance
+    given = {"--flat": flat, "--dark": dark, "--flat-radiance": flat_radiance}
+    lacks = [name for name, value in given.items() if value is None]
+    if len(lacks) == len(given):
+        return Truth()
+    if flat is None or dark is None or flat_radiance is None:
+        expected, found = f"all of {', '.join(given)}, or none", f"no {', '.join(lacks)}"
+        raise problem("record", expected, found, "add what is missing")
     if not profile.calibrated:
         fix = "run `spike4dgs calibrate-rig` first, or leave out --flat and --dark"
         raise problem(f"rig {profile.name}", "a calibration, for a scene with --flat and --dark", "none", fix)

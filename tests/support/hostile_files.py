@@ -20,8 +20,9 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,20 @@ class Outcome:
     refused: int = 0
     worst_s: float = 0.0
     failures: list[str] = field(default_factory=list)
+
+
+def read_all(reads: Iterable[Callable[[], Any]]) -> None:
+    """Call every reader; then raise the error of the last one that refused its file."""
+    from spike4dgs.benchmark.errors import UserError
+
+    refused = None
+    for read in reads:
+        try:
+            read()
+        except UserError as e:
+            refused = e
+    if refused:
+        raise refused
 
 
 # ---------------------------------------------------------------- scenes and predictions
@@ -249,48 +264,31 @@ def in_model(data: bytes, rng: m.Rng) -> bytes:
 def read_models(folder: Path, out: Path) -> None:
     from saved_models import WORLD
 
-    from spike4dgs.benchmark.errors import UserError
     from spike4dgs.method.models.saved_model import load_model
 
-    refused = None
-    for path in sorted(folder.glob("*.safetensors")):
-        try:
-            saved = load_model(path)
-            if saved.provenance.duration_us < 1e12:
-                saved.model.render(WORLD.cameras[0], 0.3 * saved.provenance.duration_us)
-        except UserError as e:
-            refused = e
-    if refused:
-        raise refused
+    def read(path: Path) -> None:
+        saved = load_model(path)
+        if saved.provenance.duration_us < 1e12:
+            saved.model.render(WORLD.cameras[0], 0.3 * saved.provenance.duration_us)
+
+    read_all(partial(read, path) for path in sorted(folder.glob("*.safetensors")))
 
 
 def make_tensors(folder: Path) -> None:
     import torch
     from toy_bursts import write_toy_shard
 
+    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
     from spike4dgs.method.checkpoint import Checkpoint, save_checkpoint
 
     write_toy_shard(folder, 13)
     save_checkpoint(folder / "fit.ckpt", Checkpoint(3, {"a.x": torch.arange(6.0)}), "fit")
-    (folder / "state.pth").write_bytes(_saved(torch, {"x": torch.arange(6.0)}))
-    shutil.copyfile(_shipped(), folder / "weights.safetensors")
-
-
-def _saved(torch: Any, value: Any) -> bytes:
-    buffer = io.BytesIO()
-    torch.save(value, buffer)
-    return buffer.getvalue()
-
-
-def _shipped() -> Path:
-    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
-
-    return WEIGHTS.shipped
+    torch.save({"x": torch.arange(6.0)}, folder / "state.pth")
+    shutil.copyfile(WEIGHTS.shipped, folder / "weights.safetensors")
 
 
 def read_tensors(folder: Path, out: Path) -> None:
     from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
-    from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.scene.training_bursts import open_bursts
     from spike4dgs.benchmark.weights import read_state
     from spike4dgs.method.checkpoint import load_checkpoint
@@ -300,20 +298,9 @@ def read_tensors(folder: Path, out: Path) -> None:
         for number in range(min(len(file), 3)):
             file.read(number)
 
-    refused = None
-    for read in (
-        bursts,
-        lambda: load_checkpoint(folder / "fit.ckpt", "fit"),
-        lambda: WEIGHTS.read_card(folder / "weights.safetensors"),
-        lambda: read_state(folder / "weights.safetensors"),
-        lambda: read_state(folder / "state.pth"),
-    ):
-        try:
-            read()
-        except UserError as e:
-            refused = e
-    if refused:
-        raise refused
+    weights = folder / "weights.safetensors"
+    states = (partial(read_state, path) for path in (weights, folder / "state.pth"))
+    read_all([bursts, lambda: load_checkpoint(folder / "fit.ckpt", "fit"), lambda: WEIGHTS.read_card(weights), *states])
 
 
 # ---------------------------------------------------------------- recordings and other programs' files
@@ -374,23 +361,16 @@ def make_imports(folder: Path) -> None:
 def read_imports(folder: Path, out: Path) -> None:
     from small_scenes import HEIGHT, WIDTH
 
-    from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.exchange.dat import import_dat
     from spike4dgs.benchmark.exchange.recording import Recording
     from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 
-    refused = None
-    for name in ("colmap", "colmap-text", "opencv.yml", "opencv.xml", "kalibr.yaml", "spikecv"):
-        try:
-            if name == "spikecv":
-                import_spikecv(folder / name, out / name, Recording(20000.0))
-            else:
-                size = {"width": WIDTH, "height": HEIGHT, "recording": Recording(20000.0)}
-                import_dat(folder / "in", **size, out=out / name, cameras=folder / name)
-        except UserError as e:
-            refused = e
-    if refused:
-        raise refused
+    facts = {"width": WIDTH, "height": HEIGHT, "recording": Recording(20000.0)}
+    reads = [
+        partial(import_dat, folder / "in", **facts, out=out / name, cameras=folder / name)
+        for name in ("colmap", "colmap-text", "opencv.yml", "opencv.xml", "kalibr.yaml")
+    ]
+    read_all([*reads, lambda: import_spikecv(folder / "spikecv", out / "spikecv", Recording(20000.0))])
 
 
 def make_recording(folder: Path) -> None:
@@ -411,18 +391,10 @@ def make_recording(folder: Path) -> None:
 
 
 def read_recording(folder: Path, out: Path) -> None:
-    from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.spikes.folder import open_stream_folder
     from spike4dgs.generators.recorder.rig_profile import load_profile
 
-    refused = None
-    for read in (lambda: load_profile(folder / "rig.toml"), lambda: open_stream_folder(folder, allow_gaps=True)):
-        try:
-            read()
-        except UserError as e:
-            refused = e
-    if refused:
-        raise refused
+    read_all([lambda: load_profile(folder / "rig.toml"), lambda: open_stream_folder(folder, allow_gaps=True)])
 
 
 CASES: dict[str, Case] = {

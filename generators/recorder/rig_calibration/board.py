@@ -26,11 +26,16 @@ class Board:
 
     >>> Board(4, 3, 0.1).corners[:2].round(3).tolist()
     [[-0.15, -0.1, 0.0], [-0.05, -0.1, 0.0]]
+
+    Attributes:
+        columns: Inner corners of the board from left to right.
+        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
+        square_m: Side of a square in metres; it sets the scale of the calibration.
     """
 
-    columns: int = 8  # inner corners from left to right
-    rows: int = 5  # inner corners from top to bottom
-    square_m: float = 0.04  # side of a square
+    columns: int = 8
+    rows: int = 5
+    square_m: float = 0.04
 
     def __post_init__(self) -> None:
         size = f"{self.columns} x {self.rows} inner corners of {self.square_m:g} m"

@@ -19,15 +19,17 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.recorder.rig_calibration.board import Board
+from spike4dgs.generators.rig import grid_camera
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+from spike4dgs.generators.worlds import RigSpec
 from spike4dgs.generators.worlds.meshes import rotation
 
 LONGEST_KEY_TICKS, KEY_PX = 20, 1.0  # between two key frames: most ticks, and largest motion of the board
@@ -64,20 +66,16 @@ def array(width: int, height: int, seed: int = 0, distance_m: float = DISTANCE_M
     Standard deviations: 2 % of the focal length, 1 % of the width in the principal point, a degree about each axis.
     """
     rng = np.random.default_rng([seed, *b"array"])
-    focal = 0.5 * width / math.tan(math.radians(FIELD_DEG) / 2)
+    rig = RigSpec((0.0, -distance_m, 0.0), (0.0, 0.0, 0.0), (SPACING_M, SPACING_M), toe_in=1.0, fov_x_deg=FIELD_DEG)
+    f_spread, c_spread, turn_deg = _PER_CAMERA_SPREAD
     cameras = []
     for view in range(9):
-        row, column = divmod(view, 3)
-        center = np.array([(column - 1) * SPACING_M, -distance_m, (1 - row) * SPACING_M])
-        c = look_at(
-            f"cam_{view:02d}", center, np.zeros(3), np.array([0.0, 0.0, 1.0]), focal=focal, width=width, height=height
-        )
-        f_spread, c_spread, turn_deg = _PER_CAMERA_SPREAD
-        f = focal * (1 + f_spread * rng.normal())
+        c = grid_camera(rig, view, width, height)
+        f = c.fx * (1 + f_spread * rng.normal())
         cx, cy = np.array([c.cx, c.cy]) + c_spread * width * rng.normal(size=2)
         x, y, z = (_turn(axis, turn_deg * rng.normal()) for axis in "xyz")
         R = x @ y @ z @ c.R
-        cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ center))
+        cameras.append(Camera(c.id, width, height, f, f, float(cx), float(cy), R, -R @ c.center))
     return tuple(cameras)
 
 

@@ -3,7 +3,7 @@
 The unknowns are few (6 a board pose, up to 11 a camera), so the normal equations are added up detection by detection
 from exact derivatives and solved densely, with Levenberg-Marquardt damping. Poses change by a small motion from the
 left: X -> exp(w) X + v. The pose of the reference camera is constant, which fixes the frame; the board's size fixes the
-scale. Square pixels; with `Freedom.lens` also k1 and k2 of each lens (`benchmark.array.lens`).
+scale. Square pixels; with `Freedom.distortion` also k1 and k2 of each lens (`benchmark.array.lens`).
 """
 
 from __future__ import annotations
@@ -75,11 +75,17 @@ class Rig:
 
 @dataclass(frozen=True)
 class Freedom:
-    """The unknown intrinsics."""
+    """The unknown intrinsics.
 
-    shared_focal: bool = False  # one focal length for all cameras, instead of one each
-    centered: bool = False  # principal points stay in the middle
-    lens: bool = False  # k1 and k2 of each camera's lens, instead of none
+    Attributes:
+        shared_focal: One focal length for all cameras.
+        centered: Principal points stay in the middle of the image.
+        distortion: Estimate k1 and k2 of every lens. The board must reach the corners of the images.
+    """
+
+    shared_focal: bool = False
+    centered: bool = False
+    distortion: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +105,7 @@ def adjust(
     """Minimise the squares from an initial rig near the solution. `points` [N, 3]: the board's corners."""
     freedom = freedom or Freedom()
     columns = _columns(len(rig.focal), len(rig.board_t), reference, freedom)
-    if freedom.lens and rig.lens is None:
+    if freedom.distortion and rig.lens is None:
         rig = replace(rig, lens=np.zeros((len(rig.focal), _PER_LENS)))
     damping = 1e-3
     cost, H, g = _normal(rig, detections, points, columns)
@@ -145,7 +151,7 @@ class _Columns:
 
 
 def _columns(n_cameras: int, n_views: int, reference: int, freedom: Freedom) -> _Columns:
-    unknown = np.ones((n_cameras, _PER_CAMERA + freedom.lens * _PER_LENS), bool)
+    unknown = np.ones((n_cameras, _PER_CAMERA + freedom.distortion * _PER_LENS), bool)
     unknown[reference, :6] = False
     if freedom.shared_focal:
         unknown[:, 6] = np.arange(n_cameras) == 0

@@ -185,13 +185,13 @@ def test_flat_and_dark_recordings_go_into_a_clip_and_feed_calibrate(scene, tmp_p
 def test_light_that_does_not_fit_is_refused(scene, tmp_path):
     profile = sources.emulated_source(scene, None, "clip").profile
     assert record("--emulate", scene, "--mode", "dark", "--out", tmp_path / "dark", "--seconds", "0.001") == 0
-    small = replace(profile, width=32)
+    small, light = replace(profile, width=32), sources.Light(tmp_path / "dark", tmp_path / "dark", 0.7)
     with pytest.raises(UserError, match="recordings of one length by the cameras of emulated-pattern"):
-        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.7, small)
+        sources.light_truth(light, small)
     with pytest.raises(UserError, match="a positive radiance"):
-        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.0, profile)
+        sources.light_truth(replace(light, flat_radiance=0.0), profile)
     with pytest.raises(UserError, match="calibrate-rig"):
-        sources.calibration_truth(tmp_path / "dark", tmp_path / "dark", 0.7, command._without_poses(profile))
+        sources.light_truth(light, command._without_poses(profile))
 
 
 # ------------------------------------------------------------ arguments

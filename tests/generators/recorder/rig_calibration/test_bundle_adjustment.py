@@ -103,7 +103,7 @@ def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
     detections = detections_of(cameras, shares, 0.05)
     rig, reference = initial(cameras, detections)
     pinholes = adjust(rig, detections, BOARD.corners, reference)
-    found = adjust(rig, detections, BOARD.corners, reference, Freedom(lens=True))
+    found = adjust(rig, detections, BOARD.corners, reference, Freedom(distortion=True))
     assert pinholes.rig.lens is None and pinholes.sigma_px > 1.5 * found.sigma_px
     assert 0.045 < found.sigma_px < 0.055  # the noise that was added
     n, at = len(cameras), found.rig
