@@ -158,9 +158,7 @@ def _wheel() -> tuple[Part, ...]:
 def _crank() -> tuple[Part, ...]:
     """Return both crank arms and the chain ring, about the bottom bracket; the left arm points up."""
     arms = [box((0.028, 0.016, CRANK_M), (0, s * 0.075, s * CRANK_M / 2)) for s in (-1, 1)]
-    ring = revolve(
-        np.array([(0.075, -0.048), (0.095, -0.048), (0.095, -0.053), (0.075, -0.053), (0.075, -0.048)]), 32, "y"
-    )
+    ring = revolve([(0.075, -0.048), (0.095, -0.048), (0.095, -0.053), (0.075, -0.053), (0.075, -0.048)], 32, "y")
     legs = [box((0.016, 0.006, 0.15), (0, -0.05, 0)).moved(rotation("y", k * np.pi / 3)) for k in range(3)]
     axle = tube([(0, -0.085, 0), (0, 0.085, 0)], 0.02)
     return (

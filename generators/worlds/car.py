@@ -40,7 +40,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     """Build the world. The car is in the middle of the frame at half of `duration_s`; it crosses the view in 0.5 s."""
     rng = rng_for("car", seed, variant)
     run = _sample(variant, rng)
-    wheels = vehicle.wheel_positions()
+    wheels = vehicle.WHEELS.positions()
     livery = _LIVERIES[run.livery]
 
     def poses(t_s: float) -> dict[str, np.ndarray]:

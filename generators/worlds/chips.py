@@ -121,7 +121,7 @@ def _chip(kind: int) -> Mesh:
         i = np.arange(_SEGMENTS)
         faces = np.stack([i, (i + 1) % _SEGMENTS, np.full(_SEGMENTS, _SEGMENTS)], 1)
         parts.append(Mesh(points, faces, uv, smooth=False))
-    rim = revolve(np.array([(r, -h), (r, h)]), _SEGMENTS)
+    rim = revolve([(r, -h), (r, h)], _SEGMENTS)
     v = (_CELL + 3 + 10 * rim.uv[:, 1]) / rows
     parts.append(Mesh(rim.vertices, rim.faces, np.stack([(kind + 0.03 + 0.94 * rim.uv[:, 0]) / n, v], 1), smooth=False))
     return merge(parts)

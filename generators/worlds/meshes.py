@@ -125,6 +125,18 @@ def loft(rings: np.ndarray, caps: bool = True) -> Mesh:
     return merge([skin, fan(rings[0]), fan(rings[-1][::-1])]) if caps else skin
 
 
+def skin(stations: Sequence[Sequence[float]], count: int, ring: np.ndarray) -> Mesh:
+    """Return a loft along x over `count` interpolated stations (x, height of the middle, half height, half width).
+
+    `ring` [m, 2] is the cross-section in half widths (y) and half heights (z).
+    """
+    given = np.asarray(stations)
+    x = np.linspace(given[0, 0], given[-1, 0], count)
+    rows = [np.interp(x, given[:, 0], given[:, k]) for k in (1, 2, 3)]
+    y, z = ring.T
+    return loft(np.stack([np.stack([0 * y + xi, w * y, m + h * z], 1) for xi, m, h, w in zip(x, *rows, strict=True)]))
+
+
 def revolve(profile: np.ndarray, segments: int = 48, axis: str = "z") -> Mesh:
     """Return the surface of a profile [m, 2] (radius, offset along the axis) turned about "z" or "y"; u runs around."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
@@ -215,6 +227,13 @@ class Atlas:
         if chart == "front":
             return np.stack([self.width / 2 + y, 3 * h + self.width - z], 1)
         return np.stack([1.5 * self.width - y, 3 * h + self.width - z], 1)
+
+    def at(self, chart: str, points: Sequence[Sequence[float]]) -> np.ndarray:
+        """Map points [N, 2] of the two coordinates that a chart shows: x, z; on top x, y; in front and back y, z."""
+        seen = {"top": [0, 1], "front": [1, 2], "back": [1, 2]}.get(chart, [0, 2])
+        p = np.zeros((len(points), 3))
+        p[:, seen] = points
+        return self.project(chart, p)
 
     def wrap(self, mesh: Mesh) -> Mesh:
         """Return the mesh cut along chart borders, with uv into this atlas.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from spike4dgs.generators.worlds.meshes import (
     quad,
     revolve,
     rotation,
+    skin,
     translation,
     tube,
 )
@@ -114,13 +116,11 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
 def body(livery: Livery) -> tuple[Part, ...]:
     """Return all parts but wheels and rider; x forward, origin on the ground between the wheels."""
-    skin = merge([_shell(_FAIRING), _shell(_TANK), _shell(_TAIL)])
+    shell = merge([_shell(_FAIRING), _shell(_TANK), _shell(_TAIL)])
     seat = ellipsoid((0.24, 0.13, 0.05), (-0.36, 0, 0.83), 18)
     engine = [box((0.34, 0.30, 0.26), (0.02, 0, 0.42)), box((0.24, 0.34, 0.10), (0.0, 0, 0.56))]
     engine += [
-        revolve(np.array([(0.0, s * 0.17), (0.11, s * 0.17), (0.10, s * 0.20), (0.0, s * 0.20)]), 24, "y").at(
-            -0.02, 0, 0.40
-        )
+        revolve([(0.0, s * 0.17), (0.11, s * 0.17), (0.10, s * 0.20), (0.0, s * 0.20)], 24, "y").at(-0.02, 0, 0.40)
         for s in (-1, 1)
     ]
     fork = [tube([(0.50, s * 0.09, 0.92), (AXLES_X_M["front"], s * 0.09, WHEEL_M)], 0.026) for s in (-1, 1)]
@@ -140,7 +140,7 @@ def body(livery: Livery) -> tuple[Part, ...]:
     plate.text("20k", 0.11, 0.08, 0.075, (0.02, 0.02, 0.05))
     pegs = [tube([(-0.30, s * 0.10, 0.37), (-0.30, s * 0.24, 0.37)], 0.016, 8) for s in (-1, 1)]
     return (
-        Part(_ATLAS.wrap(skin), Material(_paint(livery), 0.12)),
+        Part(_ATLAS.wrap(shell), Material(_paint(livery), 0.12)),
         Part(merge([seat, *bars, *pegs]), Material(_DARK, 0.35)),
         Part(merge(engine), Material((0.22, 0.22, 0.23), 0.25)),
         Part(merge([*fork, *arms]), Material((0.70, 0.62, 0.30), 0.2)),
@@ -164,12 +164,8 @@ _TAIL += [(-0.15, 0.72, 0.09, 0.12), (-0.08, 0.72, 0.04, 0.06)]
 
 def _shell(stations: list[tuple[float, float, float, float]]) -> Mesh:
     """Return a smooth skin over superelliptic cross-sections."""
-    given = np.array(stations)
-    x = np.linspace(given[0, 0], given[-1, 0], 24)
     a = np.linspace(0, 2 * np.pi, 28, endpoint=False)
-    c, s = (np.sign(f) * np.abs(f) ** 0.75 for f in (np.cos(a), np.sin(a)))
-    rows = [np.interp(x, given[:, 0], given[:, k]) for k in (1, 2, 3)]
-    return loft(np.stack([np.stack([0 * a + xi, w * c, z + h * s], 1) for xi, z, h, w in zip(x, *rows, strict=True)]))
+    return skin(stations, 24, np.stack([np.sign(f) * np.abs(f) ** 0.75 for f in (np.cos(a), np.sin(a))], 1))
 
 
 def _guard(x: float, radius_m: float) -> Mesh:
@@ -186,7 +182,7 @@ def _wheel(colour: Colour) -> tuple[Part, ...]:
         blades += [
             box((0.032, 0.05, 0.20), (lean, 0, 0.125)).moved(turn @ rotation("y", lean)) for lean in (-0.035, 0.035)
         ]
-    discs = [revolve(np.array([(0.07, s * 0.065), (0.15, s * 0.065)]), 32, "y") for s in (-1, 1)]
+    discs = [revolve([(0.07, s * 0.065), (0.15, s * 0.065)], 32, "y") for s in (-1, 1)]
     return (
         Part(cycles.tyre(WHEEL_M, 0.068), cycles.RUBBER),
         Part(merge([cycles.rim(WHEEL_M - 0.085, 0.03, 0.06), *blades]), Material(colour, 0.15)),
@@ -198,23 +194,19 @@ def _wheel(colour: Colour) -> tuple[Part, ...]:
 
 def _paint(livery: Livery) -> np.ndarray:
     c = Canvas(plain(_ATLAS.shape, livery.body), _ATLAS.texels_per_m)
-
-    def side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
-
     for chart in ("near", "far"):
+        at = partial(_ATLAS.at, chart)
         c.polygon(
-            side(chart, [(0.10, 0.30), (0.60, 0.52), (0.92, 0.76), (0.92, 0.70), (0.62, 0.36), (0.10, 0.22)]),
-            livery.second,
+            at([(0.10, 0.30), (0.60, 0.52), (0.92, 0.76), (0.92, 0.70), (0.62, 0.36), (0.10, 0.22)]), livery.second
         )
-        c.polygon(side(chart, [(-0.22, 0.86), (0.46, 0.93), (0.46, 0.89), (-0.22, 0.82)]), livery.second)
-        c.polygon(side(chart, [(-0.9, 0.86), (-0.2, 0.75), (-0.2, 0.71), (-0.9, 0.83)]), livery.second)
-        x, y = side(chart, [(0.44, 0.66)])[0]
+        c.polygon(at([(-0.22, 0.86), (0.46, 0.93), (0.46, 0.89), (-0.22, 0.82)]), livery.second)
+        c.polygon(at([(-0.9, 0.86), (-0.2, 0.75), (-0.2, 0.71), (-0.9, 0.83)]), livery.second)
+        x, y = at([(0.44, 0.66)])[0]
         c.ellipse(x, y, 0.115, 0.115, _WHITE)
         c.text(livery.number, x, y, 0.125, (0.02, 0.02, 0.02))
-        x, y = side(chart, [(0.13, 0.845)])[0]
+        x, y = at([(0.13, 0.845)])[0]
         c.text("SPIKE", x, y, 0.055, _WHITE)
-    x, y = _ATLAS.project("front", np.array([(0, 0, 0.84)]))[0]
+    x, y = _ATLAS.at("front", [(0, 0.84)])[0]
     c.ellipse(x, y, 0.10, 0.08, _WHITE)
     c.text(livery.number, x, y, 0.09, (0.02, 0.02, 0.02))
     return c.image

@@ -83,29 +83,12 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return all parts that spin: the lettered top, the striped edge, a hub, blocks, a pawn, a cone and a ring."""
     stripes = mix(((np.arange(512) // 8) % 2)[None] * np.ones((6, 1)), (0.06, 0.06, 0.07), (0.80, 0.79, 0.75))
-    edge = revolve(np.array([(DISC_RADIUS_M, 0.004), (DISC_RADIUS_M, DISC_TOP_M)]), 128)
-    collar = revolve(
-        np.array(
-            [
-                (DISC_RADIUS_M, DISC_TOP_M),
-                (DISC_RADIUS_M - 0.004, DISC_TOP_M + 0.003),
-                (DISC_RADIUS_M - 0.010, DISC_TOP_M),
-            ]
-        ),
-        128,
-    )
-    hub = np.array(
-        [
-            (0.052, 0),
-            (0.052, 0.012),
-            (0.036, 0.018),
-            (0.030, 0.055),
-            (0.036, 0.062),
-            (0.030, 0.075),
-            (0.014, 0.085),
-            (0, 0.087),
-        ]
-    )
+    edge = revolve([(DISC_RADIUS_M, 0.004), (DISC_RADIUS_M, DISC_TOP_M)], 128)
+    r, z = DISC_RADIUS_M, DISC_TOP_M
+    collar = revolve([(r, z), (r - 0.004, z + 0.003), (r - 0.010, z)], 128)
+    radii = 0.052, 0.052, 0.036, 0.030, 0.036, 0.030, 0.014, 0
+    heights = 0, 0.012, 0.018, 0.055, 0.062, 0.075, 0.085, 0.087
+    hub = np.stack([radii, heights], 1)
     parts = [
         Part(disc(DISC_RADIUS_M - 0.006, DISC_TOP_M, 128), Material(_top_image(setup, rng), 0.3)),
         Part(edge, Material(stripes)),
@@ -128,24 +111,10 @@ def _small_objects(rng: np.random.Generator) -> list[Part]:
     def around(mesh: Mesh, turn: float) -> Mesh:
         return mesh.at(0.17 * np.cos(2 * np.pi * turn), 0.17 * np.sin(2 * np.pi * turn), DISC_TOP_M)
 
-    pawn = revolve(
-        np.array(
-            [
-                (0.030, 0),
-                (0.030, 0.008),
-                (0.018, 0.018),
-                (0.011, 0.050),
-                (0.019, 0.056),
-                (0.010, 0.060),
-                (0.017, 0.068),
-                (0.019, 0.078),
-                (0.013, 0.092),
-                (0, 0.096),
-            ]
-        ),
-        32,
-    )
-    cone = revolve(np.array([(0.036, 0), (0.036, 0.006), (0.028, 0.006), (0.006, 0.085), (0, 0.086)]), 32)
+    radii = 0.030, 0.030, 0.018, 0.011, 0.019, 0.010, 0.017, 0.019, 0.013, 0
+    heights = 0, 0.008, 0.018, 0.050, 0.056, 0.060, 0.068, 0.078, 0.092, 0.096
+    pawn = revolve(np.stack([radii, heights], 1), 32)
+    cone = revolve([(0.036, 0), (0.036, 0.006), (0.028, 0.006), (0.006, 0.085), (0, 0.086)], 32)
     rows = ((np.arange(64) // 11) % 2)[:, None] * np.ones((1, 4))
     ring = np.linspace(0, 2 * np.pi, 25)[:-1]
     post = loft(

@@ -39,7 +39,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     """Build the world. The van is in the middle of the frame at half of `duration_s`; its wheels roll."""
     rng = rng_for("van", seed, variant)
     run = _sample(variant, rng)
-    livery, wheels = _LIVERIES[run.livery], van_body.wheel_positions()
+    livery, wheels = _LIVERIES[run.livery], van_body.WHEELS.positions()
 
     def poses(t_s: float) -> dict[str, np.ndarray]:
         travelled = run.speed_m_s * (t_s - duration_s / 2)

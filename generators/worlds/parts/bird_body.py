@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
-from spike4dgs.generators.worlds.meshes import Mesh, ellipsoid, loft, merge, surface, tube
+from spike4dgs.generators.worlds.meshes import Mesh, ellipsoid, merge, skin, surface, tube
 from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
@@ -56,24 +56,11 @@ class Beat:
 
 def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return the body with head, beak, eyes and feet."""
-    stations = np.array(  # x, height of the middle, half height, half width
-        [(-0.105, 0.010, 0.010, 0.013), (-0.085, 0.008, 0.020, 0.023), (-0.045, 0.002, 0.036, 0.036)]
-        + [(0.0, -0.002, 0.044, 0.041), (0.04, 0.004, 0.041, 0.037), (0.07, 0.018, 0.033, 0.030)]
-        + [
-            (0.09, 0.030, 0.032, 0.029),
-            (0.112, 0.036, 0.031, 0.028),
-            (0.132, 0.034, 0.022, 0.020),
-            (0.142, 0.030, 0.008, 0.008),
-        ]
-    )
-    x = np.linspace(stations[0, 0], stations[-1, 0], 40)
+    stations = [(-0.105, 0.010, 0.010, 0.013), (-0.085, 0.008, 0.020, 0.023), (-0.045, 0.002, 0.036, 0.036)]
+    stations += [(0.0, -0.002, 0.044, 0.041), (0.04, 0.004, 0.041, 0.037), (0.07, 0.018, 0.033, 0.030)]
+    stations += [(0.09, 0.030, 0.032, 0.029), (0.112, 0.036, 0.031, 0.028), (0.132, 0.034, 0.022, 0.020)]
     a = np.linspace(0, 2 * np.pi, 28, endpoint=False)
-    rows = [np.interp(x, stations[:, 0], stations[:, k]) for k in (1, 2, 3)]
-    skin = loft(
-        np.stack(
-            [np.stack([0 * a + xi, w * np.sin(a), z + h * np.cos(a)], 1) for xi, z, h, w in zip(x, *rows, strict=True)]
-        )
-    )
+    body = skin([*stations, (0.142, 0.030, 0.008, 0.008)], 40, np.stack([np.sin(a), np.cos(a)], 1))
     beak = tube([(0.132, 0, 0.031), (0.155, 0, 0.028), (0.172, 0, 0.023)], [0.010, 0.006, 0.001], 10)
     eyes = [ellipsoid((0.0075, 0.004, 0.0075), (0.118, s * 0.0255, 0.043), 10) for s in (-1, 1)]
     glints = [ellipsoid((0.002, 0.002, 0.002), (0.121, s * 0.029, 0.046), 6) for s in (-1, 1)]
@@ -82,7 +69,7 @@ def body_parts(plumage: Plumage, rng: np.random.Generator) -> tuple[Part, ...]:
         for s in (-1, 1)
     ]
     return (
-        Part(skin, Material(_body_image(plumage, rng))),
+        Part(body, Material(_body_image(plumage, rng))),
         Part(beak, Material((0.75, 0.42, 0.04), 0.2)),
         Part(merge(eyes), Material((0.01, 0.01, 0.012), 0.06)),
         Part(merge(glints), Material((0.9, 0.9, 0.9))),

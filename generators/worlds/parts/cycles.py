@@ -24,7 +24,7 @@ def tyre(radius_m: float, thick_m: float) -> Mesh:
 def rim(radius_m: float, depth_m: float, half_width_m: float) -> Mesh:
     """Return a rim: a band of this outer radius."""
     r0, w = radius_m - depth_m, half_width_m
-    return revolve(np.array([(radius_m, -w), (r0, -0.6 * w), (r0, 0.6 * w), (radius_m, w), (radius_m, -w)]), 48, "y")
+    return revolve([(radius_m, -w), (r0, -0.6 * w), (r0, 0.6 * w), (radius_m, w), (radius_m, -w)], 48, "y")
 
 
 def spokes(radius_m: float, hub_m: float, count: int, thick_m: float, spread_m: float) -> Mesh:

@@ -66,11 +66,11 @@ def _desk_objects(rng: np.random.Generator) -> dict[str, Part]:
         spine.text(title, 0.125, 0.5, 0.12, (0.85, 0.82, 0.72), turn_deg=90)
         books[f"book{k}"] = Part(box((thick, 0.16, tall), (x + thick / 2, 0.60, tall / 2)), Material(spine.image, 0.2))
         x += thick + 0.003
-    mug = revolve(np.array([(0.0, 0.006), (0.045, 0.006), (0.047, 0.1), (0.05, 0.1), (0.05, 0.0), (0.0, 0.0)]), 40)
+    mug = revolve([(0.0, 0.006), (0.045, 0.006), (0.047, 0.1), (0.05, 0.1), (0.05, 0.0), (0.0, 0.0)], 40)
     a = np.linspace(-1.3, 1.3, 12)
     handle = tube(np.stack([0.047 + 0.032 * np.cos(a), 0 * a, 0.05 + 0.033 * np.sin(a)], 1), 0.007, 8)
     bands = cloth((32, 64), rng, [(0.80, 0.78, 0.72), (0.12, 0.28, 0.50)], 8)
-    pencils, pot = [], revolve(np.array([(0.04, 0), (0.042, 0.1), (0.038, 0.1), (0.036, 0.005), (0, 0.005)]), 32)
+    pencils, pot = [], revolve([(0.04, 0), (0.042, 0.1), (0.038, 0.1), (0.036, 0.005), (0, 0.005)], 32)
     for k in range(5):
         lean = np.array([0.04 * np.cos(2.5 * k), 0.03 * np.sin(2.5 * k)])
         pencils.append(

@@ -89,11 +89,11 @@ def _leaf(root: np.ndarray, way: np.ndarray, length: float, rng: np.random.Gener
 
 def _objects(rng: np.random.Generator) -> dict[str, Part]:
     """Return a watering can, a bowl and a post with a lantern."""
-    can = revolve(np.array([(0.0, 0.0), (0.11, 0.0), (0.11, 0.16), (0.085, 0.20), (0.04, 0.21), (0.0, 0.21)]), 28)
+    can = revolve([(0.0, 0.0), (0.11, 0.0), (0.11, 0.16), (0.085, 0.20), (0.04, 0.21), (0.0, 0.21)], 28)
     spout = tube([(0.09, 0, 0.06), (0.22, 0, 0.19), (0.26, 0, 0.21)], [0.022, 0.016, 0.03], 12)
     a = np.linspace(0.2, np.pi - 0.2, 14)
     handle = tube(np.stack([-0.10 * np.cos(a), 0 * a, 0.15 + 0.15 * np.sin(a)], 1), 0.011, 8)
-    bowl = revolve(np.array([(0.0, 0.012), (0.10, 0.02), (0.135, 0.07), (0.15, 0.07), (0.12, 0.0), (0.0, 0.0)]), 32)
+    bowl = revolve([(0.0, 0.012), (0.10, 0.02), (0.135, 0.07), (0.15, 0.07), (0.12, 0.0), (0.0, 0.0)], 32)
     stripes = mix(((np.arange(64) // 8) % 2)[:, None] * np.ones((1, 8)), (0.10, 0.20, 0.42), (0.80, 0.79, 0.75))
     post = [box((0.07, 0.07, 0.52), (1.28, 0.30, 0.26)), box((0.16, 0.16, 0.03), (1.28, 0.30, 0.535))]
     return {

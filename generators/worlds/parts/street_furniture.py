@@ -10,6 +10,7 @@ from spike4dgs.generators.worlds.base import Part
 from spike4dgs.generators.worlds.meshes import (
     Mesh,
     box,
+    disc,
     ellipsoid,
     merge,
     quad,
@@ -67,7 +68,7 @@ def furniture(rng: np.random.Generator) -> dict[str, Part]:
     poles, boards = [], {}
     for x in (-4.9, 5.6):
         poles.append(tube([(x, 5.95, z), (x, 5.95, 3.6), (x, 5.75, 4.3), (x, 5.0, 4.45)], 0.06))
-        poles.append(revolve(np.array([(0.16, 0), (0.16, 0.25), (0.07, 0.45)]), 20).at(x, 5.95, z))
+        poles.append(revolve([(0.16, 0), (0.16, 0.25), (0.07, 0.45)], 20).at(x, 5.95, z))
     for k, (x, words, edge) in enumerate(
         ((-0.3, "STOP", (0.62, 0.04, 0.04)), (4.0, "30", (0.62, 0.04, 0.04)), (-9.8, "P", (0.05, 0.15, 0.5)))
     ):
@@ -79,27 +80,14 @@ def furniture(rng: np.random.Generator) -> dict[str, Part]:
             c.ellipse(0.5, 0.5, 0.33, 0.33, (0.85, 0.85, 0.83))
         c.text(words, 0.5, 0.5, 0.20 if len(words) > 2 else 0.34, (0.03, 0.03, 0.03) if k == 1 else (0.85, 0.85, 0.83))
         turn = rotation("x", np.pi / 2)
-        ring = np.linspace(0, 2 * np.pi, 33)[:-1]
-        face = quad((0, 0, 0), (0.84, 0, 0), (0, 0.84, 0))
-        if k != 2:
-            p = 0.42 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1)
-            i = np.arange(32)
-            uv = np.stack([0.5 + p[:, 0] / 0.84, 0.5 - p[:, 1] / 0.84], 1)
-            face = Mesh(
-                np.concatenate([p, [[0, 0, 0]]]),
-                np.stack([i, (i + 1) % 32, np.full(32, 32)], 1),
-                np.concatenate([uv, [[0.5, 0.5]]]),
-                False,
-            )
+        face = quad((0, 0, 0), (0.84, 0, 0), (0, 0.84, 0)) if k == 2 else disc(0.42, segments=32)
         boards[f"sign{k}"] = Part(face.moved(translation(x, 5.87, 2.35) @ turn), Material(c.image))
     slats = [box((1.7, 0.09, 0.04), (-2.0 + 9.4, 7.4 + dy, z + 0.45)) for dy in (-0.2, -0.09, 0.02, 0.13)]
     slats += [box((1.7, 0.04, 0.09), (7.4, 7.62, z + h)) for h in (0.62, 0.75, 0.88)]
     legs = [box((0.06, 0.45, 0.45), (7.4 + dx, 7.4, z + 0.22)) for dx in (-0.7, 0.7)]
-    hydrant = revolve(
-        np.array([(0.16, 0), (0.16, 0.06), (0.11, 0.08), (0.11, 0.5), (0.14, 0.52), (0.10, 0.66), (0, 0.72)]), 20
-    )
-    bin_ = revolve(np.array([(0.24, 0), (0.27, 0.8), (0.29, 0.82), (0.20, 0.92), (0, 0.95)]), 24)
-    bollard = revolve(np.array([(0.09, 0), (0.075, 0.75), (0.09, 0.78), (0.06, 0.88), (0, 0.9)]), 16)
+    hydrant = revolve([(0.16, 0), (0.16, 0.06), (0.11, 0.08), (0.11, 0.5), (0.14, 0.52), (0.10, 0.66), (0, 0.72)], 20)
+    bin_ = revolve([(0.24, 0), (0.27, 0.8), (0.29, 0.82), (0.20, 0.92), (0, 0.95)], 24)
+    bollard = revolve([(0.09, 0), (0.075, 0.75), (0.09, 0.78), (0.06, 0.88), (0, 0.9)], 16)
     stripes = mix(((np.arange(96) // 12) % 2)[:, None] * np.ones((1, 8)), (0.08, 0.08, 0.08), (0.80, 0.62, 0.12))
     letter = Canvas(plain((96, 64), (0.70, 0.55, 0.08)), 120)
     letter.rectangle(0.08, 0.15, 0.45, 0.2, (0.03, 0.03, 0.03))

@@ -6,6 +6,7 @@ Own coordinates: x forward, y to the left, z up, origin on the ground below the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,18 +18,18 @@ from spike4dgs.generators.worlds.meshes import (
     ellipsoid,
     loft,
     merge,
-    quad,
     revolve,
     rotation,
     tube,
 )
+from spike4dgs.generators.worlds.parts.bodywork import Section, Wheels, number_plates
 from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, fractal, plain
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.9, 1.95, 2.30
-WHEEL_M, RIM_M, ARCH_M = 0.34, 0.225, 0.42
-AXLES_X_M = (-1.45, 1.55)
-_TRACK_Y_M = 0.85
+WHEEL_M, RIM_M = 0.34, 0.225
+WHEELS = Wheels((-1.45, 1.55), 0.85, WHEEL_M, 0.42)
+_SECTION = Section(0.16, 0.05, arc=6, wall=7, lean=0.10, belt=1.15)
 _ATLAS = Atlas(LENGTH_M + 0.1, WIDTH_M + 0.1, HEIGHT_M, 104)
 
 GLASS: Colour = (0.035, 0.045, 0.055)
@@ -56,7 +57,8 @@ class Livery:
 
 def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return all parts that only translate."""
-    skin = _ATLAS.wrap(loft(np.stack([_ring(x) for x in _stations()])))
+    stations = WHEELS.stations(2.45, 50, [-2.445, -2.43, -2.40, 2.36, 2.40, 2.43, 2.445], 19)
+    skin = _ATLAS.wrap(loft(np.stack([_ring(x) for x in stations])))
     floor = box((4.5, 1.35, 0.55), (0, 0, 0.50))
     sills = [box((2.1, 0.04, 0.13), (0.05, s * 0.955, 0.36)) for s in (-1, 1)]
     bumpers = [box((0.16, 1.82, 0.20), (2.40, 0, 0.40)), box((0.12, 1.82, 0.18), (-2.44, 0, 0.42))]
@@ -68,9 +70,6 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
     ladder = [tube([(-1.95, y, 2.38), (0.55, y, 2.40)], 0.035, 8) for y in (-0.35, 0.05)]
     ladder += [tube([(x, -0.35, 2.39), (x, 0.05, 2.39)], 0.026, 8) for x in np.linspace(-1.8, 0.4, 9)]
     cross = [tube([(x, -0.74, 2.33), (x, 0.74, 2.33)], 0.026, 8) for x in (-1.7, -0.6, 0.4)]
-    plate = Canvas(plain((40, 160), (0.85, 0.85, 0.8)), 300)
-    plate.text("20-KHZ", 0.267, 0.067, 0.08, (0.02, 0.02, 0.05))
-    plates = [quad((2.49, 0, 0.42), (0, 0.52, 0), (0, 0, 0.12)), quad((-2.51, 0, 0.44), (0, -0.52, 0), (0, 0, 0.12))]
     tyre = revolve(_tyre(), 40, "y")
     return (
         Part(skin, Material(_paint(livery, rng), 0.14)),
@@ -80,15 +79,15 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
         Part(merge(tails), Material((0.60, 0.04, 0.03), 0.1)),
         Part(merge([*rails, *cross]), Material((0.10, 0.10, 0.11), 0.2)),
         Part(merge(ladder), Material((0.70, 0.70, 0.68), 0.25)),
-        Part(merge(plates), Material(plate.image)),
-        Part(merge([tyre.at(*w) for w in wheel_positions()]), Material((0.03, 0.03, 0.032))),
+        number_plates("20-KHZ", (2.49, 0.42), (-2.51, 0.44)),
+        Part(merge([tyre.at(*w) for w in WHEELS.positions()]), Material((0.03, 0.03, 0.032))),
     )
 
 
 def rim_parts(colour: Colour) -> tuple[Part, ...]:
     """Return a steel wheel about its axle (the y axis), alike from both sides: holes around a hub, one nut painted."""
     dish = [
-        revolve(np.array([(RIM_M, s * 0.10), (RIM_M - 0.03, s * 0.085), (0.09, s * 0.10), (0.0, s * 0.115)]), 40, "y")
+        revolve([(RIM_M, s * 0.10), (RIM_M - 0.03, s * 0.085), (0.09, s * 0.10), (0.0, s * 0.115)], 40, "y")
         for s in (-1, 1)
     ]
     holes: list[Mesh] = []
@@ -107,36 +106,11 @@ def rim_parts(colour: Colour) -> tuple[Part, ...]:
     )
 
 
-def wheel_positions() -> list[tuple[float, float, float]]:
-    """Return the wheel centres in the van's coordinates."""
-    return [(x, s * _TRACK_Y_M, WHEEL_M) for x in AXLES_X_M for s in (-1, 1)]
-
-
-def _stations() -> np.ndarray:
-    a = np.linspace(0, np.pi, 19)
-    arches = [np.concatenate([x + ARCH_M * np.cos(a), [x - ARCH_M - 0.004, x + ARCH_M + 0.004]]) for x in AXLES_X_M]
-    ends = np.array([-2.445, -2.43, -2.40, 2.36, 2.40, 2.43, 2.445])
-    return np.unique(np.round(np.concatenate([np.linspace(-2.45, 2.45, 50), ends, *arches]), 4))
-
-
 def _ring(x: float) -> np.ndarray:
     """Return the cross-section at x: a rounded box whose sides lean in above the belt line, cut by the wheel arches."""
     top, bottom = np.interp(x, _TOP[:, 0], _TOP[:, 1]), np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1])
-    for axle in AXLES_X_M:
-        if abs(x - axle) <= ARCH_M:
-            bottom = max(bottom, WHEEL_M + np.sqrt(ARCH_M**2 - (x - axle) ** 2))
     half = 0.965 * (1 - 0.16 * max(0.0, (x - 1.5) / 0.95) ** 2.5)
-    r1, r0 = min(0.16, 0.45 * (top - bottom)), min(0.05, 0.3 * (top - bottom))
-    a = np.linspace(0, np.pi / 2, 6)
-    low = np.stack([half - r0 + r0 * np.sin(a), bottom + r0 - r0 * np.cos(a)], 1)
-    wall = np.stack([np.full(7, half), np.linspace(bottom + r0, top - r1, 9)[1:-1]], 1)
-    high = np.stack([half - r1 + r1 * np.cos(a), top - r1 + r1 * np.sin(a)], 1)
-    under = np.stack([np.linspace(0, half - r0, 4)[:-1], np.full(3, bottom)], 1)
-    roof = np.stack([np.linspace(half - r1, 0, 6)[1:], np.full(5, top)], 1)
-    y, z = np.concatenate([under, low, wall, high, roof]).T
-    y = y - 0.10 * np.clip(z - 1.15, 0, None) * (y / half)
-    ring = np.stack([np.full_like(y, x), y, z], 1)
-    return np.concatenate([ring, (ring * [1, -1, 1])[-2:0:-1]])
+    return _SECTION.ring(x, half, WHEELS.cut(x, bottom), top)
 
 
 def _tyre() -> np.ndarray:
@@ -160,9 +134,7 @@ def _paint(livery: Livery, rng: np.random.Generator) -> np.ndarray:
 
 
 def _paint_side(c: Canvas, chart: str, livery: Livery) -> None:
-    def at(xz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
-
+    at = partial(_ATLAS.at, chart)
     c.polygon(at([(-2.5, 0.62), (2.5, 0.86), (2.5, 0.2), (-2.5, 0.2)]), livery.second)
     c.polygon(at([(-2.5, 0.70), (2.5, 0.94), (2.5, 0.88), (-2.5, 0.64)]), livery.ink)
     front = [(0.62, 1.28), (0.62, 1.92), (0.98, 1.92), (1.28, 1.70), (1.58, 1.28)]
@@ -183,9 +155,7 @@ def _paint_side(c: Canvas, chart: str, livery: Livery) -> None:
 
 
 def _paint_end(c: Canvas, chart: str, livery: Livery, is_front: bool) -> None:
-    def at(yz: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.project(chart, np.array([(0.0, y, z) for y, z in yz]))
-
+    at = partial(_ATLAS.at, chart)
     if is_front:
         c.polygon(at([(-0.62, 0.78), (0.62, 0.78), (0.58, 0.56), (-0.58, 0.56)]), DARK)
         for z in (0.62, 0.68, 0.74):
@@ -198,9 +168,7 @@ def _paint_end(c: Canvas, chart: str, livery: Livery, is_front: bool) -> None:
 
 
 def _paint_top(c: Canvas, livery: Livery) -> None:
-    def at(xy: list[tuple[float, float]]) -> np.ndarray:
-        return _ATLAS.project("top", np.array([(x, y, 0.0) for x, y in xy]))
-
+    at = partial(_ATLAS.at, "top")
     c.polygon(at([(1.02, -0.76), (1.64, -0.86), (1.64, 0.86), (1.02, 0.76)]), GLASS)
     c.polygon(at([(1.2, -0.55), (1.5, -0.60), (1.5, -0.25), (1.2, -0.22)]), (0.15, 0.17, 0.19), 0.8)
     for x in (-2.0, -1.4, -0.8, -0.2, 0.4):

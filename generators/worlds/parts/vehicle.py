@@ -6,6 +6,7 @@ Own coordinates: x forward, y to the left, z up, origin on the ground below the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,23 +18,25 @@ from spike4dgs.generators.worlds.meshes import (
     ellipsoid,
     loft,
     merge,
-    quad,
     revolve,
     rotation,
     translation,
     tube,
 )
+from spike4dgs.generators.worlds.parts.bodywork import Section, Wheels, number_plates
 from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.2, 1.76, 1.46
-WHEEL_RADIUS_M, RIM_RADIUS_M, ARCH_RADIUS_M = 0.33, 0.22, 0.405
-AXLES_X_M = (-1.29, 1.29)
-TRACK_Y_M = 0.77  # middle of each wheel, left and right
+WHEEL_RADIUS_M, RIM_RADIUS_M = 0.33, 0.22
+WHEELS = Wheels((-1.29, 1.29), 0.77, WHEEL_RADIUS_M, 0.405)
+_BODY = Section(0.17, 0.04, arc=7, wall=5, lean=0.07, belt=0.62, per_m=0.6, crown=0.05)
+_CABIN = Section(0.10, 0.01, arc=7, wall=5, lean=0.24, belt=0.62, per_m=0.6, crown=0.03)
 
 GLASS: Colour = (0.03, 0.035, 0.045)
 DARK: Colour = (0.025, 0.025, 0.028)
 _ATLAS = Atlas(LENGTH_M + 0.1, WIDTH_M + 0.1, HEIGHT_M, 128)
+_top = partial(_ATLAS.at, "top")
 
 # side outlines, x from the rear bumper to the nose
 _TOP = np.array(
@@ -58,7 +61,8 @@ class Livery:
 
 def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return all parts that only translate. The tyres are among them: they look the same at every angle."""
-    shell = _ATLAS.wrap(loft(np.stack([_body_ring(x) for x in _stations()])))
+    stations = WHEELS.stations(2.1, 43, [-2.095, -2.08, -2.05, -2.0, 2.0, 2.05, 2.08, 2.095], 21)
+    shell = _ATLAS.wrap(loft(np.stack([_body_ring(x) for x in stations])))
     glasshouse = _ATLAS.wrap(loft(np.stack([_cabin_ring(x) for x in np.linspace(-1.87, 0.98, 46)])))
     tyre = revolve(_tyre_profile(), 40, "y")
     floor = box((3.9, 1.15, 0.55), (0, 0, 0.46))
@@ -69,26 +73,23 @@ def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
     lamps += [ellipsoid((0.05, 0.07, 0.07), (2.08, s * y, 0.36)) for s in (-1, 1) for y in (0.25, 0.5)]
     tails = [ellipsoid((0.05, 0.15, 0.08), (-2.06, s * 0.66, 0.76)) for s in (-1, 1)]
     mirrors = [ellipsoid((0.09, 0.12, 0.075), (0.52, s * 0.93, 0.99)) for s in (-1, 1)]
-    plate = Canvas(plain((40, 160), (0.85, 0.85, 0.8)), 300)
-    plate.text("S4-DGS", 0.267, 0.067, 0.08, (0.02, 0.02, 0.05))
-    plates = [quad((2.115, 0, 0.40), (0, 0.52, 0), (0, 0, 0.12)), quad((-2.115, 0, 0.60), (0, -0.52, 0), (0, 0, 0.12))]
     aerial = tube([(-1.2, 0, 1.38), (-1.38, 0, 1.72)], 0.012, 6)
     return (
         Part(shell, Material(_paint_body(livery, rng), 0.12)),
         Part(glasshouse, Material(_paint_cabin(livery), 0.08)),
-        Part(merge([tyre.moved(translation(*w)) for w in wheel_positions()]), Material(_tyre_image())),
+        Part(merge([tyre.moved(translation(*w)) for w in WHEELS.positions()]), Material(_tyre_image())),
         Part(merge([floor, *trims]), Material(DARK)),
         Part(merge(lamps), Material((0.85, 0.85, 0.82), 0.08)),
         Part(merge(tails), Material((0.6, 0.03, 0.03), 0.08)),
         Part(merge([*mirrors, aerial]), Material(livery.second, 0.12)),
-        Part(merge(plates), Material(plate.image)),
+        number_plates("S4-DGS", (2.115, 0.40), (-2.115, 0.60)),
     )
 
 
 def rim_parts() -> tuple[Part, ...]:
     """Return one rim about its own axle (the y axis): ring, five double spokes, hub; alike from both sides."""
     ring = [(0.205, -0.115), (RIM_RADIUS_M, -0.11), (RIM_RADIUS_M, 0.11), (0.205, 0.115), (0.195, 0.09), (0.195, -0.09)]
-    bright: list[Mesh] = [revolve(np.array(ring + ring[:1]), 40, "y")]
+    bright: list[Mesh] = [revolve(ring + ring[:1], 40, "y")]
     for k in range(5):
         turn = rotation("y", 2 * np.pi * k / 5)
         for side in (-1, 1):
@@ -96,8 +97,8 @@ def rim_parts() -> tuple[Part, ...]:
                 spoke = box((0.024, 0.03, 0.165), (0, side * 0.088, 0.122))
                 bright.append(spoke.moved(turn @ rotation("y", lean)))
     hub = [ellipsoid((0.055, 0.02, 0.055), (0, s * 0.095, 0)) for s in (-1, 1)]
-    brake = [revolve(np.array([(0.04, s * 0.05), (0.15, s * 0.05)]), 32, "y") for s in (-1, 1)]
-    behind = [revolve(np.array([(0.0, s * 0.03), (0.2, s * 0.03)]), 32, "y") for s in (-1, 1)]
+    brake = [revolve([(0.04, s * 0.05), (0.15, s * 0.05)], 32, "y") for s in (-1, 1)]
+    behind = [revolve([(0.0, s * 0.03), (0.2, s * 0.03)], 32, "y") for s in (-1, 1)]
     # one painted mark makes a whole turn distinguishable from a fifth of one
     mark = [box((0.05, 0.012, 0.075), (0, s * 0.108, 0.15)) for s in (-1, 1)]
     return (
@@ -109,66 +110,23 @@ def rim_parts() -> tuple[Part, ...]:
     )
 
 
-def wheel_positions() -> list[tuple[float, float, float]]:
-    """Return the wheel centres in the car's coordinates."""
-    return [(x, s * TRACK_Y_M, WHEEL_RADIUS_M) for x in AXLES_X_M for s in (-1, 1)]
-
-
 # ---------------------------------------------------------------- shape
-
-
-def _stations() -> np.ndarray:
-    """Return the positions of the cross-sections: even, and dense along the wheel arches."""
-    angle = np.linspace(0, np.pi, 21)
-    edge = ARCH_RADIUS_M + 0.004
-    arches = [np.concatenate([x + ARCH_RADIUS_M * np.cos(angle), [x - edge, x + edge]]) for x in AXLES_X_M]
-    ends = np.array([-2.095, -2.08, -2.05, -2.0, 2.0, 2.05, 2.08, 2.095])
-    return np.unique(np.round(np.concatenate([np.linspace(-2.1, 2.1, 43), ends, *arches]), 4))
 
 
 def _body_ring(x: float) -> np.ndarray:
     """Return the lower body's cross-section at x: a rounded rectangle between the outlines, cut by the wheel arches."""
     top = np.interp(x, _TOP[:, 0], _TOP[:, 1])
-    bottom = np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1])
-    for axle in AXLES_X_M:
-        if abs(x - axle) <= ARCH_RADIUS_M:
-            bottom = max(bottom, WHEEL_RADIUS_M + np.sqrt(ARCH_RADIUS_M**2 - (x - axle) ** 2))
-    flare = 0.02 * sum(np.exp(-(((x - axle) / 0.5) ** 2)) for axle in AXLES_X_M)
+    bottom = WHEELS.cut(x, np.interp(x, _BOTTOM[:, 0], _BOTTOM[:, 1]))
+    flare = 0.02 * sum(np.exp(-(((x - axle) / 0.5) ** 2)) for axle in WHEELS.axles_x)
     half = WIDTH_M / 2 * (1 - 0.20 * abs(x / 2.1) ** 5) - 0.02 + flare
-    return _rounded(x, half, bottom, top, round_top=0.17, round_bottom=0.04, lean=0.07, crown=0.05)
+    return _BODY.ring(x, half, bottom, top)
 
 
 def _cabin_ring(x: float) -> np.ndarray:
     """Return the cross-section of the glasshouse at x, narrowing towards the roof."""
     roof = np.interp(x, _ROOF[:, 0], _ROOF[:, 1])
     half = 0.80 * (1 - 0.10 * abs((x + 0.45) / 1.45) ** 3)
-    return _rounded(x, half, 0.70, max(roof, 0.72), round_top=0.10, round_bottom=0.01, lean=0.24, crown=0.03)
-
-
-def _rounded(
-    x: float,
-    half: float,
-    bottom: float,
-    top: float,
-    *,
-    round_top: float,
-    round_bottom: float,
-    lean: float,
-    crown: float,
-) -> np.ndarray:
-    """Return a ring [m, 3] at x: sides lean inwards by `lean` metres per 0.6 m of height, the top bulges by `crown`."""
-    r1, r0 = min(round_top, 0.45 * (top - bottom)), min(round_bottom, 0.3 * (top - bottom))
-    a = np.linspace(0, np.pi / 2, 7)
-    low = np.stack([half - r0 + r0 * np.sin(a), bottom + r0 - r0 * np.cos(a)], 1)
-    wall = np.stack([np.full(5, half), np.linspace(bottom + r0, top - r1, 7)[1:-1]], 1)
-    high = np.stack([half - r1 + r1 * np.cos(a), top - r1 + r1 * np.sin(a)], 1)
-    under = np.stack([np.linspace(0, half - r0, 4)[:-1], np.full(3, bottom)], 1)
-    roof = np.stack([np.linspace(half - r1, 0, 7)[1:], np.full(6, top)], 1)
-    y, z = np.concatenate([under, low, wall, high, roof]).T
-    y = y - lean * np.clip(z - 0.62, 0, None) / 0.6 * (y / half)
-    z = z - crown * (y / half) ** 2 * np.clip((z - bottom) / (top - bottom), 0, 1) ** 2
-    ring = np.stack([np.full_like(y, x), y, z], 1)
-    return np.concatenate([ring, (ring * [1, -1, 1])[-2:0:-1]])
+    return _CABIN.ring(x, half, 0.70, max(roof, 0.72))
 
 
 def _tyre_profile() -> np.ndarray:
@@ -188,45 +146,37 @@ def _canvas(colour: Colour, rng: np.random.Generator | None = None) -> Canvas:
     return Canvas(image, _ATLAS.texels_per_m)
 
 
-def _side(chart: str, xz: list[tuple[float, float]]) -> np.ndarray:
-    """Convert points (x, z) on a flank to texture metres."""
-    return _ATLAS.project(chart, np.array([(x, 0.0, z) for x, z in xz]))
-
-
-def _top(xy: list[tuple[float, float]]) -> np.ndarray:
-    """Convert points (x, y) seen from above to texture metres."""
-    return _ATLAS.project("top", np.array([(x, y, 0.0) for x, y in xy]))
-
-
 def _paint_body(livery: Livery, rng: np.random.Generator) -> np.ndarray:
     c = _canvas(livery.body, rng)
     white = (0.86, 0.86, 0.83)
     for chart in ("near", "far"):
-        c.polygon(_side(chart, [(-2.1, 0.50), (-0.75, 0.40), (2.1, 0.40), (2.1, 0.18), (-2.1, 0.18)]), livery.second)
+        at = partial(_ATLAS.at, chart)
+        c.polygon(at([(-2.1, 0.50), (-0.75, 0.40), (2.1, 0.40), (2.1, 0.18), (-2.1, 0.18)]), livery.second)
         c.polygon(
-            _side(chart, [(-2.1, 0.55), (-0.75, 0.45), (2.1, 0.45), (2.1, 0.42), (-0.75, 0.42), (-2.1, 0.52)]), white
+            at([(-2.1, 0.55), (-0.75, 0.45), (2.1, 0.45), (2.1, 0.42), (-0.75, 0.42), (-2.1, 0.52)]),
+            white,
         )
         for shift, shade in ((0.0, livery.second), (0.32, white)):
             slash = [(-1.02 - shift, 0.90), (-0.80 - shift, 0.90), (-0.98 - shift, 0.46), (-1.2 - shift, 0.48)]
-            c.polygon(_side(chart, slash), shade)
+            c.polygon(at(slash), shade)
         for door in ([(-0.72, 0.95), (-0.70, 0.42), (-0.52, 0.25), (0.44, 0.25), (0.52, 0.92)],):
-            c.line(_side(chart, door), 0.022, DARK)
-        c.line(_side(chart, [(0.86, 0.62), (0.86, 0.28)]), 0.015, DARK, 0.6)
-        c.polygon(_side(chart, [(-0.62, 0.82), (-0.42, 0.82), (-0.42, 0.78), (-0.62, 0.78)]), DARK)
-        c.polygon(_side(chart, [(0.62, 0.72), (0.84, 0.72), (0.80, 0.62), (0.62, 0.62)]), DARK, 0.85)
-        x, y = _side(chart, [(-0.06, 0.62)])[0]
+            c.line(at(door), 0.022, DARK)
+        c.line(at([(0.86, 0.62), (0.86, 0.28)]), 0.015, DARK, 0.6)
+        c.polygon(at([(-0.62, 0.82), (-0.42, 0.82), (-0.42, 0.78), (-0.62, 0.78)]), DARK)
+        c.polygon(at([(0.62, 0.72), (0.84, 0.72), (0.80, 0.62), (0.62, 0.62)]), DARK, 0.85)
+        x, y = at([(-0.06, 0.62)])[0]
         c.ellipse(x, y, 0.235, 0.235, DARK)
         c.ellipse(x, y, 0.215, 0.215, white)
         c.text(livery.number, x, y, 0.22, (0.02, 0.02, 0.02))
-        x, y = _side(chart, [(1.62, 0.545)])[0]
+        x, y = at([(1.62, 0.545)])[0]
         c.text("4D", x, y, 0.13, (0.02, 0.02, 0.02))
-        x, y = _side(chart, [(-1.82, 0.66)])[0]
+        x, y = at([(-1.82, 0.66)])[0]
         c.text("20k", x, y, 0.11, white)
-        x, y = _side(chart, [(0.0, 0.325)])[0]
+        x, y = at([(0.0, 0.325)])[0]
         c.text("S P I K E", x, y, 0.105, white)
     _paint_bonnet(c, livery, white)
     for chart, grille in (("front", True), ("back", False)):
-        x, y = _ATLAS.project(chart, np.array([(0, 0, 0.42)]))[0]
+        x, y = _ATLAS.at(chart, [(0, 0.42)])[0]
         c.rectangle(x - 0.62, y - 0.07, x + 0.62, y + 0.07, DARK if grille else livery.second)
     return c.image
 
@@ -252,15 +202,16 @@ def _paint_cabin(livery: Livery) -> np.ndarray:
     c = _canvas(livery.body)
     seat: Colour = (0.10, 0.09, 0.085)
     for chart in ("near", "far"):
+        at = partial(_ATLAS.at, chart)
         front = [(-0.50, 0.95), (-0.50, 1.33), (0.10, 1.33), (0.28, 1.27), (0.66, 0.95)]
         rear = [(-0.60, 0.95), (-0.60, 1.33), (-1.02, 1.29), (-1.30, 1.16), (-1.52, 0.95)]
         for window, back in ((front, -0.36), (rear, -1.12)):
-            c.polygon(_side(chart, window), GLASS)
-            c.polygon(_side(chart, [(back, 0.95), (back - 0.06, 1.2), (back + 0.10, 1.24), (back + 0.2, 0.95)]), seat)
+            c.polygon(at(window), GLASS)
+            c.polygon(at([(back, 0.95), (back - 0.06, 1.2), (back + 0.10, 1.24), (back + 0.2, 0.95)]), seat)
             glint = [(back + 0.38, 0.97), (back + 0.56, 1.27), (back + 0.62, 1.27), (back + 0.44, 0.97)]
-            c.polygon(_side(chart, glint), (0.16, 0.18, 0.20), 0.8)
-        c.line(_side(chart, [*front, front[0]]), 0.02, DARK)
-        c.line(_side(chart, [*rear, rear[0]]), 0.02, DARK)
+            c.polygon(at(glint), (0.16, 0.18, 0.20), 0.8)
+        c.line(at([*front, front[0]]), 0.02, DARK)
+        c.line(at([*rear, rear[0]]), 0.02, DARK)
     windscreen = [(0.30, -0.56), (0.92, -0.68), (0.92, 0.68), (0.30, 0.56)]
     c.polygon(_top(windscreen), GLASS)
     c.polygon(_top([(0.30, -0.56), (0.38, -0.575), (0.38, 0.575), (0.30, 0.56)]), (0.86, 0.86, 0.83))
