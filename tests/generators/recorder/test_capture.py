@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +12,12 @@ from fake_camera import FakeCamera, frames_of, layout_of, rig, rig_of
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.capture import capture
-from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, Clip
+from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip
 from spike4dgs.generators.recorder.frames.cutting import agree
 from spike4dgs.generators.recorder.frames.layouts import COUNTER
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sync import Rate
-from spike4dgs.generators.recorder.usb.reads import OVERFLOW, SHORT, STALL, TIME_OUT, UNPLUGGED
+from spike4dgs.generators.recorder.usb.reads import UNPLUGGED
 
 N = 200  # ticks of most clips
 SECONDS = N / 20000
@@ -29,10 +27,6 @@ def make(n: int, layout: str = "plain", **changes: object) -> tuple[RigProfile, 
     profile = rig(n, layout, **changes)
     frames = [frames_of(i, layout_of(profile), 2 * N) for i in range(n)]
     return profile, frames, rig_of(frames, profile)
-
-
-def by_name(clip: Clip) -> dict[str, CameraClip]:
-    return {c.camera: c for c in clip.cameras}
 
 
 def check_frames(camera: CameraClip, frames: UInt8, n_ticks: int) -> None:
@@ -91,84 +85,6 @@ def test_counters_of_their_own_decide_nothing() -> None:
 @pytest.mark.parametrize(("most", "expected"), [(2, None), (3, 1)])
 def test_agreement_takes_the_wrap_of_counters(most: int, expected: int | None) -> None:
     assert agree([COUNTER - 1, 1, COUNTER - 2], most) == expected
-
-
-@pytest.mark.parametrize("status", [STALL, OVERFLOW, UNPLUGGED])
-def test_a_camera_that_fails_stops_alone(status: str) -> None:
-    profile, frames, links = make(3)
-    links["cam_01"].faults = {30 * 77 + 11: status}
-    cameras = by_name(capture(profile, links, SECONDS))
-    for i, camera in enumerate(cameras.values()):
-        check_frames(camera, frames[i], N)
-    failed = cameras["cam_01"]
-    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(77, N - 77, status)]
-    assert failed.stats.end == status
-    assert not cameras["cam_00"].gaps and not cameras["cam_02"].gaps
-
-
-def test_a_camera_that_falls_silent_is_given_up_after_the_time_limit() -> None:
-    profile, frames, links = make(2)
-    links["cam_00"].stream = frames[0][:150].reshape(-1)
-    cameras = by_name(capture(profile, links, SECONDS))
-    assert [(g.first_tick, g.ticks, g.reason) for g in cameras["cam_00"].gaps] == [(150, 50, TIME_OUT)]
-    check_frames(cameras["cam_00"], frames[0], N)
-    assert not cameras["cam_01"].gaps
-
-
-@pytest.mark.parametrize(
-    ("layout", "offset", "lost"), [("plain", 0, 0), ("plain", 13, 140), ("tagged-rows", 13, 0), ("tagged-rows", 0, 0)]
-)
-def test_a_short_read_ends_a_stream_only_where_no_tag_locates_the_rest(layout: str, offset: int, lost: int) -> None:
-    profile, frames, links = make(2, layout)
-    links["cam_00"].faults = {60 * layout_of(profile).frame_bytes + offset: SHORT}
-    camera = by_name(capture(profile, links, SECONDS))["cam_00"]
-    check_frames(camera, frames[0], N)
-    assert camera.stats.lost_ticks == lost and camera.stats.short_reads >= 1
-    assert [(g.first_tick, g.reason) for g in camera.gaps] == ([(60, SHORT)] if lost else [])
-
-
-def test_bytes_that_a_camera_leaves_out_are_found_by_its_counter() -> None:
-    profile, frames, links = make(2, "tagged-rows")
-    size = layout_of(profile).frame_bytes
-    stream = frames[0].reshape(-1)
-    links["cam_00"].stream = np.delete(stream, np.s_[size * 40 + 17 : size * 43 + 5])
-    camera = by_name(capture(profile, links, SECONDS))["cam_00"]
-    check_frames(camera, frames[0], N)
-    assert [(g.first_tick, g.ticks) for g in camera.gaps] == [(40, 4)]
-
-
-@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
-def test_a_slow_consumer_costs_ticks_and_shifts_none(layout: str) -> None:
-    profile = rig(2, layout, timeout_ms=60_000, ring_seconds=0.0)  # the smallest ring: twice the reads in flight
-    frames = [frames_of(i, layout_of(profile), 4000) for i in range(2)]
-    links = rig_of(frames, profile)
-    slow = links["cam_00"]
-    slow.limit = 8 * 1024
-    got: dict[str, list[tuple[int, UInt8]]] = {"cam_00": [], "cam_01": []}
-
-    def sink(camera: str, first_tick: int, raw: UInt8) -> None:
-        got[camera].append((first_tick, raw.copy()))
-        if camera == "cam_00" and len(got[camera]) == 3:
-            slow.limit = slow.position + 12 * 1024  # the ring has half of that
-            deadline = time.monotonic() + 20
-            while slow.position < slow.limit and time.monotonic() < deadline:
-                time.sleep(1e-3)
-        elif camera == "cam_00" and len(got[camera]) == 8:  # five blocks waited
-            slow.limit = None
-
-    clip = capture(profile, links, 2000 / 20000, sink=sink)
-    assert not clip.complete
-    for i, camera in enumerate(clip.cameras):
-        assert len(camera.frames) == 0
-        ticks = np.concatenate([first + np.arange(len(raw)) for first, raw in got[camera.camera]])
-        raw = np.concatenate([raw for _, raw in got[camera.camera]])
-        check_frames(replace(camera, frames=raw, ticks=ticks), frames[i], 2000)
-        assert all(g.reason == OVERFLOW for g in camera.gaps)
-    camera = clip.cameras[0]
-    assert camera.stats.slots == 6 and camera.stats.backlog >= 5, "all but the one that the sink holds"
-    assert camera.gaps[0].first_tick > 0
-    first, raw = got["cam_00"][-1]
-    assert first + len(raw) > camera.gaps[0].stop_tick, "later ticks have been kept"
 
 
 def test_an_interruption_keeps_the_ticks_that_every_camera_has() -> None:

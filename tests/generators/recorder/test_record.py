@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_text import RIG
 from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError, problem
@@ -146,19 +147,13 @@ def rig_of(scene, folder: Path) -> Path:
     cameras = open_scene(scene).cameras
     folder.mkdir()
     (folder / "calibration.toml").write_text(calibration_toml(cameras.values()))
-    lines = ['schema = "spike4dgs-rig/1"', 'name = "ours"', "width = 40", "height = 24", 'layout = "tagged-rows"']
-    lines += [
-        "radiance_gain = 0.6",
-        'held_out = ["cam_03"]',
-        'calibration = "calibration.toml"',
-        "[transfer]",
-        "bytes = 4096",
-    ]
-    lines += ["[defaults]", "vendor_id = 0x0403", "product_id = 0x601f", "endpoint_in = 0x82", "endpoint_out = 0x01"]
-    lines += ['start = ["01"]', 'stop = ["02"]', "mirrored = true"]
+    text = RIG.partition("[[camera]]")[0].replace('"plain"', '"tagged-rows"').replace("bytes = 1024", "bytes = 4096")
+    facts = 'radiance_gain = 0.6\nheld_out = ["cam_03"]\ncalibration = "calibration.toml"\n[transfer]'
+    text = text.replace("[transfer]", facts)
+    text += 'endpoint_out = 0x01\nstart = ["01"]\nstop = ["02"]\nmirrored = true\n'
     for i, name in enumerate(cameras):
-        lines += ["[[camera]]", f'id = "{name}"', f'serial = "S{i}"', f'role = "{"secondary" if i else "primary"}"']
-    (folder / "rig.toml").write_text("\n".join(lines))
+        text += f'[[camera]]\nid = "{name}"\nserial = "S{i}"\nrole = "{"secondary" if i else "primary"}"\n'
+    (folder / "rig.toml").write_text(text)
     return folder / "rig.toml"
 
 

@@ -92,6 +92,14 @@ def test_a_camera_that_fails_keeps_every_earlier_tick(two: Scene, kind: str, tra
     assert failed.stats.end == kind
 
 
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_a_short_read_between_frames_loses_nothing(two: Scene, layout: str, tmp_path: Path) -> None:
+    profile = profile_of(two, layout=layout)
+    clip = record(tmp_path / "clip", profile, emulate(two, profile, Fault("cam_01", "short read", 77)), N)
+    assert clip.complete and clip.cameras[1].stats.short_reads == clip.cameras[0].stats.short_reads + 1
+    check_recording(tmp_path / "clip", two, clip)
+
+
 @pytest.mark.parametrize(
     ("lost", "gap"), [(0, []), (1, [(77, 1)]), (168, [(77, 2)]), (5 * 168 - 33, [(77, 5)]), (5 * 168, [(77, 6)])]
 )
@@ -213,6 +221,9 @@ def test_a_consumer_slowed_on_purpose_loses_exactly_the_ticks_without_a_slot(
         [(first, stop, "overflow")],
     ]
     assert 0 < first < stop < N - 1, "data follow the gap"
+    failed = clip.cameras[1]
+    assert not len(failed.frames) and failed.stats.slots == SLOTS
+    assert failed.stats.backlog >= SLOTS - 1, "all but the one that the sink holds"
     check_recording(tmp_path / "clip", two, clip)
     with pytest.raises(
         UserError, match=f"cam_01 from tick {first}, {stop - first} ticks .overflow.; pass --allow-gaps"
