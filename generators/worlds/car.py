@@ -9,13 +9,14 @@ import numpy as np
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import rotation, translation
 from spike4dgs.generators.worlds.parts import street, vehicle
+from spike4dgs.generators.worlds.parts.bodywork import Livery
 
 _LIVERIES = (
-    vehicle.Livery((0.82, 0.56, 0.04), (0.03, 0.03, 0.035), "7"),
-    vehicle.Livery((0.80, 0.80, 0.78), (0.55, 0.05, 0.04), "12"),
-    vehicle.Livery((0.35, 0.62, 0.80), (0.80, 0.30, 0.04), "20"),
-    vehicle.Livery((0.50, 0.72, 0.30), (0.04, 0.10, 0.25), "4"),
-    vehicle.Livery((0.85, 0.38, 0.06), (0.04, 0.14, 0.40), "31"),
+    Livery((0.82, 0.56, 0.04), (0.03, 0.03, 0.035), "7"),
+    Livery((0.80, 0.80, 0.78), (0.55, 0.05, 0.04), "12"),
+    Livery((0.35, 0.62, 0.80), (0.80, 0.30, 0.04), "20"),
+    Livery((0.50, 0.72, 0.30), (0.04, 0.10, 0.25), "4"),
+    Livery((0.85, 0.38, 0.06), (0.04, 0.14, 0.40), "31"),
 )
 
 

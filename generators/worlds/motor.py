@@ -23,6 +23,7 @@ from spike4dgs.generators.worlds.meshes import (
     tube,
 )
 from spike4dgs.generators.worlds.parts import cycles, figure, street
+from spike4dgs.generators.worlds.parts.bodywork import Livery
 from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, plain
 
@@ -32,15 +33,6 @@ _ATLAS = Atlas(1.9, 0.6, 1.2, 200)
 
 _WHITE: Colour = (0.84, 0.83, 0.79)
 _DARK: Colour = (0.03, 0.03, 0.035)
-
-
-@dataclass(frozen=True)
-class Livery:
-    """Colours and number of machine and rider, linear RGB."""
-
-    body: Colour
-    second: Colour
-    number: str
 
 
 _LIVERIES = (

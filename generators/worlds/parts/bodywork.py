@@ -1,4 +1,4 @@
-"""Shapes that the bodies of cars and vans share. x forward, y to the left, z up, metres."""
+"""What the bodies of cars, vans and motorcycles share. x forward, y to the left, z up, metres."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ import numpy as np
 
 from spike4dgs.generators.worlds.base import Part
 from spike4dgs.generators.worlds.meshes import merge, quad
-from spike4dgs.generators.worlds.surfaces import Material
+from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, plain
+
+
+@dataclass(frozen=True)
+class Livery:
+    """Colours (linear RGB) and number of a car, or of a motorcycle and its rider."""
+
+    body: Colour
+    second: Colour
+    number: str
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ Own coordinates: x forward, y to the left, z up, origin on the ground below the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -23,7 +22,7 @@ from spike4dgs.generators.worlds.meshes import (
     translation,
     tube,
 )
-from spike4dgs.generators.worlds.parts.bodywork import Section, Wheels, number_plates
+from spike4dgs.generators.worlds.parts.bodywork import Livery, Section, Wheels, number_plates
 from spike4dgs.generators.worlds.surfaces import Colour, Material
 from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 
@@ -48,15 +47,6 @@ _ROOF = np.array(
     [(-1.88, 0.86), (-1.72, 1.02), (-1.45, 1.26), (-1.15, 1.38), (-0.7, 1.44), (-0.1, 1.45), (0.25, 1.40)]
     + [(0.62, 1.17), (1.0, 0.86)]
 )
-
-
-@dataclass(frozen=True)
-class Livery:
-    """Colours (linear RGB) of one car, and the number on its doors."""
-
-    body: Colour
-    second: Colour
-    number: str
 
 
 def body_parts(livery: Livery, rng: np.random.Generator) -> tuple[Part, ...]:
