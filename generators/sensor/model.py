@@ -13,7 +13,13 @@ sum of k independent Gamma(N) / N variables, exactly, whatever the light does; s
 each spike, not for each tick: a spike takes the charge 1 + g / sqrt(N) instead of 1, with g from a sum of four bytes
 (mean 0, variance 1, excess kurtosis -0.3, |g| < 3.46) where Gamma's is Gaussian up to a skewness of 2 / sqrt(N). g is a
 hash of (seed, pixel, tick), so it does not depend on batches or threads. The limit to a tick's charge is then not 1 but
-the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick.
+the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick. Reset noise,
+the sampled noise kTC of the charge that a reset takes, is another term of the same g: 1 / N + reset_noise^2.
+
+Two effects are off by default and have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every
+tick it sees the charge plus read_noise times such a g, so a spike comes early or late, but the charge that a spike takes
+stays 1 and the error does not add up. A pixel with dead ticks collects no light in so many ticks after each spike, so a
+rate r becomes r / (1 + r dead_ticks), and its light follows the interval minus the dead ticks.
 
 Radiance between keys is a cubic Hermite (Catmull-Rom) curve: the tangent at a key is the slope between its neighbours,
 in the first and last interval the slope of that interval itself. With p0..p3 the keys around the interval from p1 to p2
@@ -35,6 +41,7 @@ used, so every processor gives the same bits.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -49,6 +56,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators.sensor.kernels import BLOCK, STRIP, integrate
+from spike4dgs.generators.sensor.uneven_kernels import integrate_uneven
 
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
@@ -66,7 +74,10 @@ class Sensor:
         gain: [H, W], relative sensitivity, mean 1.
         dark: [H, W], spikes per tick in the dark.
         photons: number of photons per spike, for shot noise; at least 100.
-        noise_seed: seed of the shot noise.
+        noise_seed: seed of the noise.
+        reset_noise: standard deviation of the charge that a reset takes, in thresholds.
+        read_noise: standard deviation of the comparator's error in a tick, in thresholds.
+        dead_ticks: ticks after a spike in which a pixel collects no light.
     """
 
     radiance_gain: float = SENSOR.radiance_gain
@@ -74,6 +85,19 @@ class Sensor:
     dark: Float32 | None = None
     photons: float | None = None
     noise_seed: tuple[int, ...] = ()
+    reset_noise: float = 0.0
+    read_noise: float = 0.0
+    dead_ticks: int = 0
+
+    @property
+    def spent_sd(self) -> float:
+        """Standard deviation of the charge that a spike takes, in thresholds."""
+        return math.hypot(self.photons**-0.5 if self.photons else 0.0, self.reset_noise)
+
+    @property
+    def is_uneven(self) -> bool:
+        """True where spikes come at other ticks than the charge's."""
+        return self.read_noise > 0 or self.dead_ticks > 0
 
     @property
     def noise_key(self) -> int:
@@ -122,6 +146,11 @@ def simulate(
     n_intervals = int(np.searchsorted(ticks, n_ticks))
     window = np.zeros((per_batch + 3, len(state)), dtype=np.float32)
     tangents, bounds = _tangent_weights(ticks), _shares(blocks, threads)
+    loop: Any = integrate
+    more: tuple[Any, ...] = ()
+    if sensor.is_uneven:
+        loop, state = integrate_uneven, state.astype(np.int64)
+        more = _steps(sensor.read_noise, unit), sensor.dead_ticks, np.zeros(len(state), np.int64)
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
             last = min(first + per_batch, n_intervals)
@@ -130,7 +159,7 @@ def simulate(
             words = np.empty((end - ticks[first], blocks), dtype=np.uint64)
             batch = window, ticks[first : last + 1], tangents[first:last]
             camera = sensor.radiance_gain, gain, dark, state, unit, noise, np.uint32(sensor.noise_key), means
-            jobs = [pool.submit(integrate, *batch, *camera, words, a, b) for a, b in itertools.pairwise(bounds)]
+            jobs = [pool.submit(loop, *batch, *camera, *more, words, a, b) for a, b in itertools.pairwise(bounds)]
             for job in jobs:
                 job.result()
             yield words.view(np.uint8)[:, : bytes_per_tick(width, height)]
@@ -138,12 +167,15 @@ def simulate(
 
 def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
     """Return the room below zero in thresholds, and the charge units of a threshold and of one step of `deviate`."""
-    if sensor.photons is None:
-        return 0.0, float(THRESHOLD), np.int32(0)
-    sd = sensor.photons**-0.5
+    sd = sensor.spent_sd
     head = sd * MOST_DEVIATION
     unit = float(np.floor(THRESHOLD / (1 + head)))
-    return head, unit, np.int32(sd * unit / DEVIATE_SD)  # rounded down: a spike never takes more than there is
+    return head, unit, _steps(sd, unit)
+
+
+def _steps(sd: float, unit: float) -> np.int32:
+    """Return the charge units of a step of `deviate` for noise of `sd` thresholds."""
+    return np.int32(sd * unit / DEVIATE_SD)  # rounded down: a spike never takes more than there is
 
 
 def _check(keys: Keys, ticks: NDArray[np.int64], n_ticks: int, sensor: Sensor, charge: Int32, means: bool) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float32, Float64, Int32
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD, charge_after_spike, charge_of_tick
 from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_DEVIATION, Keys, Sensor
+from spike4dgs.generators.sensor.uneven_kernels import READ_SALT
 
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
 
@@ -47,28 +48,39 @@ def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[F
 
 def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
     """Yield spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
-    sd = 0.0 if sensor.photons is None else sensor.photons**-0.5
+    sd = sensor.spent_sd
     height, width = charge.shape
     pixels = np.arange(height * width, dtype=np.uint64).reshape(height, width)[::-1]  # as the file numbers them
     level = charge / THRESHOLD
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
+    rest = np.zeros(charge.shape, np.int64)  # dead ticks that are left
     for tick, mean in enumerate(means):
-        level = level + charge_of_tick(gain * sensor.radiance_gain * mean, dark, 1 + sd * MOST_DEVIATION)
-        fired = level >= 1.0
-        yield fired, level
-        level = charge_after_spike(level, fired * (1 + sd * deviates(pixels, tick, sensor.noise_key)))
+        awake = rest == 0
+        added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, 1 + sd * MOST_DEVIATION)
+        level = level + np.where(awake, added, 0.0)
+        shown = level
+        if sensor.read_noise:
+            shown = level + sensor.read_noise * deviates(pixels, tick, sensor.noise_key, READ_SALT)
+        fired = awake & (shown >= 1.0)
+        yield fired, shown
+        spent = 1 + sd * deviates(pixels, tick, sensor.noise_key)
+        level = np.where(fired, charge_after_spike(level, spent), level)
+        rest = np.where(fired, sensor.dead_ticks, np.maximum(rest - 1, 0))
 
 
-def deviates(pixels: NDArray[np.uint64], tick: int, key: int) -> Float64:
-    """Return the simulator's random numbers of a tick, mean 0 and variance 1: four bytes of a 32-bit hash, summed."""
+def deviates(pixels: NDArray[np.uint64], tick: int, key: int, salt: int = 0) -> Float64:
+    """Return the simulator's random numbers of a tick, mean 0 and variance 1: four bytes of a 32-bit hash, summed.
+
+    `salt` chooses other numbers: 0 for the charge that a spike takes, READ_SALT for the comparator.
+    """
 
     def mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
         for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B), (16, 1)):
             x = ((x ^ (x >> np.uint64(shift))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
         return x
 
-    hashed = (pixels * np.uint64(0x9E3779B1)) & np.uint64(0xFFFFFFFF)
+    hashed = ((pixels * np.uint64(0x9E3779B1)) & np.uint64(0xFFFFFFFF)) ^ np.uint64(salt)
     x = mixed(hashed ^ mixed(np.array([tick ^ key], dtype=np.uint64)))
     total = sum((x >> np.uint64(shift)) & np.uint64(255) for shift in (0, 8, 16, 24))
     return (np.asarray(total, dtype=np.float64) - 510) / DEVIATE_SD

@@ -375,3 +375,88 @@ def test_an_old_processor_gives_the_same_spikes(tmp_path: Path) -> None:
     assert "separate" in here[4] and old[4] == "narrow separate"
     if not here[4].startswith("wide"):
         pytest.skip("this processor has no wide registers: both runs used the same instructions")
+
+
+def uneven(height, width, **options):
+    return replace(maps(height, width, True), photons=5e4, noise_seed=(3,), **options)
+
+
+def test_the_loop_for_uneven_spikes_gives_the_bits_of_the_fast_one_where_both_effects_are_off(monkeypatch):
+    keys, ticks, n = scene()
+    sensor, charge = uneven(31, 45, reset_noise=0.003), random_charge(31, 45, [0, 7])
+    fast = stream(keys * 2, ticks, n, sensor, charge).packed
+    monkeypatch.setattr(Sensor, "is_uneven", True)
+    assert np.array_equal(fast, stream(keys * 2, ticks, n, sensor, charge, threads=2).packed)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    read=st.sampled_from([0.0, 0.003, 0.05]),
+    dead=st.integers(0, 3),
+    reset=st.sampled_from([0.0, 0.01]),
+    bright=st.sampled_from([0.3, 3.0]),
+    seed=st.integers(0, 2**31),
+)
+def test_uneven_spikes_equal_the_twins(read, dead, reset, bright, seed):
+    rng = np.random.default_rng(seed)
+    keys = (bright * rng.random((6, 7, 13))).astype(np.float32)
+    keys[:, :, :4] = keys[0, :, :4]
+    ticks, n = np.arange(6) * 15, 71
+    sensor = uneven(7, 13, read_noise=read, dead_ticks=dead, reset_noise=reset)
+    charge = random_charge(7, 13, [seed])
+    got = stream(keys, ticks, n, sensor, charge).window(0, n)
+    expected = simulate_reference(keys, ticks, n, sensor, charge)
+    # steps of `deviate` are whole charge units and increments float32: a spike may move by a tick, seldom more
+    assert (got != expected).mean() < 0.01
+    assert np.abs(got.sum(0) - expected.sum(0).astype(int)).max() <= 1
+
+
+def test_uneven_bytes_depend_neither_on_threads_nor_on_batches(monkeypatch):
+    keys, ticks, n = scene()
+    sensor, charge = uneven(31, 45, read_noise=0.02, dead_ticks=1), random_charge(31, 45, [0, 7])
+    once = stream(keys, ticks, n, sensor, charge).packed
+    monkeypatch.setattr("spike4dgs.generators.sensor.model._BATCH_BYTES", 4 * 31 * 45 * 7)
+    assert np.array_equal(once, stream(keys, ticks, n, sensor, charge, threads=3).packed)
+
+
+def steady_spikes(rate, n, sensor, pixels=4000):
+    light = np.full((1, pixels), rate / sensor.radiance_gain, np.float32)
+    return stream([light, light], [0, n], n, sensor, random_charge(1, pixels, [5])).window(0, n)[:, 0]
+
+
+@pytest.mark.parametrize(("rate", "dead"), [(0.05, 1), (0.4, 1), (1.0, 1), (0.3, 2)])
+def test_dead_ticks_add_to_every_interval(rate, dead):
+    """The law of a real camera's calibration: light is proportional to 1 / (interval - dead ticks)."""
+    spikes = steady_spikes(rate, 2000, Sensor(dead_ticks=dead))
+    intervals = np.diff(np.flatnonzero(spikes[:, 0]))
+    assert 1 / (intervals.mean() - dead) == pytest.approx(rate, rel=0.002)
+    assert intervals.min() > dead
+    assert spikes.mean() == pytest.approx(rate / (1 + rate * dead), rel=0.002)
+
+
+def interval_variances(sensor, rate=0.1, n=8000):
+    """Return the variance of the sum of 1, 4 and 16 intervals, in units of the squared mean interval."""
+    found = {k: [] for k in (1, 4, 16)}
+    for pixel in steady_spikes(rate, n, sensor, pixels=300).T:
+        times = np.flatnonzero(pixel) * rate
+        for k, values in found.items():
+            values.extend(times[k:] - times[:-k] - k)
+    return {k: np.var(values) for k, values in found.items()}
+
+
+def test_reset_noise_adds_up_from_spike_to_spike_and_read_noise_does_not():
+    """k intervals vary by k s^2 for the noise s of a reset, as for shot noise, and by 2 s^2 for that of the comparator.
+
+    Ticks round a time by up to half of one, with the same variance in all three cameras where noise spreads the phase;
+    so the noise is nearly as large as the charge of a tick.
+    """
+    s = 0.08
+    reset, shot = interval_variances(Sensor(reset_noise=s)), interval_variances(Sensor(photons=s**-2))
+    read = interval_variances(Sensor(read_noise=s))
+    rounding = 2 * 0.1**2 / 12  # of both ends
+    for k in (1, 4, 16):
+        assert reset[k] == pytest.approx(shot[k], rel=0.05)
+        assert reset[k] == pytest.approx(k * s * s + rounding, rel=0.06)
+    assert read[4] == pytest.approx(read[1], rel=0.05) and read[16] == pytest.approx(read[1], rel=0.05)
+    # the first tick in which charge and error exceed the threshold: earlier and less spread than a lone comparison
+    assert 0.5 * s * s < read[1] < 2 * s * s + rounding

@@ -1,0 +1,79 @@
+"""The inner loop of `sensor.model` for a comparator that errs and for a pixel that rests after a spike.
+
+It is a plain loop over pixels, three times slower than `sensor.kernels`; where both effects are off it gives the same
+bits. Charge is 64 bits wide, because an early spike leaves a pixel below zero and a late one above the threshold.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from spike4dgs.benchmark.spikes.bits import kernel
+from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
+from spike4dgs.generators.sensor.kernels import BLOCK, _along, _equal, _prepare, _steady, deviate, mix
+
+READ_SALT = 0x7F4A7C15  # the comparator's random numbers are others than those of the charge
+
+
+@kernel
+def integrate_uneven(
+    window: Any,
+    ticks: Any,
+    tangents: Any,
+    radiance_gain: Any,
+    gain: Any,
+    dark: Any,
+    charge: Any,
+    unit: Any,
+    noise: Any,
+    key: Any,
+    means: Any,
+    read: Any,
+    dead: Any,
+    rest: Any,
+    words: Any,
+    first_block: Any,
+    last_block: Any,
+) -> None:
+    """Fill words[:, first_block:last_block], and advance `charge` and `rest`; see `kernels.integrate`.
+
+    charge [P] int64; `read`: charge units of one step of `deviate` in the comparator, 0 is off; `dead`: ticks after a
+    spike in which a pixel collects nothing; rest [P]: how many of them are left.
+    """
+    w = np.empty(6 * BLOCK, np.float32)
+    increment = np.empty(BLOCK, np.int32)
+    top = np.int64(THRESHOLD)
+    for block in range(first_block, last_block):
+        p = block * BLOCK
+        g = gain[p : p + BLOCK] if len(gain) > BLOCK else gain
+        d = dark[p : p + BLOCK] if len(dark) > BLOCK else dark
+        for s in range(len(ticks) - 1):
+            n = ticks[s + 1] - ticks[s]
+            start = ticks[s] - ticks[0]
+            k0, k1 = window[s][p : p + BLOCK], window[s + 1][p : p + BLOCK]
+            k2, k3 = window[s + 2][p : p + BLOCK], window[s + 3][p : p + BLOCK]
+            constant = means or _equal(k0, k1, k2, k3)
+            if constant:
+                _steady(k1, g, d, radiance_gain, unit, increment)
+            else:
+                weights = tangents[s, 0], tangents[s, 1]
+                _prepare(k0, k1, k2, k3, weights, g, d, np.float32(radiance_gain), np.float32(unit), n, w)
+            for j in range(min(n, len(words) - start)):
+                u = (np.float32(j) + np.float32(0.5)) / np.float32(n)
+                now = mix(np.uint32(np.uint32(ticks[s] + j) ^ key))
+                word = np.uint64(0)
+                for i in range(BLOCK):
+                    if rest[p + i] > 0:
+                        rest[p + i] -= 1
+                        continue
+                    pixel = np.uint32((p + i) * 0x9E3779B1)
+                    c = charge[p + i] + (increment[i] if constant else np.int32(_along(w, i, u)))
+                    shown = c + np.int64(read) * deviate(np.uint32(pixel ^ np.uint32(READ_SALT)), now)
+                    if shown >= top:
+                        word |= np.uint64(1) << np.uint64(i)
+                        c = min(c - (np.int64(unit) + np.int64(noise) * deviate(pixel, now)), top - 1)  # a full well
+                        rest[p + i] = dead
+                    charge[p + i] = c
+                words[start + j, block] = word
