@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,10 +17,10 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.runs.executors import Run, executor
 from spike4dgs.benchmark.scene.cameras import check_lens
-from spike4dgs.benchmark.scene.lens import NAMES, Distortion, make_distortion
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA
 from spike4dgs.benchmark.variants import is_reserved
+from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
 from spike4dgs.generators.render_tasks import cameras_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
@@ -48,9 +47,7 @@ class SceneSettings:
         adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
         sub_ticks: Render instants inside a tick where the motion in one tick is too large.
         whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
-        lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first of them, such as -0.15 0.03.
-            Streams, other recordings and ground truth all show it. The scene's id ends in -lens.
-        lens_spread: Largest share by which a camera's coefficients differ from --lens, such as 0.3; the seed draws it.
+        physics: What differs from ideal cameras and lamps.
     """
 
     profile: str = "small"
@@ -63,8 +60,7 @@ class SceneSettings:
     adaptive_keys: bool = True
     sub_ticks: bool = True
     whole_frames: bool = False
-    lens: tuple[float, ...] = ()
-    lens_spread: float = 0.0
+    physics: PhysicsOptions = NO_OPTIONS
 
     def job(self, world: str) -> Job:
         """Return the scene of a world. Raises UserError for unknown names and impossible numbers."""
@@ -96,8 +92,7 @@ class SceneSettings:
             adaptive=self.adaptive_keys,
             sub_ticks=self.sub_ticks,
             whole_frames=self.whole_frames,
-            lens=_check_lens(self.lens, self.lens_spread),
-            lens_spread=self.lens_spread,
+            physics=self.physics.physics(),
         )
 
 
@@ -119,8 +114,9 @@ def make_dataset(
     differs by more than noise.
     """
     console = Console(highlight=False, soft_wrap=True)
-    if audit and any(job.lens for job in jobs):
-        raise problem("--audit", "pinhole cameras, which Mitsuba's own sensor can be", "--lens", "leave one out")
+    if audit and any(p.lens or p.psf_px or p.flicker for p in (job.physics for job in jobs)):
+        fix = "audit the scene of --camera ideal, whose rendering is the same"
+        raise problem("--audit", "pinholes in steady light, as Mitsuba's own sensor", "a lens, blur or flicker", fix)
     for variant in {job.variant: None for job in jobs if is_reserved(job.variant)}:
         console.print(f"variant {variant} is kept for hidden seasons: train nothing on it, and enter no scores of it")
     references = find_references(check, [job.id for job in jobs]) if check else {}
@@ -131,10 +127,10 @@ def make_dataset(
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     if todo:
         chosen = pick_variant()  # fails here, before anything is written, if it cannot render
-        for job in (job for job in todo if job.lens):
+        for job in (job for job in todo if job.physics.lens or job.physics.psf_px):
             if chosen.startswith("scalar"):
                 fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
-                raise problem("--lens", "Mitsuba's LLVM or CUDA variant", chosen, fix)
+                raise problem("--lens and --psf-px", "Mitsuba's LLVM or CUDA variant", chosen, fix)
             for camera in cameras_of(job):
                 check_lens(camera, "--lens")
     with executor(workers, scheduler) as run:
@@ -159,17 +155,6 @@ def _make(job: Job, out: Path, run: Run, with_audit: bool, console: Any, which: 
     plan = {"spacings_ticks": list(maker.plan.chain), "sub_ticks": maker.plan.sub_ticks, "keys": len(maker.plan.ticks)}
     write_json(out / f"{job.id}.report.json", report | {"plan": plan, "audit": maker.audit})
     console.print(f"{job.id}: {total:.0f} s, written to {folder}", markup=False)
-
-
-def _check_lens(coefficients: tuple[float, ...], spread: float) -> Distortion:
-    """Return the five coefficients of a lens, none for a pinhole. Raises UserError for what is no lens."""
-    if len(coefficients) > len(NAMES) or not all(map(math.isfinite, coefficients)):
-        raise problem("--lens", f"at most {len(NAMES)} numbers: {', '.join(NAMES)}", str(coefficients), "correct it")
-    if not 0 <= spread < 1:
-        raise problem("--lens-spread", "a share from 0 to below 1", f"{spread:g}", "correct it")
-    if spread and not coefficients:
-        raise problem("--lens-spread", "the mean lens, --lens", "none", "give both, or leave both out")
-    return make_distortion(coefficients)
 
 
 def _is_done(job: Job, out: Path, replace: bool) -> bool:

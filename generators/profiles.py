@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from spike4dgs.benchmark.scene.lens import Distortion
+import numpy as np
+
+from spike4dgs.generators.physics import Physics
+from spike4dgs.generators.sensor.light import Flicker
 
 RATE_HZ = 20_000
 TARGET_EVERY = RATE_HZ // 1000  # ticks between ground-truth frames: 1 ms
@@ -51,23 +54,34 @@ class Job:
     adaptive: bool = True  # False: every pixel that changes, at every tick
     sub_ticks: bool = True  # False: never render instants inside a tick
     whole_frames: bool = False  # True: every pixel of every key
-    lens: Distortion = ()  # of every camera, or their mean
-    lens_spread: float = 0.0  # largest share by which a camera's coefficients differ from it
+    physics: Physics = Physics()
     noise: int = 0  # another number gives the rendering other noise, and changes nothing else
 
     @property
     def id(self) -> str:
         """Id such as `car-0-small`; with a length that is not the profile's, such as `car-0-paper-500ms`.
 
-        With a lens it ends in `-lens`.
+        What is not ideal in its physics follows, such as `-lens`.
         """
         length = "" if self.seconds == self.profile.seconds else f"-{self.seconds * 1000:g}ms"
-        return f"{self.world}-{self.variant}-{self.profile_name}{length}" + ("-lens" if self.lens else "")
+        return f"{self.world}-{self.variant}-{self.profile_name}{length}{self.physics.suffix}"
 
     @property
     def render_seed(self) -> int:
         """Seed of the rendering's random numbers; ground truth uses the next one."""
         return self.seed + 1000 * self.noise
+
+    @property
+    def flicker(self) -> Flicker | None:
+        """The flicker of the world's light, at a phase that the seed draws; None in steady light."""
+        if not (p := self.physics).flicker:
+            return None
+        phase = np.random.default_rng([self.seed, self.variant, *f"{self.world} flicker".encode()]).uniform()
+        return Flicker(p.flicker, p.flicker_hz / RATE_HZ, float(phase), p.flicker_duty)
+
+    def light_at(self, tick: int) -> float:
+        """Return the factor of the world's light at the start of a tick: 1 in steady light."""
+        return self.flicker.at(tick) if self.flicker else 1.0
 
     @property
     def n_ticks(self) -> int:
@@ -92,8 +106,7 @@ class Job:
             "adaptive_keys": self.adaptive,
             "sub_ticks": self.sub_ticks,
             "whole_frames": self.whole_frames,
-            **({"lens": list(self.lens)} if self.lens else {}),
-            **({"lens_spread": self.lens_spread} if self.lens_spread else {}),
+            **({"physics": changed} if (changed := self.physics.settings) else {}),
             **({"noise": self.noise} if self.noise else {}),
         }
 

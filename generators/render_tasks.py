@@ -8,7 +8,7 @@ needs no common file system.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.lens import Distortion
+from spike4dgs.generators.physics import from_settings, true_cameras
 from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
@@ -33,7 +33,7 @@ def recorded_job(source: Mapping[str, Any]) -> Job | None:
     """
     if source["kind"] != "mitsuba" or source["world"] not in WORLDS:
         return None
-    same = ("gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "lens_spread", "noise")
+    same = ("gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "noise")
     return Job(
         source["world"],
         source["variant"],
@@ -42,7 +42,7 @@ def recorded_job(source: Mapping[str, Any]) -> Job | None:
         Profile(**{**source["sampling"], "views": tuple(source["sampling"]["views"])}),
         source["seconds"],
         adaptive=source.get("adaptive_keys", True),
-        lens=tuple(source.get("lens", ())),
+        physics=from_settings(source.get("physics", {})),
         **{name: source[name] for name in same if name in source},
     )
 
@@ -55,16 +55,9 @@ def world_of(job: Job) -> WorldScene:
 
 @lru_cache(maxsize=1)
 def cameras_of(job: Job) -> tuple[Camera, ...]:
-    """Return the cameras of a job's profile, each with its own lens where lenses differ."""
+    """Return the true cameras of a job's profile, each with its own lens where lenses differ."""
     p = job.profile
-    rig = cameras(world_of(job), p.width, p.height, p.views)
-    return tuple(replace(c, distortion=_lens_of(job, view)) for c, view in zip(rig, p.views, strict=True))
-
-
-def _lens_of(job: Job, view: int) -> Distortion:
-    """Return the lens of a camera: the job's, stronger or weaker by a share that the seed draws."""
-    share = np.random.default_rng([job.seed, view, *b"lens"]).uniform(-1, 1) * job.lens_spread
-    return tuple(k * (1 + float(share)) for k in job.lens)
+    return true_cameras(cameras(world_of(job), p.width, p.height, p.views), p.views, job.physics, job.seed)
 
 
 @lru_cache(maxsize=1)
@@ -113,6 +106,7 @@ class RenderStatic(_Task):
             seed=self.job.render_seed,
             spp=p.spp,
             background_spp=p.background_spp,
+            psf_px=self.job.physics.psf_px,
         )
         first = _target_renderer(self.job, cameras_of(self.job), None).static_on(renderer.static.background).first
         return StaticParts(renderer.static, first, _surface_points(renderer))
@@ -135,6 +129,7 @@ class RenderKeys(_Task):
             background_spp=p.background_spp,
             static=self.static,
             whole_frames=job.whole_frames,
+            psf_px=job.physics.psf_px,
         )
 
     def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
@@ -193,6 +188,7 @@ def _target_renderer(job: Job, views: Sequence[Camera], static: StaticViews | No
         background_spp=background_spp,
         color=True,
         static=static,
+        psf_px=job.physics.psf_px,
     )
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, writing
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import standard_splits
@@ -33,6 +33,7 @@ from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import render_tasks, streams
+from spike4dgs.generators.physics import given_cameras
 from spike4dgs.generators.previews import contact_sheet, preview
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
@@ -194,7 +195,8 @@ class Maker:
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
                     if target in missing:
-                        write_truth(self._scene, target, truth, ground, partial(light_range, truth.view))
+                        light = self.job.light_at(truth.tick)
+                        write_truth(self._scene, target, truth, ground, partial(light_range, truth.view), light)
                         yield target
 
         for _ in self.watch("ground truth", truths(), len(missing)):
@@ -210,6 +212,9 @@ class Maker:
             part.unlink()
         job, held_out = self.job, self.cameras[render_tasks.held_out_view(self.job)].id
         splits = standard_splits(self.cameras, held_out)
+        cameras = given_cameras(self.cameras, held_out, job.physics, [job.seed, job.variant, *job.world.encode()])
+        if job.physics.moves_poses:
+            write_json(self._scene / "truth/cameras.json", {c.id: to_nerfstudio(c) for c in self.cameras})
         scored = {c for split in splits.values() for c in split.test}
         finish_scene(
             self._scene,
@@ -217,7 +222,7 @@ class Maker:
                 id=job.id,
                 title=f"{WORLDS[job.world].title} (variant {job.variant})",
                 licence=LICENCE,
-                cameras=self.cameras,
+                cameras=cameras,
                 train=splits["center"].train,
                 test=splits["center"].test,
                 splits=splits,

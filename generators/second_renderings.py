@@ -32,7 +32,12 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
     for seed in _SEEDS:
         renderer = MultiViewRenderer(
-            world_of(job), [camera], seed=job.seed + seed, spp=profile.target_spp, background_spp=profile.target_spp
+            world_of(job),
+            [camera],
+            seed=job.seed + seed,
+            spp=profile.target_spp,
+            background_spp=profile.target_spp,
+            psf_px=job.physics.psf_px,
         )
-        images.append(renderer.crn_frames(target.tick / RATE_HZ)[0])
+        images.append(renderer.crn_frames(target.tick / RATE_HZ)[0] * np.float32(job.light_at(target.tick)))
     return target, images[0], images[1]

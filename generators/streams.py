@@ -5,8 +5,11 @@ One call writes all recordings of one camera, the spikes last.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
@@ -18,11 +21,13 @@ from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, THRESHOLD, events, exposures
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
-from spike4dgs.generators.rendering.keyframes import KeyStore
+from spike4dgs.generators.rendering.keyframes import Clip, KeyStore
 from spike4dgs.generators.sensor import calibration as calibration
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.light import FlickeringInstants, FlickeringMeans
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
+_OF_SENSOR = ("psf_px", "warming_k", "reset_noise", "read_noise", "dead_ticks")  # of the physics, where they are on
 CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
 
 
@@ -34,28 +39,43 @@ def is_done(scene: Path, camera: Camera) -> bool:
 def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: int, plan: KeyPlan) -> None:
     """Write truth maps, calibration recordings, conventional frames, events and spikes of one camera."""
     sensor = sensor_of(job, camera)
+    warm = sensor if sensor.dark is None else replace(sensor, dark=sensor.dark * np.float32(job.physics.dark_factor))
     size, entropy = (camera.height, camera.width), [job.seed, job.variant, *f"{job.world} {camera.id}".encode()]
     write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
-    instants = store.instants(view, plan)
+    instants, clip = _lit(job, store, view, plan)
     for tick, image in exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
         write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(image))
-    found = events(store.instants(view, plan).keys, instants.ticks, job.n_ticks, RATE_HZ)
+    found = events(_lit(job, store, view, plan)[0].keys, instants.ticks, job.n_ticks, RATE_HZ)
     write_events(scene / f"events/{camera.id}.npz", found)
-    clip, charge = store.view(view, plan), random_charge(*size, entropy)
+    charge = random_charge(*size, entropy)
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
-        for packed in simulate(clip.keys, clip.ticks, job.n_ticks, sensor, charge, means=clip.means):
+        for packed in simulate(clip.keys, clip.ticks, job.n_ticks, warm, charge, means=clip.means):
             writer.write(packed)
 
 
+def _lit(job: Job, store: KeyStore, view: int, plan: KeyPlan) -> tuple[Clip, Clip]:
+    """Return the radiance of a view at instants, and as the simulator takes it, in the light that the world has."""
+    instants, clip, light = store.instants(view, plan), store.view(view, plan), job.flicker
+    if light is None:
+        return instants, clip
+    n, means = job.n_ticks, clip.keys if clip.means else None
+    dense = FlickeringInstants(store.at(view, plan), n, light)
+    every = list(range(n + 1))
+    return Clip(dense, every), Clip(FlickeringMeans(store.at(view, plan), n, light, means), every[:-1], True)
+
+
 def sensor_of(job: Job, camera: Camera) -> Sensor:
-    """Return a camera's sensor; its maps belong to the camera, not to the world."""
+    """Return a camera's sensor as it is calibrated; its maps belong to the camera, not to the world."""
     pixels = camera.height, camera.width, job.seed, camera.id
     return Sensor(
         gain=gain_map(*pixels) if job.gain_map else None,
         dark=dark_map(*pixels) if job.dark_map else None,
         photons=SENSOR.photons_per_spike if job.shot_noise else None,
         noise_seed=(job.seed, job.variant, *f"{job.world} {camera.id} photons".encode()),
+        reset_noise=job.physics.reset_noise,
+        read_noise=job.physics.read_noise,
+        dead_ticks=job.physics.dead_ticks,
     )
 
 
@@ -70,6 +90,7 @@ def sensor_facts(job: Job) -> dict[str, Any]:
         "gain_map": job.gain_map,
         "dark_map": job.dark_map,
         "photons_per_spike": SENSOR.photons_per_spike if job.shot_noise else None,
+        **{name: value for name, value in job.physics.settings.items() if name in _OF_SENSOR},
     }
 
 

@@ -40,13 +40,15 @@ def write_truth(
     truth: Truth,
     background: NDArray[np.float32],
     light_range: Callable[[], tuple[NDArray[np.float32], NDArray[np.float32]]],
+    light: float = 1.0,
 ) -> None:
     """Write image, geometry and mask of one target. `background` [H, W] is the gray background of its camera.
 
-    `light_range` returns the smallest and largest radiance [H, W] of each pixel over the clip.
+    `light_range` returns the smallest and largest radiance [H, W] of each pixel over the clip, in steady light; `light`
+    is the factor of flickering light at this instant.
     """
     t_us = target.tick * 1e6 / RATE_HZ
-    write_exr(scene / f"images/{target.name}.exr", truth.rgb, t_us)
+    write_exr(scene / f"images/{target.name}.exr", truth.rgb * np.float32(light), t_us)
     write_geometry(scene / f"geometry/{target.name}.exr", truth.depth, truth.ids, truth.flow, t_us)
     low, high = light_range()
     varies = high - low > _MASK_CHANGE * high

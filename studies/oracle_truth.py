@@ -130,6 +130,7 @@ class WorldTruth:
             spp=samples,
             background_spp=background,
             static=static,
+            psf_px=self.job.physics.psf_px,
         )
 
     def maps(self) -> Arrays:

@@ -14,7 +14,8 @@ their noise from key to key, and a list of pixels traced alone equals the same p
 Traced pixels that see only the shadow of a moving surface get the background plus the *difference* of two such
 renderings: the low noise of the background remains, and there is no step at the edge of the traced region.
 
-This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area), or denoise.
+This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area, after the optics'
+blur where there is one), or denoise.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class MultiViewRenderer(Visibility):
         color: bool = False,
         static: StaticViews | None = None,
         whole_frames: bool = False,
+        psf_px: float = 0.0,
     ) -> None:
         """Load the world into Mitsuba (about a second). Raises UserError for numbers of samples that do not fit.
 
@@ -97,6 +99,7 @@ class MultiViewRenderer(Visibility):
             color: images are linear RGB, [C, H, W, 3].
             static: `static` of a renderer with the same arguments; if None, it is rendered when needed.
             whole_frames: trace every pixel of every key: slow and exact.
+            psf_px: standard deviation of the optics' blur, a Gaussian, before the pixel's box; 0 is off.
         """
         for name, value in (("spp", spp), ("background_spp", background_spp)):
             if value < 1 or value & (value - 1):
@@ -106,7 +109,7 @@ class MultiViewRenderer(Visibility):
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise problem("cameras", "one resolution for all", "several or none", "render them apart")
         scene = mitsuba_scene(world)
-        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
+        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed, psf_px))
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
         self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
@@ -253,12 +256,18 @@ class MultiViewRenderer(Visibility):
         return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
 
 
-def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int) -> Any:
-    """Return the tracer for the process's variant. Imports are here because the modules need the variant to be set."""
+def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int, psf_px: float = 0.0) -> Any:
+    """Return the tracer for the process's variant. Imports are here because the modules need the variant to be set.
+
+    Raises UserError for a blur where the variant cannot render it.
+    """
     if load_mitsuba().variant().startswith("scalar"):
+        if psf_px:
+            fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
+            raise problem("--psf-px", "Mitsuba's LLVM or CUDA variant", "the scalar variant", fix)
         from spike4dgs.generators.rendering.scalar_tiles import TileTracer
 
         return TileTracer(scene, cameras, seed, MAX_DEPTH)
     from spike4dgs.generators.rendering.wavefront import WavefrontTracer
 
-    return WavefrontTracer(scene, cameras, seed, MAX_DEPTH)
+    return WavefrontTracer(scene, cameras, seed, MAX_DEPTH, psf_px)

@@ -11,12 +11,33 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.special import ndtr
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
 
 _LENS_STEPS = 6  # of Newton's method: enough for float32 where a lens moves a pixel by a fifth of the image
+_QUANTILES = 4096  # of a blurred pixel's footprint: its variance is right to 1e-3
 _LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
+
+
+def footprint_quantiles(psf_px: float) -> np.ndarray:
+    """Return the quantiles [_QUANTILES + 1] of a point of a pixel, px from its centre along one axis.
+
+    The point is uniform in the pixel plus Gaussian with the standard deviation `psf_px`: samples at such points are the
+    blurred image's mean over the pixel, and one number for each axis keeps them stratified. With z = x / psf_px, its
+    distribution is psf_px (g(x + 1/2) - g(x - 1/2)), g = z Phi(z) + phi(z).
+    """
+    reach = 0.5 + 6 * psf_px
+    x = np.linspace(-reach, reach, 1 << 16)
+
+    def g(at: np.ndarray) -> np.ndarray:
+        z = at / psf_px
+        return z * ndtr(z) + np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
+
+    shares = (np.arange(_QUANTILES + 1)) / _QUANTILES
+    shares[[0, -1]] = 0.25 / _QUANTILES, 1 - 0.25 / _QUANTILES  # the tails beyond are cut
+    return np.interp(shares, psf_px * (g(x + 0.5) - g(x - 0.5)), x)
 
 
 class PixelSampler(mi.Sampler):  # type: ignore[misc]
@@ -86,7 +107,10 @@ def _shuffle(i: mi.UInt32, n: int, salt: mi.UInt32) -> mi.UInt32:
 class WavefrontTracer:
     """Traces pixels of several views at once. Pixels are flat numbers: (view * height + row) * width + column."""
 
-    def __init__(self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int) -> None:
+    def __init__(
+        self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int, psf_px: float = 0.0
+    ) -> None:
+        self._footprint = mi.Float(footprint_quantiles(psf_px)) if psf_px else None
         self._scene, self._seed = scene, seed
         self._width, self._height = cameras[0].width, cameras[0].height
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
@@ -126,11 +150,20 @@ class WavefrontTracer:
         key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self._keys, view))) + salt)
         sampler = PixelSampler(key, index, spp)
         offset = sampler.next_2d()
+        if self._footprint is not None:
+            offset = mi.Point2f(self._blurred(offset.x), self._blurred(offset.y))
         ray = self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
         scene = self._scene.full if moving else self._scene.empty
         radiance, _, _ = self._integrator.sample(scene, sampler, ray)
         dr.eval(radiance)  # the path kernel writes one colour per sample; the reductions below read it
         return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in radiance], 1) / np.float32(spp)
+
+    def _blurred(self, u: mi.Float) -> mi.Float:
+        """Return the place in a blurred pixel, px from its left or upper edge, of numbers in [0, 1): one each way."""
+        at = u * _QUANTILES
+        first = mi.UInt32(at)
+        low, high = (dr.gather(mi.Float, self._footprint, first + k) for k in (0, 1))
+        return 0.5 + low + (high - low) * (at - mi.Float(first))
 
     def _ray(self, view: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.RayDifferential3f:
         def number(k: int) -> mi.Float:

@@ -8,6 +8,7 @@ A camera keeps its maps: they depend on the seed, the camera and the resolution,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Seq
         keys = [np.full((camera.height, camera.width), radiance, np.float32)] * 2
         charge = random_charge(camera.height, camera.width, [*entropy, *name.encode()])
         noise = (*sensor.noise_seed, *name.encode())
-        same = Sensor(sensor.radiance_gain, sensor.gain, sensor.dark, sensor.photons, noise)
+        same = replace(sensor, noise_seed=noise)
         with SpikeWriter(folder / name / f"{camera.id}.dat", camera.width, camera.height) as writer:
             for packed in simulate(keys, [0, n_ticks], n_ticks, same, charge):
                 writer.write(packed)

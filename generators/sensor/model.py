@@ -13,13 +13,13 @@ sum of k independent Gamma(N) / N variables, exactly, whatever the light does; s
 each spike, not for each tick: a spike takes the charge 1 + g / sqrt(N) instead of 1, with g from a sum of four bytes
 (mean 0, variance 1, excess kurtosis -0.3, |g| < 3.46) where Gamma's is Gaussian up to a skewness of 2 / sqrt(N). g is a
 hash of (seed, pixel, tick), so it does not depend on batches or threads. The limit to a tick's charge is then not 1 but
-the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick. Reset noise,
-the sampled noise kTC of the charge that a reset takes, is another term of the same g: 1 / N + reset_noise^2.
+the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick. Reset noise
+(kTC) is the random part of the charge that a reset takes: the variance of a spike's charge is 1 / N + reset_noise^2.
 
-Two effects are off by default and have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every
-tick it sees the charge plus read_noise times such a g, so a spike comes early or late, but the charge that a spike takes
-stays 1 and the error does not add up. A pixel with dead ticks collects no light in so many ticks after each spike, so a
-rate r becomes r / (1 + r dead_ticks), and its light follows the interval minus the dead ticks.
+Two effects have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every tick it sees the
+charge plus read_noise times such a g, so a spike comes early or late, but the charge that a spike takes stays 1 and the
+error does not add up. With dead ticks a pixel collects no light in so many ticks after each spike, so a rate r becomes
+r / (1 + r dead_ticks), and light is proportional to 1 / (interval - dead_ticks).
 
 Radiance between keys is a cubic Hermite (Catmull-Rom) curve: the tangent at a key is the slope between its neighbours,
 in the first and last interval the slope of that interval itself. With p0..p3 the keys around the interval from p1 to p2

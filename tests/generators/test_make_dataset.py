@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.make_dataset import make_dataset as command
 from spike4dgs.generators import scene_maker
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
+from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.scene_maker import Maker
 
@@ -177,12 +178,16 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
         ("car", {"seconds": float("nan")}, "--seconds"),
         ("car", {"seed": -1}, "--seed"),
         ("car", {"variant": -1}, "--seed and --variant"),
-        ("car", {"lens": (0.1,) * 6}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
-        ("car", {"lens": (float("nan"),)}, "--lens"),
-        ("car", {"lens": (-0.1,), "audit": True}, "--audit: expected pinhole cameras"),
-        ("car", {"lens": (-9.0,)}, "whose model holds up to the image's corners"),
-        ("car", {"lens": (-0.1,), "lens_spread": 1.0}, "--lens-spread: expected a share from 0 to below 1"),
-        ("car", {"lens_spread": 0.2}, "--lens-spread: expected the mean lens"),
+        ("car", {"physics": PhysicsOptions(lens=(0.1,) * 6)}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
+        ("car", {"physics": PhysicsOptions(lens=(float("nan"),))}, "--lens"),
+        ("car", {"physics": PhysicsOptions(lens=(-0.1,)), "audit": True}, "--audit: expected pinholes in steady light"),
+        ("car", {"physics": PhysicsOptions(lens=(-9.0,))}, "whose model holds up to the image's corners"),
+        (
+            "car",
+            {"physics": PhysicsOptions(lens=(-0.1,), lens_spread=1.0)},
+            "--lens-spread: expected a share from 0 to below 1",
+        ),
+        ("car", {"physics": PhysicsOptions(lens_spread=0.2)}, "--lens-spread: expected the mean lens"),
     ],
 )
 def test_bad_arguments_are_one_line(world, options, words, tmp_path):

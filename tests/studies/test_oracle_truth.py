@@ -15,6 +15,7 @@ from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.untrusted import read_npz
+from spike4dgs.generators.physics import Physics
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.render_tasks import recorded_job
 from spike4dgs.studies.oracle_truth import Truth, find_truth
@@ -40,10 +41,10 @@ def truth(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Truth:
 
 
 def test_a_scene_records_the_job_that_made_it() -> None:
-    lens = (-0.1, 0.0, 0.0, 0.0, 0.0)
+    physics = Physics(lens=(-0.1, 0.0, 0.0, 0.0, 0.0), lens_spread=0.3, flicker=0.08, dead_ticks=1)
     for job in (
         Job("car", 0, 0, "tiny", PROFILES["tiny"], 0.004),
-        Job("van", 3, 2**70, "small", PROFILES["small"], 0.5, False, False, False, False, False, True, lens, 0.3, 2),
+        Job("van", 3, 2**70, "small", PROFILES["small"], 0.5, False, False, False, False, False, True, physics, 2),
     ):
         assert recorded_job(json.loads(json.dumps(job.settings))) == job
     assert recorded_job({"kind": "mitsuba", "world": "nowhere"}) is None

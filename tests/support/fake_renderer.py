@@ -33,7 +33,7 @@ def render_fakes(monkeypatch):
 class FakeRenderer:
     """Images without Mitsuba: a bright square over noise, to the right with time."""
 
-    def __init__(self, world, cameras, *, seed, spp, background_spp, color=False, static=None, whole_frames=False):
+    def __init__(self, world, cameras, *, seed, spp, background_spp, color=False, static=None, **_options):
         self.cameras, self.color = tuple(cameras), color
         self.shape = (len(cameras), cameras[0].height, cameras[0].width)
         noise = [

@@ -13,10 +13,12 @@ import pytest
 from matplotlib.path import Path
 from scipy.ndimage import binary_erosion as erode
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
+from scipy.stats import norm
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray as gray_of
 from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import MultiViewRenderer, make_tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, Deforming, Part, WorldScene
@@ -199,6 +201,41 @@ def test_cameras_of_two_sizes_are_refused():
     both = [*cameras(world("car"), 8, 5, (4,)), *cameras(world("car"), 16, 10, (4,))]
     with pytest.raises(UserError, match="resolution"):
         MultiViewRenderer(world("car"), both, seed=0, spp=16, background_spp=16)
+
+
+@pytest.mark.parametrize("sigma", [0.2, 0.5, 0.8])
+def test_a_blurred_pixels_footprint_is_a_box_and_a_gaussian(sigma):
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("the scalar variant has no blur")
+    from spike4dgs.generators.rendering.wavefront import footprint_quantiles
+
+    x = footprint_quantiles(sigma)
+    assert x == pytest.approx(-x[::-1], abs=1e-6) and (np.diff(x) > 0).all()
+    middle = (x[1:] + x[:-1]) / 2
+    assert np.mean(middle**2) == pytest.approx(1 / 12 + sigma**2, rel=2e-3)
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, 400_000)
+    for edge in (-0.7, 0.0, 0.4, 1.1):  # the response to an edge, by another way
+        assert np.mean(middle < edge) == pytest.approx(norm.cdf((edge - inside) / sigma).mean(), abs=2e-3)
+
+
+def test_a_blur_is_that_of_the_radiance_and_keeps_its_sum():
+    """Against a rendering with eight times the pixels, filtered by SciPy."""
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("the scalar variant has no blur")
+    sigma, fine = 0.6, 8
+    w = world("turntable")
+
+    def whole(width, height, spp, **options):
+        r = MultiViewRenderer(w, cameras(w, width, height, (4,)), seed=0, spp=spp, background_spp=spp, **options)
+        return r.crn_frames(0.0)[0].astype(np.float64)
+
+    blurred, sharp = whole(64, 40, 256, psf_px=sigma), whole(64, 40, 256)
+    large = gaussian_filter(whole(64 * fine, 40 * fine, 16), sigma * fine, mode="nearest")
+    expected = large.reshape(40, fine, 64, fine).mean((1, 3))
+    inside = np.s_[3:-3, 3:-3]  # beyond the image's edge only the renderer sees
+    assert np.abs(sharp - expected)[inside].mean() > 0.01
+    assert np.abs(blurred - expected)[inside].mean() < 0.002
+    assert blurred[inside].mean() == pytest.approx(expected[inside].mean(), rel=2e-3)
 
 
 def test_rays_go_through_the_lens():

@@ -1,0 +1,230 @@
+"""What real cameras and lamps have and ideal ones lack: each an option of `make-dataset`, each off at no cost.
+
+Two cameras have names. `ideal` is a pinhole in steady light with a calibration of the same minute. `realistic` has a
+lens, a blur and a drift with these sources:
+
+- lens, spread, principal point: the two cameras of the EuRoC MAV dataset's VI-sensor (Burri et al. 2016, sensor.yaml):
+  k1 -0.2834 and -0.2837, k2 0.0740 and 0.0745, 752 x 480 px, principal points 8.8 and -4.0 px left and 8.4 and 15.2 px
+  below the middle: 10 px RMS or 0.013 of the width. The tangential coefficients, below 0.0002, are left out.
+- blur: a Gaussian of 0.5 px and the pixel's box give half contrast at 0.32 cycles per pixel, a lens in focus; without
+  blur it is 0.60, which no lens reaches with pixels that its resolution suits.
+- drift: the sensor is 8 K warmer in the clip than when it was calibrated, which doubles its dark rate (`DOUBLING_K`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.lens import NAMES, Distortion, make_distortion
+
+# Literature has doublings every 5 to 8 K near room temperature (A. Theuwissen, harvestimaging.com, September 2009).
+# Silicon's band gap gives 4.5 K where dark current comes by diffusion and 9.0 K where it is generated in depletion.
+DOUBLING_K = 8.0
+MOST_PSF_PX = 0.8  # moving objects are traced 3 px around: three standard deviations and half a pixel
+_MOST_NOISE = 0.2  # thresholds
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Deviations of the cameras and the light from ideal ones; each is off by default.
+
+    Attributes:
+        lens: distortion of every camera, or their mean.
+        lens_spread: largest share by which a camera's coefficients differ from it.
+        principal_point: standard deviation of a camera's principal point from the middle, each way, in image widths.
+        pose_noise_deg, pose_noise_m: standard deviations, each axis, of the poses that methods are given from the true
+            ones. The held-out camera of the default split keeps its true pose: it is the question, not a measurement.
+        psf_px: standard deviation of the optics' blur, a Gaussian, before the pixel's box.
+        flicker: (highest - lowest) / (highest + lowest) light; 1 is off in between.
+        flicker_hz: frequency of the flicker, twice that of the mains.
+        flicker_duty: share of a period in which an LED is on; 0 is a sine.
+        warming_k: temperature of the sensors in the clip above that at calibration.
+        reset_noise, read_noise, dead_ticks: see `sensor.model.Sensor`.
+    """
+
+    lens: Distortion = ()
+    lens_spread: float = 0.0
+    principal_point: float = 0.0
+    pose_noise_deg: float = 0.0
+    pose_noise_m: float = 0.0
+    psf_px: float = 0.0
+    flicker: float = 0.0
+    flicker_hz: float = 100.0
+    flicker_duty: float = 0.0
+    warming_k: float = 0.0
+    reset_noise: float = 0.0
+    read_noise: float = 0.0
+    dead_ticks: int = 0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The values that are not the default ones, for `source.physics` of scene.json."""
+        changed = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in changed.items()}
+
+    @property
+    def suffix(self) -> str:
+        """The end of a scene's id: what is on, such as `-lens-psf`, or the name of the camera."""
+        for name, camera in CAMERAS.items():
+            if self == camera:
+                return "" if name == IDEAL else f"-{name}"
+        return "".join(f"-{word}" for name, word in _WORDS.items() if getattr(self, name))
+
+    @property
+    def dark_factor(self) -> float:
+        """Dark rate in the clip, in units of that at calibration."""
+        return float(2 ** (self.warming_k / DOUBLING_K))
+
+    @property
+    def moves_poses(self) -> bool:
+        """True where methods are given other poses than the true ones."""
+        return self.pose_noise_deg > 0 or self.pose_noise_m > 0
+
+
+_WORDS = {
+    "lens": "lens",
+    "principal_point": "centers",
+    "pose_noise_deg": "turned",
+    "pose_noise_m": "moved",
+    "psf_px": "psf",
+    "flicker": "flicker",
+    "warming_k": "warm",
+    "reset_noise": "reset",
+    "read_noise": "read",
+    "dead_ticks": "dead",
+}
+IDEAL, REALISTIC = "ideal", "realistic"
+CAMERAS = {
+    IDEAL: Physics(),
+    REALISTIC: Physics(
+        lens=make_distortion((-0.2835, 0.0742)), lens_spread=0.003, principal_point=0.013, psf_px=0.5, warming_k=8.0
+    ),
+}
+
+
+@dataclass(frozen=True)
+class PhysicsOptions:
+    """What differs from ideal cameras and lamps. What is left out is that of --camera.
+
+    Args:
+        camera: ideal: pinholes, steady light, a calibration of the same minute. realistic: a lens, principal points,
+            blur and a warmer sensor as published for real cameras; the scene's id ends in -realistic.
+        lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first of them, such as -0.15 0.03;
+            0 is none. Streams, other recordings and ground truth all show it. The scene's id ends in -lens; each of the
+            options below adds its own word.
+        lens_spread: Largest share by which a camera's coefficients differ from --lens, such as 0.3; the seed draws it.
+        principal_point: Standard deviation of the principal points from the middle, in image widths, such as 0.013.
+        pose_noise_deg: Standard deviation, in degrees about each axis, of the poses that methods are given.
+        pose_noise_m: Standard deviation, in metres along each axis, of the camera centres that methods are given.
+        psf_px: Standard deviation of the optics' blur in px, a Gaussian, at most 0.8; in streams and in ground truth.
+        flicker: Depth of the light's flicker, (highest - lowest) / (highest + lowest), such as 0.08.
+        flicker_hz: Frequency of the flicker: 100 where the mains have 50 Hz.
+        flicker_duty: Share of a period in which a dimmed LED is on; 0 is a sine.
+        warming_k: Kelvin by which the sensors are warmer in the clip than at calibration; 8 doubles the dark rate.
+        reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
+        read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
+        dead_ticks: Ticks after a spike in which a pixel collects no light; 1 in a published calibration.
+    """
+
+    camera: str = IDEAL
+    lens: tuple[float, ...] = ()
+    lens_spread: float | None = None
+    principal_point: float | None = None
+    pose_noise_deg: float | None = None
+    pose_noise_m: float | None = None
+    psf_px: float | None = None
+    flicker: float | None = None
+    flicker_hz: float | None = None
+    flicker_duty: float | None = None
+    warming_k: float | None = None
+    reset_noise: float | None = None
+    read_noise: float | None = None
+    dead_ticks: int | None = None
+
+    def physics(self) -> Physics:
+        """Return the physics. Raises UserError for an unknown camera and for numbers that no camera has."""
+        if self.camera not in CAMERAS:
+            raise problem("--camera", f"one of {', '.join(CAMERAS)}", repr(self.camera), "correct the name")
+        if len(self.lens) > len(NAMES) or not all(map(math.isfinite, self.lens)):
+            raise problem("--lens", f"at most {len(NAMES)} numbers: {', '.join(NAMES)}", str(self.lens), "correct it")
+        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("camera", "lens")}
+        changed: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        if self.lens:
+            changed["lens"] = make_distortion(self.lens)
+        found = replace(CAMERAS[self.camera], **changed)
+        if found.lens_spread and not found.lens:
+            if self.lens_spread:
+                raise problem("--lens-spread", "the mean lens, --lens", "none", "give both, or leave both out")
+            found = replace(found, lens_spread=0.0)
+        _check(found)
+        return found
+
+
+NO_OPTIONS = PhysicsOptions()
+
+_RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
+    "lens_spread": ("a share from 0 to below 1", 0, 0.999),
+    "principal_point": ("a share of the image's width from 0 to 0.2", 0, 0.2),
+    "pose_noise_deg": ("degrees from 0 to 5", 0, 5),
+    "pose_noise_m": ("metres from 0 to 1", 0, 1),
+    "psf_px": (f"px from 0 to {MOST_PSF_PX}", 0, MOST_PSF_PX),
+    "flicker": ("a depth from 0 to 1", 0, 1),
+    "flicker_hz": ("Hz from 1 to 100000", 1, 1e5),
+    "flicker_duty": ("0, or a share below 1", 0, 0.999),
+    "warming_k": ("kelvin from -50 to 50", -50, 50),
+    "reset_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
+    "read_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
+    "dead_ticks": ("ticks from 0 to 100", 0, 100),
+}
+
+
+def _check(physics: Physics) -> None:
+    for name, (expected, least, most) in _RANGES.items():
+        value = getattr(physics, name)
+        if not least <= value <= most:
+            raise problem(f"--{name.replace('_', '-')}", expected, f"{value:g}", "correct it")
+
+
+def from_settings(settings: Mapping[str, Any]) -> Physics:
+    """Return the physics of `Physics.settings`."""
+    return Physics(**{name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()})
+
+
+def true_cameras(cameras: Sequence[Camera], views: Sequence[int], physics: Physics, seed: int) -> tuple[Camera, ...]:
+    """Return the rig's ideal cameras with their lenses and principal points: a function of `seed` and view alone."""
+    return tuple(_true_camera(c, view, physics, seed) for c, view in zip(cameras, views, strict=True))
+
+
+def _true_camera(camera: Camera, view: int, physics: Physics, seed: int) -> Camera:
+    share = np.random.default_rng([seed, view, *b"lens"]).uniform(-1, 1) * physics.lens_spread
+    camera = replace(camera, distortion=tuple(k * (1 + float(share)) for k in physics.lens))
+    if not physics.principal_point:
+        return camera
+    x, y = np.random.default_rng([seed, view, *b"principal point"]).normal(size=2) * physics.principal_point
+    return replace(camera, cx=camera.cx + float(x) * camera.width, cy=camera.cy + float(y) * camera.width)
+
+
+def given_cameras(
+    cameras: Sequence[Camera], exact: str, physics: Physics, entropy: Sequence[int]
+) -> tuple[Camera, ...]:
+    """Return the cameras with the poses that methods are given: turned about their centres, and moved.
+
+    Camera `exact` keeps its pose. `entropy`: of the random numbers, which differ by camera.
+    """
+    if not physics.moves_poses:
+        return tuple(cameras)
+    return tuple(c if c.id == exact else _moved(c, physics, entropy) for c in cameras)
+
+
+def _moved(camera: Camera, physics: Physics, entropy: Sequence[int]) -> Camera:
+    turn, shift = np.random.default_rng([*entropy, *f"{camera.id} pose".encode()]).normal(size=(2, 3))
+    R = Rotation.from_rotvec(turn * physics.pose_noise_deg, degrees=True).as_matrix() @ camera.R
+    return replace(camera, R=R, t=-R @ (camera.center + shift * physics.pose_noise_m))

@@ -1,0 +1,170 @@
+"""Each deviation from ideal cameras and light against a closed form or a published figure, through `make-dataset`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_renderer import render_fakes
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.cameras import from_nerfstudio
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.stream import open_stream
+from spike4dgs.generators.physics import CAMERAS, Physics, PhysicsOptions, from_settings, given_cameras, true_cameras
+from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.render_tasks import cameras_of, recorded_job
+from spike4dgs.generators.scene_maker import Maker
+from spike4dgs.generators.streams import sensor_of
+
+JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
+
+
+def job(**physics):
+    return replace(JOB, physics=Physics(**physics))
+
+
+def plain(stage, steps, total):
+    yield from steps
+
+
+def test_what_is_off_is_neither_in_the_id_nor_in_the_settings():
+    assert JOB.id == "car-0-tiny" and "physics" not in JOB.settings
+    assert job(psf_px=0.5, dead_ticks=1).id == "car-0-tiny-psf-dead"
+    assert replace(JOB, physics=CAMERAS["realistic"]).id == "car-0-tiny-realistic"
+    assert PhysicsOptions().physics() == CAMERAS["ideal"] == Physics()
+
+
+def test_settings_are_read_back():
+    for physics in (Physics(), CAMERAS["realistic"], Physics(flicker=0.3, pose_noise_deg=0.1, dead_ticks=2)):
+        assert from_settings(json.loads(json.dumps(physics.settings))) == physics
+        made = replace(JOB, physics=physics)
+        assert recorded_job(json.loads(json.dumps(made.settings))) == made
+
+
+def test_an_option_replaces_that_of_the_named_camera():
+    realistic = CAMERAS["realistic"]
+    assert PhysicsOptions("realistic").physics() == realistic
+    assert PhysicsOptions("realistic", psf_px=0.0).physics() == replace(realistic, psf_px=0.0)
+    straight = PhysicsOptions("realistic", lens=(0.0,)).physics()
+    assert straight == replace(realistic, lens=(), lens_spread=0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"camera": "best"}, "--camera: expected one of ideal, realistic"),
+        ({"psf_px": 2.0}, "--psf-px: expected px from 0 to 0.8"),
+        ({"flicker": 1.5}, "--flicker: expected a depth"),
+        ({"flicker": float("nan")}, "--flicker"),
+        ({"flicker_duty": 1.0}, "--flicker-duty"),
+        ({"flicker_hz": 0.0}, "--flicker-hz"),
+        ({"pose_noise_deg": -1.0}, "--pose-noise-deg"),
+        ({"dead_ticks": -1}, "--dead-ticks"),
+        ({"read_noise": 1.0}, "--read-noise"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_one_line(options, words):
+    with pytest.raises(UserError, match=words) as e:
+        PhysicsOptions(**options).physics()
+    assert "\n" not in str(e.value)
+
+
+def test_lenses_that_differ_are_weaker_or_stronger_copies_of_the_mean_one():
+    nine = replace(JOB, profile_name="small", profile=PROFILES["small"])
+    lens = (-0.1, 0.03, 0.0, 0.0, 0.0)
+    alike, different = (replace(nine, physics=Physics(lens=lens, lens_spread=s)) for s in (0.0, 0.3))
+    assert {c.distortion for c in cameras_of(alike)} == {lens}
+    shares = np.array([np.array(c.distortion[:2]) / lens[:2] - 1 for c in cameras_of(different)])
+    assert np.abs(shares).max() <= 0.3 and len(set(shares[:, 0])) == 9
+    assert shares[:, 0] == pytest.approx(shares[:, 1])
+    again, other = cameras_of(replace(different)), cameras_of(replace(different, seed=1))
+    assert [c.distortion for c in again] == [c.distortion for c in cameras_of(different)]
+    assert all(a.distortion != b.distortion for a, b in zip(again, other, strict=True))
+    assert not any(c.distortion for c in cameras_of(nine))
+
+
+def test_principal_points_spread_by_the_stated_share_of_the_width():
+    rig, views = cameras_of(JOB), JOB.profile.views
+    found = []
+    for seed in range(200):
+        for c, ideal in zip(true_cameras(rig, views, Physics(principal_point=0.02), seed), rig, strict=True):
+            found.append([c.cx - ideal.cx, c.cy - ideal.cy])
+            assert (c.fx, c.fy) == (ideal.fx, ideal.fy) and np.array_equal(c.t, ideal.t)
+    assert np.std(found, axis=0) == pytest.approx(0.02 * 64, rel=0.1)
+
+
+def test_given_poses_move_pixels_by_what_their_noise_says():
+    """A turn by s radians about x or y moves the middle of the image by s f px, a shift by s metres by s f / z."""
+    rig, z = cameras_of(JOB), 12.0
+    moved = {"pose_noise_deg": [], "pose_noise_m": []}
+    sizes = {"pose_noise_deg": np.degrees(1e-3), "pose_noise_m": 1e-3 * z}
+    for name, found in moved.items():
+        for seed in range(300):
+            given = given_cameras(rig, "cam_04", Physics(**{name: sizes[name]}), [seed])
+            for true, other in zip(rig, given, strict=True):
+                middle = true.unproject(np.array([[true.cx, true.cy]]), np.array([z]))
+                shift = (other.project(middle)[0] - true.project(middle)[0])[0] / true.fx
+                if true.id == "cam_04":
+                    assert other is true  # the question of the default split
+                else:
+                    found.append(shift)
+        assert np.std(found, axis=0) == pytest.approx(1e-3, rel=0.1)
+        assert np.allclose(other.R @ other.R.T, np.eye(3))
+
+
+def test_a_scene_of_moved_poses_keeps_the_true_ones_where_no_method_looks(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    made = job(pose_noise_deg=0.05, pose_noise_m=0.002)
+    scene = open_scene(Maker(made, tmp_path, plain).make())
+    truth = json.loads((scene.root / "truth/cameras.json").read_text())
+    for camera in cameras_of(made):
+        known = from_nerfstudio(camera.id, truth[camera.id])
+        assert np.allclose(known.R, camera.R) and np.allclose(known.t, camera.t)
+        given = scene.cameras[camera.id]
+        assert np.allclose(given.R, camera.R, atol=1e-9) == (camera.id == "cam_04")
+    assert scene.meta["source"]["physics"] == {"pose_noise_deg": 0.05, "pose_noise_m": 0.002}
+
+
+def test_dark_current_doubles_every_8_kelvin_between_silicons_two_laws():
+    """Arrhenius: it follows exp(-E / kT) with all of the band gap of 1.12 eV (diffusion) or half of it (generation)."""
+    for gap, sign in ((1.12, 1), (0.56, -1)):
+        law = np.exp(gap / 8.617e-5 * (1 / 300 - 1 / 308))
+        assert (law - Physics(warming_k=8.0).dark_factor) * sign > 0
+    assert Physics(warming_k=8.0).dark_factor == 2 and Physics(warming_k=-16.0).dark_factor == 0.25
+
+
+def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibration(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    folders = [Maker(job(warming_k=k), tmp_path / str(k), plain).make() for k in (0.0, 8.0)]
+    for name in ("calibration/dark/cam_00.dat", "calibration/flat/cam_00.dat"):
+        assert len({(f / name).read_bytes() for f in folders}) == 1
+    counts = [open_stream(f / "spikes/cam_00.dat", 64, 40, 2e4, rows_bottom_up=True).counts(0, 80) for f in folders]
+    added = np.mean(counts[1].astype(int) - counts[0]) / 80
+    assert added == pytest.approx(sensor_of(JOB, cameras_of(JOB)[0]).dark.mean(), rel=0.1)
+
+
+def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    steady, lit = (
+        open_scene(Maker(job(**p), tmp_path, plain).make()) for p in ({}, {"flicker": 0.5, "flicker_hz": 250})
+    )
+    light = job(flicker=0.5, flicker_hz=250).flicker
+    for target in steady.targets:
+        ratio = lit.ground_truth(target) / steady.ground_truth(target)
+        assert ratio == pytest.approx(light.at(target.tick), rel=2e-3)
+        assert np.array_equal(lit.moving(target), steady.moving(target))
+    counts = [s.stream("cam_00").counts(20, 40).astype(float).sum() for s in (steady, lit)]
+    dark = sensor_of(JOB, cameras_of(JOB)[0]).dark.sum() * 20
+    expected = np.mean([light.mean(t) for t in range(20, 40)])
+    assert (counts[1] - dark) / (counts[0] - dark) == pytest.approx(expected, rel=0.01)
+
+
+def test_a_scenes_description_states_what_the_sensor_does(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    made = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009)
+    sensor = open_scene(Maker(made, tmp_path, plain).make()).meta["sensor"]
+    assert (sensor["dead_ticks"], sensor["read_noise"], sensor["reset_noise"]) == (1, 0.006, 0.0009)
+    assert not {"dead_ticks", "psf_px"} & set(open_scene(Maker(JOB, tmp_path, plain).make()).meta["sensor"])
