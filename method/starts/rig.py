@@ -189,11 +189,18 @@ def _points(
 
 
 def middle_camera(cameras: Sequence[Camera]) -> Camera:
-    """Return a camera between all others: their mean centre and the rotation nearest to their mean rotation."""
+    """Return a camera between all others, with the rotation nearest to their mean rotation.
+
+    It stands a quarter of the way from their mean centre to the camera nearest to that. In an array whose middle camera
+    is held out the mean centre is that camera's, and points thinned on its pixels would suit the image that is scored.
+    """
     u, _, vt = np.linalg.svd(np.mean([c.R for c in cameras], axis=0))
     R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     first = cameras[0]
-    center = np.mean([c.center for c in cameras], axis=0)
+    centers = np.array([c.center for c in cameras])
+    mean = centers.mean(axis=0)
+    nearest = centers[np.argmin(np.linalg.norm(centers - mean, axis=1).round(9))]
+    center = 0.75 * mean + 0.25 * nearest  # halfway, the fill leaves pixels of other views empty
     return Camera("middle", first.width, first.height, first.fx, first.fy, first.cx, first.cy, R, -R @ center)
 
 

@@ -8,6 +8,7 @@ from toy_world import GAIN, RATE_HZ, ToyWorld
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import RecipeMethod
@@ -109,10 +110,17 @@ def test_rig_covers_the_image(start):
     assert 0.15 < len(start.points) / (96 * 60) < 0.8
 
 
-def test_middle_camera_is_between_the_others():
-    m, centers = middle_camera(WORLD.cameras), np.stack([c.center for c in WORLD.cameras])
-    assert np.allclose(m.center, centers.mean(axis=0)) and np.allclose(m.R @ m.R.T, np.eye(3))
+def test_middle_camera_is_between_the_others_and_not_the_held_out_one():
+    training = WORLD.training.cameras
+    m, centers = middle_camera(training), np.stack([c.center for c in training])
+    mean = centers.mean(axis=0)
+    nearest = np.linalg.norm(centers - mean, axis=1).min()
+    assert np.linalg.norm(m.center - mean) == pytest.approx(nearest / 4) and np.allclose(m.R @ m.R.T, np.eye(3))
     assert np.allclose(m.R, WORLD.held_out.R, atol=0.01)
+    places = [np.array([0.3 * (k % 3 - 1), 0.0, 0.2 * (1 - k // 3)]) for k in range(9)]  # 3x3, the middle held out
+    up = np.array([0.0, 0.0, 1.0])
+    array = [look_at(f"{k}", p, p + (0, 9.0, 0), up, focal=50.0, width=40, height=20) for k, p in enumerate(places)]
+    assert np.linalg.norm(middle_camera([*array[:4], *array[5:]]).center - array[4].center) == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("spikes", ["none", "all"])
