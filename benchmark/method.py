@@ -30,7 +30,10 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 
 GROUP = "spike4dgs.methods"
-GIVEN = ("poses", "flat-field")  # what a method may be given beside streams, clock and intrinsics
+# What a method may be given beside streams, clock and intrinsics: the rig's poses, calibration recordings, the true
+# points of sparse/0, the recordings of frame cameras and event cameras at the same positions.
+GIVEN = ("poses", "flat-field", "points", "frames", "events")
+DEFAULT_GIVEN = GIVEN[:2]  # what a method is given that says nothing
 
 
 @dataclass(frozen=True)
@@ -124,10 +127,10 @@ class Method(Protocol):
     """Something that fits scenes. `params` is recorded and is part of the key under which a result is resumed.
 
     Nine attributes may be added: `version` (the package's if absent; also part of the key), `trained_on`, the names of
-    the data sets that learned parts have seen, `given`, which of `GIVEN` it uses (all if absent; tracks of the
-    leaderboard withhold some), `refines_views`: its models have `refine` (see `refinement`), `description`, one line
-    for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called before the clock of a fit
-    starts, `rasterizes`: False lets it run on a GPU without numba-cuda, `oracle`: what the truth replaces in it (no
+    the data sets that learned parts have seen, `given`, which of `GIVEN` it uses (`DEFAULT_GIVEN` if absent; tracks of
+    the leaderboard withhold some), `refines_views`: its models have `refine` (see `refinement`), `description`, one
+    line for `spike4dgs methods`, `warm_up(request)`, which compiles what `fit` runs and is called before the clock of a
+    fit starts, `rasterizes`: False lets it run on a GPU without numba-cuda, `oracle`: what the truth replaces in it (no
     leaderboard takes its records), and `with_settings(overrides, name)`, which returns the method with other settings
     for `run-benchmark --set`.
     """
@@ -141,13 +144,15 @@ class Method(Protocol):
 
 
 def training_for(method: Method, scene: TrainingScene) -> TrainingScene:
-    """Return what a method gets of a scene: no calibration recordings if it does not say that it is given them.
+    """Return what a method gets of a scene: no recordings of a kind that it does not say it is given.
 
-    Poses remain: the estimated ones are brought to the rig's frame, in which held-out cameras are given.
+    Poses remain: the estimated ones are brought to the rig's frame, in which held-out cameras are given. No method gets
+    points from here; one that reads them from the folder says so.
     """
-    if "flat-field" in getattr(method, "given", GIVEN):
-        return scene
-    return replace(scene, recordings=(None,) * len(scene.cameras))
+    given = getattr(method, "given", DEFAULT_GIVEN)
+    withheld: dict[str, Any] = {} if "flat-field" in given else {"recordings": (None,) * len(scene.cameras)}
+    withheld |= {f"found_{kind}": {} for kind in ("frames", "events") if kind not in given}
+    return replace(scene, **withheld)
 
 
 def check_protocol(method: Any, source: str) -> None:

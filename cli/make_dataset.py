@@ -25,6 +25,7 @@ def make_dataset(
     audit: bool = False,
     replace: bool = False,
     check: Path | None = None,
+    track: str | None = None,
 ) -> int:
     """Render worlds and simulate their spike cameras: one scene folder OUT/WORLD-VARIANT-PROFILE for each world.
 
@@ -40,15 +41,18 @@ def make_dataset(
         check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
             they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
             world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.
+        track: Make the scenes of a track of release 2, which has its profile, variants and camera: small, dev-small or
+            ideal; of all worlds if none is named.
     """
     from spike4dgs.generators.worlds import WORLDS  # it loads other packages' worlds
 
     if all and worlds:
         raise problem("worlds", "names or --all", "both", "leave one out")
-    names = WORLDS if all else dict.fromkeys(worlds)
+    names = WORLDS if all or (track and not worlds) else dict.fromkeys(worlds)
     if not names:
         raise problem("worlds", "at least one world, or --all", "none", f"choose among {', '.join(WORLDS)}")
-    jobs = [settings.job(name) for name in names]
+    chosen = list(names)
+    jobs = scenes.track_jobs(track, chosen, settings) if track else [settings.job(name) for name in chosen]
     choose_device(renderers.device)
     parallel = {"workers": renderers.workers, "scheduler": renderers.scheduler}
     return scenes.make_dataset(jobs, out, **parallel, audit=audit, replace=replace, check=check)

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.method import GIVEN, Method, Recipe, find_packaged_methods, get_method
+from spike4dgs.benchmark.method import DEFAULT_GIVEN, Method, Recipe, find_packaged_methods, get_method
 from spike4dgs.benchmark.reports.console import make_console
 
 _PARTS = tuple(f.name for f in fields(Recipe) if f.name not in ("name", "settings"))
@@ -72,7 +72,7 @@ def _part(method: Method, part: str) -> str:
 
 def _describe(console: Console, method: Method) -> None:
     """Print a method's description, parts, what it is given, and its settings with their reasons."""
-    given = getattr(method, "given", GIVEN)
+    given = getattr(method, "given", DEFAULT_GIVEN)
     console.print(f"{method.name}: {description(method)}", markup=False)
     console.print(", ".join(f"{part} {_part(method, part)}" for part in _PARTS), markup=False)
     console.print(f"given beside streams, clock and intrinsics: {', '.join(given) or 'nothing'}", markup=False)

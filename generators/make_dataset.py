@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA
 from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, Job
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, TRACKS, Job
 from spike4dgs.generators.render_tasks import cameras_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
 from spike4dgs.generators.scene_check import check_scenes, find_references
@@ -94,6 +94,22 @@ class SceneSettings:
             whole_frames=self.whole_frames,
             physics=self.physics.physics(),
         )
+
+
+def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> list[Job]:
+    """Return the scenes of a track that show these worlds, world by world.
+
+    Raises UserError for an unknown track, and for settings that are the track's.
+    """
+    if track not in TRACKS:
+        raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
+    if settings != SceneSettings():
+        fix = "leave one out"
+        raise problem("--track", "a track, which has its own profile, variants and camera", "settings too", fix)
+    t = TRACKS[track]
+    physics = replace(settings.physics, camera=t.camera)
+    every = [replace(settings, profile=t.profile, variant=variant, physics=physics) for variant in t.variants]
+    return [one.job(world) for world in worlds for one in every]
 
 
 def make_dataset(

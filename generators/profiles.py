@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.generators.physics import Physics
+from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS, PUBLIC_VARIANT, PUBLIC_VARIANTS
+from spike4dgs.generators.physics import IDEAL, REALISTIC, Physics
 from spike4dgs.generators.sensor.light import Flicker
 
 RATE_HZ = 20_000
@@ -35,6 +36,22 @@ PROFILES: dict[str, Profile] = {
     "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 256, 64, 0.5, 40),
     "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.5, 100),
     "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 0.25, 400),
+}
+
+
+@dataclass(frozen=True)
+class Track:
+    """The scenes of a track of release 2: these variants of every world, at a profile, by a camera of `CAMERAS`."""
+
+    profile: str
+    variants: tuple[int, ...]
+    camera: str
+
+
+TRACKS = {
+    "small": Track("small", PUBLIC_VARIANTS, REALISTIC),  # the main one: 27 scenes
+    "dev-small": Track("small", DEVELOPMENT_VARIANTS, REALISTIC),  # for tuning: 18 scenes that no score of a track has
+    "ideal": Track("small", (PUBLIC_VARIANT,), IDEAL),  # the camera of release 1
 }
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.method import DEFAULT_GIVEN
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, Record, is_complete
@@ -190,7 +190,7 @@ def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
         "mean": {metric: mean(r["mean"][metric] for r in records) for metric in METRICS},
         "unverified": [m for m in METRICS if any(m in c["unverified"] for c in checks)],
         "status": {scene: cell["status"] for scene, cell in first["scenes"].items()},
-        "given": first["method"].get("given", list(GIVEN)),
+        "given": first["method"].get("given", list(DEFAULT_GIVEN)),
         "trained_on": first["method"]["trained_on"],
         **({"equivalent": equivalent} if (equivalent := _equivalent(records)) else {}),
         "costs": {

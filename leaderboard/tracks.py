@@ -22,7 +22,7 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, sha256_json
-from spike4dgs.benchmark.method import GIVEN, is_changed
+from spike4dgs.benchmark.method import DEFAULT_GIVEN, is_changed
 from spike4dgs.benchmark.release.fingerprint import Match, compare, read_fingerprint
 from spike4dgs.benchmark.runs.record import NOISY, Record
 from spike4dgs.benchmark.scene.scene import Scene
@@ -213,7 +213,7 @@ def place_of(record: Mapping[str, Any]) -> Place:
         raise problem("the record's dataset", f"the name {'+'.join(ids)[:120]}", repr(dataset["name"][:120]), fix)
     revision = short(dataset_revision(dataset))
     same = [t for t in release.tracks if t.scenes == dataset["scenes"] and t.split == dataset["split"]]
-    given = set(record["method"].get("given", GIVEN))
+    given = set(record["method"].get("given", DEFAULT_GIVEN))
     changed = is_changed(record["method"]["name"])
     if boards := tuple(t.name for t in same if not t.withheld & given and not changed):
         return Place(f"{PUBLIC}/{release.number}-{same[0].name}@{revision}", boards, "")

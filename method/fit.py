@@ -14,7 +14,7 @@ from torch import Tensor
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.method import GIVEN, FitRequest, Model, Recipe
+from spike4dgs.benchmark.method import DEFAULT_GIVEN, FitRequest, Model, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
@@ -106,7 +106,7 @@ class RecipeMethod:
             self.params["refinement"] = asdict(REFINEMENT)
         corrected = [getattr(self.settings[part], FLAT_FIELD, False) for part in ("images", "initialization")]
         calibrated = any(corrected) or self.initialization.calibrated or self.algorithm.calibrated
-        self.given = tuple(name for name, used in zip(GIVEN, (not posed, calibrated), strict=True) if used)
+        self.given = tuple(name for name, used in zip(DEFAULT_GIVEN, (not posed, calibrated), strict=True) if used)
         self.description = description or describe(recipe, parts, self.algorithm)
         self.trained_on: tuple[str, ...] = ()
         if learned := self.images.learned():

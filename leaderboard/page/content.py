@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.method import DEFAULT_GIVEN
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import published
@@ -76,7 +76,7 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
         "parts": {p: str(params[p]) if isinstance(params.get(p), str) else "none" for p in PARTS},
         "budget": _distinct(_budget(c["budget"]) for of in cells for c in of if c["status"] == "ok"),
         "hardware": _distinct(machines),
-        "given": list(method.get("given", GIVEN)),
+        "given": list(method.get("given", DEFAULT_GIVEN)),
         "trainedOn": len(method["trained_on"]),
         "cells": [_cell(of) for of in cells],
     }

@@ -13,6 +13,7 @@ from dummy_methods import CountMethod, run
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.predictions import read_info
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -49,6 +50,21 @@ def test_calibration_recordings_are_handed_to_those_who_say_that_they_are_given_
     assert recipes.training_for(CountMethod(), scene).recordings is recordings
     assert recipes.training_for(Unflat(), scene).recordings == (None,) * len(training.cameras)
     assert recipes.training_for(Unflat(), scene).cameras == training.cameras
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"), [(None, set()), (("poses", "frames"), {"frames"}), (GIVEN, {"frames", "events"})]
+)
+def test_frames_and_events_are_handed_to_those_who_say_that_they_are_given_them(
+    small_scene: Path, given: tuple[str, ...] | None, kept: set[str]
+) -> None:
+    training = open_scene(small_scene).training
+    scene = replace(training, found_frames={"a": object()}, found_events={"a": object()})  # type: ignore[dict-item]
+    method = CountMethod()
+    if given is not None:
+        method.given = given  # type: ignore[attr-defined]
+    handed = recipes.training_for(method, scene)
+    assert {kind for kind in ("frames", "events") if getattr(handed, f"found_{kind}")} == kept
 
 
 def test_what_a_method_is_given_is_recorded_and_no_part_of_the_key(small_scene: Path, tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.make_dataset import make_dataset as command
 from spike4dgs.generators import scene_maker
-from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
+from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track_jobs
 from spike4dgs.generators.physics import PhysicsOptions
-from spike4dgs.generators.profiles import PROFILES, Job
+from spike4dgs.generators.profiles import PROFILES, TRACKS, Job
 from spike4dgs.generators.scene_maker import Maker
+from spike4dgs.generators.worlds import WORLDS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 
@@ -215,6 +216,20 @@ def test_a_variant_of_seasons_is_named_as_such(fake, tmp_path, capsys):
     for variant, kept in ((8999, False), (9000, True)):
         assert make("car", variant=variant, out=tmp_path) == 0
         assert (f"variant {variant} is kept for hidden seasons" in capsys.readouterr().out) is kept
+
+
+def test_a_track_has_its_variants_of_every_world_and_its_camera(tmp_path):
+    worlds = list(WORLDS)[:9]
+    ids = {name: [job.id for job in track_jobs(name, worlds, SceneSettings())] for name in TRACKS}
+    assert len(ids["small"]) == 27 and ids["small"][:3] == [f"jaywalk-{v}-small-realistic" for v in (0, 3, 4)]
+    assert len(ids["dev-small"]) == 18 and not set(ids["small"]) & set(ids["dev-small"])
+    assert ids["ideal"] == [f"{world}-0-small" for world in worlds]  # as in release 1
+    for settings, track, words in (
+        (SceneSettings(), "large", "--track: expected one of small, dev-small, ideal"),
+        (SceneSettings(variant=1), "small", "its own profile, variants and camera"),
+    ):
+        with pytest.raises(UserError, match=words):
+            command(("car",), track=track, settings=settings, out=tmp_path)
 
 
 def test_worlds_are_named_or_all(tmp_path):

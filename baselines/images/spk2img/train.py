@@ -5,7 +5,8 @@ ground truth at the middles of all five blocks; a scene has it every 20 ticks, t
 only. The extractor is shared by the blocks, so its estimates are held to the truth there, with the weight of all five.
 
 Every image of a scene counts: those of the held-out camera (every 20 ticks) and the sparse ones of the others. The
-public benchmark, variant 0 of every world, and hidden seasons are refused: no training may see a scored scene.
+public benchmark (variants 0, 3 and 4 of every world), development scenes (10 to 12) and hidden seasons are refused: no
+training may see a scored scene.
 Augmentation is exact: the eight symmetries of the square, and time reversal. An integrator's spikes played backwards
 are those of one that saw the light backwards; the image of the start of tick t is then that of the end of tick t, so
 the reversed window is taken one tick earlier.
@@ -34,7 +35,7 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.variants import PUBLIC_VARIANT, is_reserved
+from spike4dgs.benchmark.variants import HIDDEN_VARIANTS, PUBLIC_VARIANTS, is_reserved
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_learning_rate
 from spike4dgs.method.images.base import HALF_WINDOW, WINDOW, window
@@ -69,8 +70,10 @@ def open_for_training(folder: Path, allow_gaps: bool = False) -> Scene:
     scene = open_scene(folder, allow_gaps)
     variant = scene.meta.get("source", {}).get("variant")
     fix = "make one with `spike4dgs make-dataset WORLD --variant 1`"
-    if variant == PUBLIC_VARIANT:
-        raise problem(folder, "a training variant (1 or higher)", "the public benchmark's variant 0", fix)
+    if variant in PUBLIC_VARIANTS:
+        raise problem(folder, "a training variant, such as 1", f"the public benchmark's variant {variant}", fix)
+    if variant in HIDDEN_VARIANTS:
+        raise problem(folder, "a training variant, such as 1", f"variant {variant}, which is kept for scores", fix)
     if is_reserved(variant):
         raise problem(folder, "a training variant", f"variant {variant}, which is kept for hidden seasons", fix)
     return scene
