@@ -6,8 +6,9 @@ lens, a blur and a drift with these sources:
 - lens, spread, principal point: the two cameras of the EuRoC MAV dataset's VI-sensor (Burri et al. 2016, sensor.yaml):
   k1 -0.2834 and -0.2837, k2 0.0740 and 0.0745, 752 x 480 px, principal points 8.8 and -4.0 px left and 8.4 and 15.2 px
   below the middle: 10 px RMS or 0.013 of the width. The tangential coefficients, below 0.0002, are left out.
-- blur: a Gaussian of 0.5 px and the pixel's box give half contrast at 0.32 cycles per pixel, a lens in focus; without
-  blur it is 0.60, which no lens reaches with pixels that its resolution suits.
+- blur: a Gaussian of 0.5 px has the spread of a circle of confusion of 2 px (a disk of diameter D: D / 4), twice the
+  pixel to which machine vision counts depth of field. With the pixel's box, contrast falls to a half at 0.32 cycles per
+  pixel; with the box alone it does at 0.60.
 - drift: the sensor is 8 K warmer in the clip than when it was calibrated, which doubles its dark rate (`DOUBLING_K`).
 """
 

@@ -25,7 +25,7 @@ MAY_IMPORT = {
 ORDER = {
     "benchmark": "errors arrays lazy plugins variants files compilation schemas untrusted croissant environment "
     "weights spikes scene exchange release metrics method runs reports",
-    "generators": "profiles sensor worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
+    "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
     "schedule models checkpoint msdi images starts self_calibration trainer fit recipes viewing recordings",

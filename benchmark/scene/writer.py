@@ -216,6 +216,7 @@ _CONTENTS = {
     "  counts, `.npz`.",
     "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
     "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
+    "truth/cameras.json": "`truth/cameras.json`: the true cameras; the poses that methods are given differ from them.",
     "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
     "events": "`events/CAMERA.npz`: an event camera: t (us), x, y (row 0 at the top), p (1: brighter, 0: darker).",
     "sheet.png": "`sheet.png`, `preview.webp`: the scene at a glance.",
@@ -234,13 +235,16 @@ def _readme(root: Path, scene: SceneDescription) -> str:
         f"  - `{name}`: train {', '.join(s.train)}; test {', '.join(s.test) or 'none'}"
         for name, s in scene.all_splits.items()
     )
+    dead = scene.sensor.get("dead_ticks", 0)
+    rest = f"\n  A pixel rests for {dead} ticks after a spike: a rate r becomes r / (1 + {dead} r)." if dead else ""
     return f"""# {scene.title}
 
 Scene `{scene.id}` in the format `{SCHEMA}`. {_summary(scene)}
 Licence: {scene.licence}.
 
 - `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
-  tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.
+  tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.\
+{rest}
 {contents}
 - `scene.json`: everything else about the scene. `manifest.json`: size and SHA-256 of every file, and of the
   content of data that is fitted or scored. The revision of the scene is made of these contents.
