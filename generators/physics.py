@@ -63,7 +63,7 @@ class Physics:
     warming_k: float = 0.0
     reset_noise: float = 0.0
     read_noise: float = 0.0
-    dead_ticks: int = 0
+    dead_ticks: float = 0.0
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -132,7 +132,7 @@ class PhysicsOptions:
         warming_k: Kelvin by which the sensors are warmer in the clip than at calibration; 8 doubles the dark rate.
         reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
-        dead_ticks: Ticks after a spike in which a pixel collects no light; 1 in a published calibration.
+        dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
     """
 
     camera: str = IDEAL
@@ -148,7 +148,7 @@ class PhysicsOptions:
     warming_k: float | None = None
     reset_noise: float | None = None
     read_noise: float | None = None
-    dead_ticks: int | None = None
+    dead_ticks: float | None = None
 
     def physics(self) -> Physics:
         """Return the physics. Raises UserError for an unknown camera and for numbers that no camera has."""
@@ -196,7 +196,8 @@ def _check(physics: Physics) -> None:
 
 def from_settings(settings: Mapping[str, Any]) -> Physics:
     """Return the physics of `Physics.settings`."""
-    return Physics(**{name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()})
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()}
+    return Physics(**values)
 
 
 def true_cameras(cameras: Sequence[Camera], views: Sequence[int], physics: Physics, seed: int) -> tuple[Camera, ...]:

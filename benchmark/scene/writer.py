@@ -236,7 +236,7 @@ def _readme(root: Path, scene: SceneDescription) -> str:
         for name, s in scene.all_splits.items()
     )
     dead = scene.sensor.get("dead_ticks", 0)
-    rest = f"\n  A pixel rests for {dead} ticks after a spike: a rate r becomes r / (1 + {dead} r)." if dead else ""
+    rest = f"\n  A pixel rests for {dead:g} ticks after a spike: a rate r becomes r / (1 + {dead:g} r)." if dead else ""
     return f"""# {scene.title}
 
 Scene `{scene.id}` in the format `{SCHEMA}`. {_summary(scene)}

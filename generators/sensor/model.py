@@ -18,8 +18,10 @@ the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring ligh
 
 Two effects have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every tick it sees the
 charge plus read_noise times such a g, so a spike comes early or late, but the charge that a spike takes stays 1 and the
-error does not add up. With dead ticks a pixel collects no light in so many ticks after each spike, so a rate r becomes
-r / (1 + r dead_ticks), and light is proportional to 1 / (interval - dead_ticks).
+error does not add up. With dead ticks a pixel collects no light for so long after its charge has crossed the threshold,
+from the very moment inside the tick. A charge that takes 1 / x ticks to fill then gives intervals of dead_ticks + 1 / x
+in the mean: the rate is x / (1 + x dead_ticks), and light is proportional to 1 / (interval - dead_ticks). With one dead
+tick x has no limit below MOST_CHARGE thresholds a tick, and bright pixels may fire in adjacent ticks.
 
 Radiance between keys is a cubic Hermite (Catmull-Rom) curve: the tangent at a key is the slope between its neighbours,
 in the first and last interval the slope of that interval itself. With p0..p3 the keys around the interval from p1 to p2
@@ -62,6 +64,7 @@ Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in or
 
 DEVIATE_SD = 21845**0.5  # of `sensor.kernels.deviate`
 MOST_DEVIATION = 510 / DEVIATE_SD
+MOST_CHARGE = 16  # thresholds that a tick adds at most where a pixel rests after a spike: 0.94 spikes per tick
 _BATCH_BYTES = 16 << 20  # of key frames in memory at a time
 
 
@@ -77,7 +80,7 @@ class Sensor:
         noise_seed: seed of the noise.
         reset_noise: standard deviation of the charge that a reset takes, in thresholds.
         read_noise: standard deviation of the comparator's error in a tick, in thresholds.
-        dead_ticks: ticks after a spike in which a pixel collects no light.
+        dead_ticks: ticks after a crossing of the threshold in which a pixel collects no light.
     """
 
     radiance_gain: float = SENSOR.radiance_gain
@@ -87,7 +90,7 @@ class Sensor:
     noise_seed: tuple[int, ...] = ()
     reset_noise: float = 0.0
     read_noise: float = 0.0
-    dead_ticks: int = 0
+    dead_ticks: float = 0.0
 
     @property
     def spent_sd(self) -> float:
@@ -150,7 +153,8 @@ def simulate(
     more: tuple[Any, ...] = ()
     if sensor.is_uneven:
         loop, state = integrate_uneven, state.astype(np.int64)
-        more = _steps(sensor.read_noise, unit), sensor.dead_ticks, np.zeros(len(state), np.int64)
+        top, rest = np.int64(head * unit + unit if sensor.dead_ticks else THRESHOLD), np.zeros(len(state))
+        more = _steps(sensor.read_noise, unit), top, float(sensor.dead_ticks), rest
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
             last = min(first + per_batch, n_intervals)
@@ -169,7 +173,8 @@ def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
     """Return the room below zero in thresholds, and the charge units of a threshold and of one step of `deviate`."""
     sd = sensor.spent_sd
     head = sd * MOST_DEVIATION
-    unit = float(np.floor(THRESHOLD / (1 + head)))
+    most = MOST_CHARGE if sensor.dead_ticks else 1
+    unit = float(np.floor(THRESHOLD / (most + head)))
     return head, unit, _steps(sd, unit)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Int32
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD, charge_after_spike, charge_of_tick
-from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_DEVIATION, Keys, Sensor
+from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_CHARGE, MOST_DEVIATION, Keys, Sensor
 from spike4dgs.generators.sensor.uneven_kernels import READ_SALT
 
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
@@ -54,19 +54,21 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
     level = charge / THRESHOLD
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
-    rest = np.zeros(charge.shape, np.int64)  # dead ticks that are left
+    rest, most = np.zeros(charge.shape), MOST_CHARGE if sensor.dead_ticks else 1  # rest: dead ticks that are left
     for tick, mean in enumerate(means):
-        awake = rest == 0
-        added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, 1 + sd * MOST_DEVIATION)
-        level = level + np.where(awake, added, 0.0)
+        awake = np.maximum(1 - rest, 0.0)  # share of the tick
+        added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, most + sd * MOST_DEVIATION)
+        level = level + awake * added
         shown = level
         if sensor.read_noise:
             shown = level + sensor.read_noise * deviates(pixels, tick, sensor.noise_key, READ_SALT)
-        fired = awake & (shown >= 1.0)
+        fired = (awake > 0) & (shown >= 1.0)
         yield fired, shown
-        spent = 1 + sd * deviates(pixels, tick, sensor.noise_key)
+        ago = np.clip((shown - 1) / np.maximum(added, 1e-30), 0, awake)  # ticks since the charge crossed the threshold
+        lost = added * np.minimum(ago, sensor.dead_ticks)
+        spent = 1 + sd * deviates(pixels, tick, sensor.noise_key) + lost
         level = np.where(fired, charge_after_spike(level, spent), level)
-        rest = np.where(fired, sensor.dead_ticks, np.maximum(rest - 1, 0))
+        rest = np.where(fired, np.maximum(sensor.dead_ticks - ago, 0), np.maximum(rest - 1, 0))
 
 
 def deviates(pixels: NDArray[np.uint64], tick: int, key: int, salt: int = 0) -> Float64:

@@ -1,7 +1,7 @@
 """The inner loop of `sensor.model` for a comparator that errs and for a pixel that rests after a spike.
 
-It is a plain loop over pixels, three times slower than `sensor.kernels`; where both effects are off it gives the same
-bits. Charge is 64 bits wide, because an early spike leaves a pixel below zero and a late one above the threshold.
+It is a plain loop over pixels, slower than `sensor.kernels`; where both effects are off it gives the same bits. Charge
+is 64 bits wide, because an early spike leaves a pixel below zero and a late one above the threshold.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.benchmark.spikes.bits import kernel
-from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.generators.sensor.kernels import BLOCK, _along, _equal, _prepare, _steady, deviate, mix
 
 READ_SALT = 0x7F4A7C15  # the comparator's random numbers are others than those of the charge
@@ -31,6 +30,7 @@ def integrate_uneven(
     key: Any,
     means: Any,
     read: Any,
+    top: Any,
     dead: Any,
     rest: Any,
     words: Any,
@@ -39,12 +39,12 @@ def integrate_uneven(
 ) -> None:
     """Fill words[:, first_block:last_block], and advance `charge` and `rest`; see `kernels.integrate`.
 
-    charge [P] int64; `read`: charge units of one step of `deviate` in the comparator, 0 is off; `dead`: ticks after a
-    spike in which a pixel collects nothing; rest [P]: how many of them are left.
+    charge [P] int64; `read`: charge units of one step of `deviate` in the comparator, 0 is off; `top`: the threshold in
+    charge units; `dead`: ticks after a crossing of the threshold in which a pixel collects nothing; rest [P] float64:
+    how many of them are left.
     """
     w = np.empty(6 * BLOCK, np.float32)
     increment = np.empty(BLOCK, np.int32)
-    top = np.int64(THRESHOLD)
     for block in range(first_block, last_block):
         p = block * BLOCK
         g = gain[p : p + BLOCK] if len(gain) > BLOCK else gain
@@ -65,15 +65,22 @@ def integrate_uneven(
                 now = mix(np.uint32(np.uint32(ticks[s] + j) ^ key))
                 word = np.uint64(0)
                 for i in range(BLOCK):
-                    if rest[p + i] > 0:
-                        rest[p + i] -= 1
+                    asleep = rest[p + i]
+                    if asleep >= 1.0:
+                        rest[p + i] = asleep - 1.0
                         continue
                     pixel = np.uint32((p + i) * 0x9E3779B1)
-                    c = charge[p + i] + (increment[i] if constant else np.int32(_along(w, i, u)))
+                    x = np.int64(increment[i] if constant else np.int32(_along(w, i, u)))
+                    c = charge[p + i] + (np.int64((1.0 - asleep) * x) if asleep > 0.0 else x)
+                    asleep = 0.0
                     shown = c + np.int64(read) * deviate(np.uint32(pixel ^ np.uint32(READ_SALT)), now)
                     if shown >= top:
                         word |= np.uint64(1) << np.uint64(i)
-                        c = min(c - (np.int64(unit) + np.int64(noise) * deviate(pixel, now)), top - 1)  # a full well
-                        rest[p + i] = dead
-                    charge[p + i] = c
+                        c -= np.int64(unit) + np.int64(noise) * deviate(pixel, now)
+                        if dead > 0.0:  # from the crossing on, inside the tick
+                            ago = min((shown - top) / x, 1.0 - rest[p + i]) if x > 0 else 0.0
+                            c -= np.int64(min(ago, dead) * x)
+                            asleep = max(dead - ago, 0.0)
+                        c = min(c, top - 1)  # a full well
+                    charge[p + i], rest[p + i] = c, asleep
                 words[start + j, block] = word

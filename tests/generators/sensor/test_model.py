@@ -392,9 +392,9 @@ def test_the_loop_for_uneven_spikes_gives_the_bits_of_the_fast_one_where_both_ef
 @settings(max_examples=15, deadline=None)
 @given(
     read=st.sampled_from([0.0, 0.003, 0.05]),
-    dead=st.integers(0, 3),
+    dead=st.sampled_from([0, 0.4, 1, 2.5]),
     reset=st.sampled_from([0.0, 0.01]),
-    bright=st.sampled_from([0.3, 3.0]),
+    bright=st.sampled_from([0.3, 3.0, 12.0]),
     seed=st.integers(0, 2**31),
 )
 def test_uneven_spikes_equal_the_twins(read, dead, reset, bright, seed):
@@ -424,13 +424,15 @@ def steady_spikes(rate, n, sensor, pixels=4000):
     return stream([light, light], [0, n], n, sensor, random_charge(1, pixels, [5])).window(0, n)[:, 0]
 
 
-@pytest.mark.parametrize(("rate", "dead"), [(0.05, 1), (0.4, 1), (1.0, 1), (0.3, 2)])
+@pytest.mark.parametrize(("rate", "dead"), [(0.05, 1), (0.4, 1), (1.0, 1), (3.0, 1), (0.3, 2), (0.7, 0.5)])
 def test_dead_ticks_add_to_every_interval(rate, dead):
     """The law of a real camera's calibration: light is proportional to 1 / (interval - dead ticks)."""
     spikes = steady_spikes(rate, 2000, Sensor(dead_ticks=dead))
-    intervals = np.diff(np.flatnonzero(spikes[:, 0]))
-    assert 1 / (intervals.mean() - dead) == pytest.approx(rate, rel=0.002)
-    assert intervals.min() > dead
+    times = np.flatnonzero(spikes[:, 0])
+    intervals = np.diff(times)
+    mean = (times[-1] - times[0]) / (len(times) - 1)
+    assert 1 / (mean - dead) == pytest.approx(rate, rel=0.01)
+    assert intervals.max() - intervals.min() <= 1  # the rest of the charge is kept, as time
     assert spikes.mean() == pytest.approx(rate / (1 + rate * dead), rel=0.002)
 
 
