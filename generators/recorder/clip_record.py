@@ -16,9 +16,8 @@ from typing import Any
 
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
 from spike4dgs.benchmark.files import atomic_path
-from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Target
-from spike4dgs.benchmark.scene.splits import Split, standard_splits
+from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import open_stream
@@ -105,7 +104,7 @@ def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
             cameras=cameras,
             train=tuple(c.id for c in cameras if c.id not in profile.held_out),
             test=profile.held_out,
-            splits=_splits(cameras, profile.held_out),
+            splits=standard_splits(cameras, profile.held_out[0]) if len(profile.held_out) == 1 else {},
             rate_hz=float(profile.fps),
             n_ticks=record.n_ticks,
             radiance_gain=profile.radiance_gain,
@@ -118,10 +117,6 @@ def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
             extras=record.extras,
         ),
     )
-
-
-def _splits(cameras: tuple[Camera, ...], held_out: tuple[str, ...]) -> dict[str, Split]:
-    return standard_splits(cameras, held_out[0]) if len(held_out) == 1 else {}
 
 
 def _clock(record: ClipRecord) -> dict[str, Any]:

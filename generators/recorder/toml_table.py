@@ -104,7 +104,8 @@ class Table:
         are_tables: Kind[list[dict[str, Any]]] = values(
             f"tables [[{key}]]", lambda v: isinstance(v, list) and all(isinstance(t, dict) for t in v)
         )
-        return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(self.get(key, are_tables, None) or [])]
+        found: list[dict[str, Any]] | None = self.get(key, are_tables, None)
+        return [Table(self.path, f"{key}[{i}]", v) for i, v in enumerate(found or [])]
 
     def table(self, key: str) -> Table | None:
         """Return a table in this one, or None where it is absent."""

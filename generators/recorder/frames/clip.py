@@ -62,13 +62,12 @@ class Clip:
 
     def without(self, gaps: tuple[Gap, ...]) -> Clip:
         """Return the same clip with these gaps, the ticks that the disk did not store."""
-        return replace(self, cameras=tuple(_without(c, gaps, self.n_ticks) for c in self.cameras))
-
-
-def _without(clip: CameraClip, gaps: tuple[Gap, ...], n_ticks: int) -> CameraClip:
-    mine = [g for g in gaps if g.camera == clip.camera]
-    if not mine:
-        return clip
-    every = merged([*clip.gaps, *mine], n_ticks)
-    end = DISK if clip.stats.end == "ok" else clip.stats.end
-    return replace(clip, gaps=every, stats=replace(clip.stats, lost_ticks=sum(g.ticks for g in every), end=end))
+        cameras = []
+        for c in self.cameras:
+            if mine := [g for g in gaps if g.camera == c.camera]:
+                every = merged([*c.gaps, *mine], self.n_ticks)
+                end = DISK if c.stats.end == "ok" else c.stats.end
+                stats = replace(c.stats, lost_ticks=sum(g.ticks for g in every), end=end)
+                c = replace(c, gaps=every, stats=stats)
+            cameras.append(c)
+        return replace(self, cameras=tuple(cameras))

@@ -102,17 +102,12 @@ def check_file(path: Path, source: UInt8, camera: CameraClip, n_ticks: int) -> N
     assert camera.stats.lost_ticks + int(zeros.sum()) == n_ticks, "what was sent is written, or is in a gap"
 
 
-@pytest.mark.parametrize("stall_s", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("stall_s", [0.1, 0.5, 5.0])
 def test_a_stall_shorter_than_the_buffer_loses_nothing(tmp_path: Path, stall_s: float) -> None:
     clip, _ = run(tmp_path / "clip", stall_s + 0.3, stall_s, buffer_s=stall_s + 1.0)
-    assert clip.complete and not clip.interrupted
+    assert clip.complete and not clip.interrupted and clip.n_ticks == round((stall_s + 0.3) * FPS)
     waited = max(c.stats.backlog for c in clip.cameras) * BLOCK / (FPS * FRAME)
     assert waited > 0.7 * stall_s, "the data of the stall waited in memory"
-
-
-def test_five_seconds_without_the_disk_are_ridden_out(tmp_path: Path) -> None:
-    clip, _ = run(tmp_path / "clip", 5.3, 5.0, buffer_s=6.5)
-    assert clip.complete and clip.n_ticks == 53_000
 
 
 def test_a_stall_longer_than_the_buffer_is_a_gap_and_takes_no_more_memory(tmp_path: Path) -> None:
@@ -142,10 +137,10 @@ def test_ctrl_c_during_a_stall_ends_the_reading_and_keeps_what_is_there(tmp_path
     assert 500 < clip.n_ticks < 2.0 * FPS, "the cameras were read until Ctrl-C, not until the sink returned"
 
 
-@pytest.mark.parametrize("stall_s", [0.3])
 def test_a_disk_that_stalls_within_a_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stall_s: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    stall_s = 0.3
     scene = source_scene(tmp_path / "scene", cameras=2, ticks=12_000)  # 0.6 s, 1.4 MB a camera
     write, calls = os.pwrite, iter(range(10**6))
 
