@@ -24,6 +24,19 @@ MOVED = {
     "speed tfp": "speed images",
 }
 
+# Headings of --help, in its order -> the commands below them, by their first words.
+GROUPS: dict[str, str] = {
+    "Make data": "make-dataset worlds verify calibrate",
+    "Run and score": "run-benchmark methods score fit fault-table",
+    "Leaderboard": "leaderboard submit verify-leaderboard season",
+    "Look": "inspect images render view",
+    "Recorder": "record board-clip calibrate-rig",
+    "Exchange": "import-dat import-spikecv export-spikecv export-nerfstudio export-colmap export-ply download release",
+    "Train": "make-msdi-data train-msdi train-spk2img",
+    "Measure": "report speed poses patterns spike-agreement tradeoff spacing",
+    "This machine": "doctor completion",
+}
+
 COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
         "spike4dgs.cli.make_dataset:make_dataset",

@@ -7,16 +7,20 @@ import difflib
 import functools
 import importlib
 import inspect
+import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
+from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.cli.command import Command
-from spike4dgs.cli.commands import COMMANDS, MOVED
+from spike4dgs.cli.commands import COMMANDS, GROUPS, MOVED
 
 _MOST = 1e12  # of a number on the command line
+_NARROWEST = 60  # characters of a line of the overview
 
 
 def load(name: str) -> Callable[..., Any]:
@@ -46,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in ("-h", "--help"):
-        print(_overview("spike4dgs", COMMANDS))
+        print(_overview("spike4dgs", COMMANDS, GROUPS))
         return 0
     if name == "--version":
         print(version("spike4dgs"))
@@ -127,11 +131,21 @@ def _load(command: Command) -> Callable[..., Any]:
     return found
 
 
-def _overview(prog: str, table: Mapping[str, Command]) -> str:
+def _overview(prog: str, table: Mapping[str, Command], groups: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return the commands with their summaries, below the headings of `groups`; lines fit the terminal."""
     width = max(map(len, table))
-    lines = [f"  {name:<{width}}  {command.summary}" for name, command in table.items()]
-    usage = [f"usage: {prog} COMMAND ...", "", "commands:", *lines, ""]
-    return "\n".join([*usage, f"`{prog} COMMAND --help` shows a command's arguments and an example."])
+    line_width = max(shutil.get_terminal_size().columns, _NARROWEST)
+
+    def lines(names: Iterable[str]) -> Iterator[str]:
+        for name in names:
+            first, rest = f"  {name:<{width}}  ", " " * (width + 4)
+            yield from textwrap.wrap(table[name].summary, line_width, initial_indent=first, subsequent_indent=rest)
+
+    listed = [f"usage: {prog} COMMAND ..."]
+    for heading, words in (groups or {"commands": " ".join(table)}).items():
+        found = [n for word in words.split() for n in table if n.partition(" ")[0] == word] if groups else list(table)
+        listed += ["", f"{heading}:", *lines(found)]
+    return "\n".join([*listed, "", f"`{prog} COMMAND --help` shows a command's arguments and an example."])
 
 
 def _description(function: Callable[..., Any], command: Command) -> str:

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as Left
+from rich.progress import Progress
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
@@ -19,6 +18,7 @@ from spike4dgs.benchmark.runs.executors import Run, executor
 from spike4dgs.benchmark.scene.cameras import check_lens
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA
+from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_text
 from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, TRACKS, Job
@@ -197,10 +197,9 @@ def _is_done(job: Job, out: Path, replace: bool) -> bool:
 
 
 @contextmanager
-def _stages(console: Any, title: str) -> Iterator[Any]:
-    """Show stages with their remaining time: bars on a terminal, a line from time to time elsewhere."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("left"), Left(), console=console, disable=not console.is_terminal) as bars:
+def _stages(console: Console, title: str) -> Iterator[Any]:
+    """Show stages with their remaining time: bars on a terminal or in a notebook, a line now and then elsewhere."""
+    with make_bars(console) as bars:
 
         def watch(stage: str, steps: Iterable[T], total: int) -> Iterator[T]:
             return _bar(bars, f"{title}: {stage}", steps, total)
@@ -208,22 +207,26 @@ def _stages(console: Any, title: str) -> Iterator[Any]:
         def lines(stage: str, steps: Iterable[T], total: int) -> Iterator[T]:
             return _lines(console, f"{title}: {stage}", steps, total)
 
-        yield watch if console.is_terminal else lines
+        yield watch if console.is_terminal or console.is_jupyter else lines
 
 
 def _bar(bars: Progress, title: str, steps: Iterable[T], total: int) -> Iterator[T]:
-    task = bars.add_task(title, total=total)
-    for step in steps:
-        yield step
-        bars.advance(task)
-
-
-def _lines(console: Any, title: str, steps: Iterable[T], total: int) -> Iterator[T]:
-    start = shown = time.perf_counter()
+    pace = Pace()
+    task = bars.add_task(title, total=total, pace=pace)
     for done, step in enumerate(steps, start=1):
         yield step
+        pace.at(done, total)
+        bars.update(task, completed=done)
+
+
+def _lines(console: Console, title: str, steps: Iterable[T], total: int) -> Iterator[T]:
+    pace, start = Pace(), time.perf_counter()
+    shown = start
+    for done, step in enumerate(steps, start=1):
+        yield step
+        pace.at(done, total)
         now = time.perf_counter()
         if done == total or now - shown > _LINE_EVERY_S:
             shown = now
-            left = (now - start) / done * (total - done)
-            console.print(f"{title} {done}/{total}, {now - start:.0f} s, about {left:.0f} s left", markup=False)
+            left = "" if done == total else f", {left_text(pace.left())}"
+            console.print(f"{title} {done}/{total}, {seconds_text(now - start)}{left}", markup=False)

@@ -7,7 +7,7 @@ needs no common file system.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -93,14 +93,48 @@ class StaticParts(NamedTuple):
     points: NDArray[np.float64]  # [N, 3] on static surfaces, for the sparse model
 
 
+class StaticPart(NamedTuple):
+    """A part of `StaticParts`: samples of the background, or some pixels with the noise of ground truth."""
+
+    rgb: NDArray[np.float32]  # [C, H, W, 3] or [K, 3]
+    points: NDArray[np.float64] | None  # of the first part
+
+
 @dataclass(frozen=True, eq=False)
 class RenderStatic(_Task):
-    """Renders the static background; the argument of the call is ignored."""
+    """Renders the static background, in parts of as many paths each; called with the number of one."""
 
-    def __call__(self, chunk: object) -> StaticParts:
-        """Return the static parts of the scene."""
+    @property
+    def parts(self) -> range:
+        """The numbers of all parts: those of the background come first."""
+        return range(self._backgrounds + self._truths)
+
+    def join(self, parts: Iterable[StaticPart]) -> StaticParts:
+        """Return the static parts of the scene from all parts, in order."""
+        first, points, truth = None, None, []
+        for number, part in enumerate(parts):
+            if first is None:
+                first, points, total = part.rgb, part.points, part.rgb.astype(np.float64)
+            elif number < self._backgrounds:
+                total += part.rgb
+            else:
+                truth.append(part.rgb)
+        assert first is not None and points is not None  # there is a part of the background
+        background = (total / self._backgrounds).astype(np.float32)
+        return StaticParts(StaticViews(background, first), np.concatenate(truth).reshape(first.shape), points)
+
+    @property
+    def _backgrounds(self) -> int:
+        return self.job.profile.background_spp // self.job.profile.spp
+
+    @property
+    def _truths(self) -> int:
+        return max(1, self.job.profile.target_spp // self.job.profile.spp)
+
+    @cached_property
+    def _renderer(self) -> MultiViewRenderer:
         p = self.job.profile
-        renderer = MultiViewRenderer(
+        return MultiViewRenderer(
             world_of(self.job),
             cameras_of(self.job),
             seed=self.job.render_seed,
@@ -108,8 +142,20 @@ class RenderStatic(_Task):
             background_spp=p.background_spp,
             psf_px=self.job.physics.psf_px,
         )
-        first = _target_renderer(self.job, cameras_of(self.job), None).static_on(renderer.static.background).first
-        return StaticParts(renderer.static, first, _surface_points(renderer))
+
+    @cached_property
+    def _truth(self) -> MultiViewRenderer:
+        return _target_renderer(self.job, cameras_of(self.job), None)
+
+    def __call__(self, number: int) -> StaticPart:
+        """Return one part."""
+        if number < self._backgrounds:
+            points = _surface_points(self._renderer) if number == 0 else None
+            return StaticPart(self._renderer.background_sample(number), points)
+        pixels = np.arange(int(np.prod(self._truth.shape)))
+        return StaticPart(
+            self._truth.static_pixels(np.array_split(pixels, self._truths)[number - self._backgrounds]), None
+        )
 
 
 @dataclass(frozen=True, eq=False)

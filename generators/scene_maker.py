@@ -163,10 +163,10 @@ class Maker:
         path = self._work / "targets.npz"  # written last
         if self.store.has_static and path.is_file():
             return
-        for _ in self.watch("background", range(1), 1):
-            (static,) = self.run(render_tasks.RenderStatic(self.job), [None])
-            self.store.set_static(static.views)
-            write_arrays(path, {"first": static.target_first, "points": static.points})
+        task = render_tasks.RenderStatic(self.job)
+        static = task.join(self.watch("background", self.run(task, task.parts), len(task.parts)))
+        self.store.set_static(static.views)
+        write_arrays(path, {"first": static.target_first, "points": static.points})
 
     def _render_keys(self) -> None:
         missing = self.store.missing(self.plan)

@@ -24,7 +24,7 @@ MAY_IMPORT = {
 # The modules and folders of each room, low to high: each imports only those before it.
 ORDER = {
     "benchmark": "errors arrays lazy plugins variants files compilation schemas untrusted croissant environment "
-    "weights spikes scene exchange release metrics method runs reports",
+    "weights screen spikes scene exchange release metrics method runs reports",
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "

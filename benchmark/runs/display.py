@@ -1,4 +1,4 @@
-"""Progress of a run: bars with an estimate on a terminal, lines with one elsewhere; what came of each cell."""
+"""Progress of a run, with the time left, and what came of each cell."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import Cell
+from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_text
 
 
 @dataclass(frozen=True)
@@ -23,17 +23,22 @@ class ShownCell:
 
 
 class RunDisplay:
-    """Progress on the console: bars with an estimate on a terminal, lines with one elsewhere."""
+    """Progress on the console: bars with an estimate on a terminal or in a notebook, lines with one elsewhere.
 
-    def __init__(self, console: Console, cells: int) -> None:
-        self._console, self._cells, self._done, self._start = console, cells, 0, time.perf_counter()
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-        self._bars = Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)
-        self._all = self._bars.add_task("all cells", total=cells)
+    `kinds` names what the cells' times go by, in their order, such as the methods: those that are fitted here one
+    after another. Without it all cells count alike.
+    """
+
+    def __init__(self, console: Console, cells: int, kinds: Sequence[str] = ()) -> None:
+        self._console, self._cells, self._kinds, self._done = console, cells, kinds, 0
+        self._start = time.perf_counter()
+        self._times: dict[str, list[float]] = {}  # of the cells in which something was fitted, by kind
+        self._cell: tuple[float, Pace] | None = None  # of the one that is being fitted: since when
+        self._bars = make_bars(console, transient=True)
+        self._all = self._bars.add_task("all cells", total=cells, pace=self)
 
     def __enter__(self) -> RunDisplay:
-        if self._console.is_terminal:
-            self._bars.start()
+        self._bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -43,15 +48,38 @@ class RunDisplay:
         """Print one line."""
         self._console.print(text, highlight=False, markup=False)
 
+    def left(self) -> float | None:
+        """Return the seconds left: of each cell those of earlier ones of its kind, or of all; None where none ended."""
+        now, begun = time.perf_counter(), self._done + (self._cell is not None)
+        times, of_cell = self._times, 0.0
+        if self._cell:
+            since, pace = self._cell
+            if (left := pace.left()) is None:
+                return None
+            of_cell = left
+            if not times:
+                times = {"": [now - since + left]}
+        if not times:
+            return (now - self._start) / self._done * (self._cells - self._done) if self._done else None
+        means = {kind: sum(known) / len(known) for kind, known in times.items()}
+        every = sum(means.values()) / len(means)
+        kinds = self._kinds[begun:] or [""] * (self._cells - begun)
+        return of_cell + sum(means.get(kind, every) for kind in kinds)
+
     @contextmanager
     def cell(self, title: str, notes: Sequence[str] = ()) -> Iterator[ShownCell]:
         """Show one cell with notes about it, and yield the callables to which it reports."""
         task = self._bars.add_task(title, total=None)
-        label = f"[{self._done + 1}/{self._cells}] {title}"
-        self.say(label)
+        self.say(f"[{self._done + 1}/{self._cells}] {title}")
+        since, last = time.perf_counter(), 0
 
         def progress(done: int, total: int, note: str = "") -> None:
-            self._bars.update(task, completed=done, total=total, description=f"{title} {note}")
+            nonlocal last
+            if self._cell is None or total != last:
+                last, self._cell = total, (since, Pace())
+            self._cell[1].at(done, total)
+            of_stage = {"total": total if done else None, "completed": done}  # a stage that has only begun has no count
+            self._bars.update(task, **of_stage, description=f"{title} {note}", pace=self._cell[1])
             self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
 
         def note(text: str) -> None:
@@ -60,12 +88,16 @@ class RunDisplay:
         for text in notes:
             note(text)
         yield ShownCell(progress, note)
+        if self._cell:
+            kind = self._kinds[self._done] if self._kinds else ""
+            self._times.setdefault(kind, []).append(time.perf_counter() - since)
+            self._cell = None
         self._done += 1
         self._bars.remove_task(task)
         self._bars.update(self._all, completed=self._done)
-        if left := self._cells - self._done:
-            elapsed = time.perf_counter() - self._start
-            note(f"{elapsed:.0f} s so far, about {elapsed / self._done * left:.0f} s to go")
+        if self._done < self._cells and (left := self.left()) is not None:
+            elapsed = seconds_text(time.perf_counter() - self._start)
+            note(f"{elapsed} so far, {left_text(left)}")
 
 
 def metrics_summary(values: Mapping[str, float | None]) -> str:

@@ -121,16 +121,23 @@ class MultiViewRenderer(Visibility):
     @cached_property
     def static(self) -> StaticViews:
         """The views without moving objects."""
-        first = self._whole(self.spp, 0, None)
+        first = self.background_sample(0)
         total = first.astype(np.float64)
         parts = self.background_spp // self.spp
         for stream in range(1, parts):
-            total += self._whole(self.spp, stream, None)
+            total += self.background_sample(stream)
         return StaticViews((total / parts).astype(np.float32), first)
 
-    def static_on(self, background: np.ndarray) -> StaticViews:
-        """Return static views with another renderer's background; only `first` is rendered."""
-        return StaticViews(background, self._whole(self.spp, 0, None))
+    def background_sample(self, stream: int) -> np.ndarray:
+        """Return the views without moving objects by `spp` samples, linear RGB [C, H, W, 3].
+
+        Stream 0 has the random numbers of keys; `static.background` is the mean of several.
+        """
+        return self._whole(self.spp, stream, None)
+
+    def static_pixels(self, where: np.ndarray) -> np.ndarray:
+        """Return the flat pixels `where` of `background_sample(0)`, [K, 3]."""
+        return self._rgb_at(where, self.spp, 0, None)
 
     @cached_property
     def background(self) -> np.ndarray:

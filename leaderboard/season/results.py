@@ -35,7 +35,7 @@ def predict_all(scenes: Sequence[Scene], methods: Sequence[Method], settings: Se
     failed = set()
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(make_console(), len(scenes) * len(methods)) as display,
+        RunDisplay(make_console(), len(scenes) * len(methods), [m.name for m in methods for _ in scenes]) as display,
     ):
         for method, scene in product(methods, scenes):
             files = JobFiles(Job(method, scene, settings.seed, settings.device, settings.budget), settings.out)

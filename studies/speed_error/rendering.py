@@ -110,7 +110,8 @@ def saved(job: Job) -> Series:
     for name, changed in settings(job).items():
         spp = changed.profile.spp
         if spp not in static:
-            static[spp] = RenderStatic(changed)(None)
+            task = RenderStatic(changed)
+            static[spp] = task.join(map(task, task.parts))
         values = measure(changed, static[spp], ticks, truth, moving)
         points.append(Point(name, values, "chosen" if changed is job else ""))
     name = f"{job.world}, {p.width}x{p.height}, {job.seconds * 1e3:g} ms, {len(p.views)} view{'s' * (len(p.views) > 1)}"

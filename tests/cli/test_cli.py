@@ -13,6 +13,7 @@ from dummy_methods import CountMethod, run
 from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.cli import COMMANDS, Command, main
 from spike4dgs.cli import dispatch as cli
+from spike4dgs.cli.commands import GROUPS
 from spike4dgs.cli.score import score
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
@@ -36,6 +37,23 @@ def test_help_answers_in_under_a_second_and_imports_nothing_heavy() -> None:
     assert done.stderr == "0 []\n"
     for name in COMMANDS:
         assert f"  {name} " in done.stdout
+
+
+def test_every_command_has_one_heading_in_help() -> None:
+    words = " ".join(GROUPS.values()).split()
+    assert sorted(words) == sorted({name.partition(" ")[0] for name in COMMANDS})
+
+
+@pytest.mark.parametrize("columns", [80, 100, 200])
+def test_help_fits_the_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= columns
+    assert [heading for heading in GROUPS if f"\n\n{heading}:\n" in text] == list(GROUPS)
+    assert text.count("\n  report ") == 3 and " ".join(COMMANDS["import-dat"].summary.split()) in " ".join(text.split())
 
 
 def test_no_arguments_and_help_say_the_same(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,95 @@
+"""Bars: the time left, and what a notebook shows."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from spike4dgs.benchmark.runs import display
+from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.screen import bars
+from spike4dgs.benchmark.screen.bars import NotebookBars, Pace, left_text, make_bars
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_even_steps_after_a_slow_first_one_have_an_exact_estimate_at_once() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    assert pace.left() is None and left_text(None) == ""
+    for done in range(1, 11):
+        clock.now = 40.0 + 3.0 * (done - 1)
+        pace.at(done, 10)
+        if done > 1:
+            assert pace.left() == 3.0 * (10 - done)
+    clock.now += 100.0
+    assert pace.left() == 0.0
+
+
+def test_a_step_that_lasts_lets_the_estimate_count_down() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    for now, done in ((1.0, 1), (2.0, 2)):
+        clock.now = now
+        pace.at(done, 12)
+    clock.now = 5.0
+    assert pace.left() == 7.0
+
+
+def run_cells(monkeypatch, cells: list[tuple[str, float, bool]]) -> list[float | None]:
+    """Run cells of (method, seconds, fitted); return the estimates after each but the last."""
+    clock, estimates = Clock(), []
+    monkeypatch.setattr(display.time, "perf_counter", clock)
+    shown = RunDisplay(Console(file=io.StringIO()), len(cells), [method for method, *_ in cells])
+    with shown:
+        for method, seconds, fitted in cells:
+            with shown.cell(f"{method} on a scene") as cell:
+                if fitted:
+                    cell.progress(0, 1, "images")
+                clock.now += seconds
+            estimates.append(shown.left())
+    return estimates[:-1]
+
+
+def test_cells_left_take_as_long_as_those_of_their_method(monkeypatch) -> None:
+    cells = [
+        ("quick", 2.0, True),
+        ("slow", 90.0, True),
+        ("quick", 2.0, True),
+        ("slow", 90.0, True),
+        ("slow", 90.0, True),
+    ]
+    assert run_cells(monkeypatch, cells) == [8.0, 182.0, 180.0, 90.0]
+
+
+def test_what_is_kept_makes_no_estimate_shorter(monkeypatch) -> None:
+    cells = [("a", 0.1, False), ("a", 0.1, False), ("a", 60.0, True), ("a", 60.0, True), ("a", 60.0, True)]
+    assert run_cells(monkeypatch, cells)[2:] == [120.0, 60.0]
+
+
+def test_a_terminal_has_bars_and_a_file_has_none() -> None:
+    assert make_bars(Console(file=io.StringIO())).disable
+    assert not make_bars(Console(file=io.StringIO(), force_terminal=True)).disable
+
+
+def test_a_notebook_has_bars_of_html(monkeypatch) -> None:
+    shown: list[str] = []
+
+    class Handle:
+        def update(self, html) -> None:
+            shown.append(html.data)
+
+    made = NotebookBars(console=Console(file=io.StringIO()))
+    made._handle = Handle()
+    monkeypatch.setattr(bars, "_NOTEBOOK_EVERY_S", 0.0)
+    task = made.add_task("images of <car>", total=8)
+    made.update(task, completed=2)
+    made.stop()
+    assert '<progress value="2" max="8"></progress> images of &lt;car&gt; 2/8' in shown[-1]
