@@ -12,15 +12,19 @@ from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.method.images.base import ImageMaker
 
 
-@dataclass(frozen=True, eq=False)
-class NearestViewModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class NearestViewModel(Shown):
     """Nothing is fitted: images are made from the training streams when they are asked for."""
 
     scene: TrainingScene
     images: ImageMaker
+
+    def _about(self) -> str:
+        return f"of {self.scene.id}: {self.images.name} images of {len(self.scene.cameras)} cameras"
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
         """Return the image [H, W] of the training camera whose centre is nearest to `camera`'s; the first of equals."""
@@ -32,8 +36,8 @@ class NearestViewModel:
         return self.images(stream, ticks, self.scene.radiance_gain)[0]
 
 
-@dataclass
-class NearestView:
+@dataclass(repr=False)
+class NearestView(Shown):
     """`benchmark.method.Method` without any reconstruction: what a method must beat to be worth its time."""
 
     name: str
@@ -41,6 +45,9 @@ class NearestView:
     description: str = "the nearest training camera's image, without any reconstruction"
     given: tuple[str, ...] = ("poses",)
     params: dict[str, Any] = field(init=False)
+
+    def _about(self) -> str:
+        return f"{self.name}: {self.description}"
 
     def __post_init__(self) -> None:
         self.params = {"name": self.name, "images": self.images.name}

@@ -21,6 +21,7 @@ from spike4dgs.baselines.starts.colmap import ColmapSettings, colmap
 from spike4dgs.baselines.starts.dust3r import Dust3rSettings, dust3r
 from spike4dgs.baselines.tracking.fit import TRACKING
 from spike4dgs.benchmark.method import Method, Recipe
+from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
 from spike4dgs.method.recipes import FLAT, MSDI_SETTINGS
@@ -111,7 +112,13 @@ POSED = (
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
-METHODS: dict[str, Method] = {
-    **{recipe.name: RecipeMethod(recipe, PARTS) for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED)},
-    "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
-}
+METHODS: dict[str, Method] = Table(
+    "methods",
+    {
+        **{
+            recipe.name: RecipeMethod(recipe, PARTS)
+            for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED)
+        },
+        "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
+    },
+)

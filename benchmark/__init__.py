@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Recipe, find_methods, get_method
     from spike4dgs.benchmark.metrics.measure import score_image
     from spike4dgs.benchmark.metrics.table import METRICS
+    from spike4dgs.benchmark.runs.predictions import write_predictions
     from spike4dgs.benchmark.runs.record import read_record
     from spike4dgs.benchmark.runs.results import records_to_dataframe
     from spike4dgs.benchmark.runs.score import score_predictions
@@ -30,6 +31,7 @@ else:
             "metrics.measure": ("score_image",),
             "metrics.table": ("METRICS",),
             "runs.results": ("records_to_dataframe",),
+            "runs.predictions": ("write_predictions",),
             "runs.record": ("read_record",),
             "runs.score": ("score_predictions",),
             "scene.cameras": ("Camera",),
@@ -59,4 +61,5 @@ __all__ = [
     "records_to_dataframe",
     "score_image",
     "score_predictions",
+    "write_predictions",
 ]

@@ -28,6 +28,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import Plugin, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.screen.fit_progress import FitProgress
+from spike4dgs.benchmark.screen.shown import Table
 
 GROUP = "spike4dgs.methods"
 # What a method may be given beside streams, clock and intrinsics: the rig's poses, calibration recordings, the true
@@ -110,7 +112,9 @@ class FitRequest:
     budget: Budget = Budget()
     device: str = "cpu"  # as torch names it: cpu, cuda, cuda:1
     seed: int = 0
-    progress: Progress = no_progress
+    progress: Progress = field(
+        default_factory=FitProgress, compare=False, repr=False
+    )  # shown in a terminal or notebook
     checkpoint: Path | None = None
 
 
@@ -181,7 +185,7 @@ def find_methods() -> dict[str, Method]:
 
     Raises UserError where two packages use one name, and where one cannot be imported or has another protocol.
     """
-    return {name: found.value for name, found in find_packaged_methods().items()}
+    return Table("methods", {name: found.value for name, found in find_packaged_methods().items()})
 
 
 def find_packaged_methods() -> dict[str, Plugin]:

@@ -15,10 +15,12 @@ from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.record import COSTS
+from spike4dgs.leaderboard.entry import reading_folder
 from spike4dgs.leaderboard.page.intervals import LEVEL
 from spike4dgs.leaderboard.page.rows import Board, find_board, gather
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
 from spike4dgs.leaderboard.page.site import write_site
+from spike4dgs.leaderboard.tracks import RELEASE, SHIPPED
 
 
 def show(
@@ -26,26 +28,32 @@ def show(
     track: str | None = None,
     metric: str = PRIMARY,
     runs: tuple[Path, ...] = (),
-    leaderboard: Path = Path("leaderboard"),
+    leaderboard: Path | None = None,
 ) -> int:
     """Print the ranking of each track with the intervals of its ranks.
 
-    Methods whose rank intervals start with the same number cannot be told apart from the best of them. `leaderboard
-    build` writes the same as a page, with filters, plots and images.
+    The published entries, which come with the package, are among them. Methods whose rank intervals start with the same
+    number cannot be told apart from the best of them. `leaderboard build` writes the same as a page, with filters,
+    plots and images.
 
     Args:
         track: Only this track.
         metric: Metric to rank by, such as psnr_dynamic.
         runs: Folders of run-benchmark, to see own methods beside the entries.
-        leaderboard: Leaderboard folder.
+        leaderboard: Leaderboard folder; ./leaderboard if left out, where it has entries.
     """
     if metric not in METRICS:
         raise problem("--metric", f"one of {', '.join(METRICS)}", repr(metric), "correct the name")
-    boards, _ = gather(leaderboard, runs)
-    console = make_console()
+    folder, console = reading_folder(leaderboard), make_console()
+    boards, refused = gather(folder, runs, published=True)
+    if folder == SHIPPED:
+        text = f"published entries of release {RELEASE}, as this version ships them"
+        console.print(text if runs else f"{text}; --runs OUT adds your own", markup=False)
     for board in [find_board(boards, track)] if track else boards:
         if track or any(row.ranked for row in board.rows):
             console.print(ranking_table(board, metric))
+    for item in refused:
+        console.print(f"not listed: {item['entry']}: {item['reason']}", markup=False)
     return 0
 
 
@@ -54,26 +62,26 @@ def build(
     out: Path = Path("runs/leaderboard"),
     runs: tuple[Path, ...] = (),
     data: Path = Path("data"),
-    leaderboard: Path = Path("leaderboard"),
+    leaderboard: Path | None = None,
 ) -> int:
     """Write the leaderboard as a page of files, which a browser opens from the disk.
 
-    The page has every board of the leaderboard. With --runs it has the reader's own finished runs beside the entries,
-    and their images where --data has the scenes: a run that equals an entry lends its images to the entry. An earlier
-    page in the folder is replaced.
+    The page has every board of the leaderboard, and the published entries. With --runs it has the reader's own
+    finished runs beside the entries, and their images where --data has the scenes: a run that equals an entry lends its
+    images to the entry. An earlier page in the folder is replaced.
 
     Args:
         out: Folder of the page.
         runs: Folders of run-benchmark.
         data: Folder of the scenes.
-        leaderboard: Leaderboard folder.
+        leaderboard: Leaderboard folder; ./leaderboard if left out, where it has entries.
     """
     console = make_console()
 
     def say(text: str) -> None:
         console.print(text, markup=False)
 
-    boards, refused = gather(leaderboard, runs)
+    boards, refused = gather(reading_folder(leaderboard), runs, published=True)
     site = write_site(out, boards, refused, data, say)
     for line in site.left_out:
         say(f"left out: {line}")

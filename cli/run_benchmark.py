@@ -226,6 +226,11 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
             replace=entries.replace or entries.leaderboard is None,
             allow_gaps=allow_gaps,
         )
+        make_console().print(
+            f"ranking among the published entries: spike4dgs leaderboard --runs {run.settings.out}",
+            highlight=False,
+            markup=False,
+        )
         cells = [(r["method"], scene, c["status"]) for r in run.records for scene, c in r["scenes"].items()]
         failed += [f"{m['name']} on {scene}, seed {m['seed']}" for m, scene, status in cells if status == "failed"]
     if failed:

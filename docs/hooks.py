@@ -37,6 +37,8 @@ _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
 _RECIPES = re.compile(r"^<!-- recipes of (\w+) -->$", re.MULTILINE)
+_NOTEBOOK = re.compile(r"^<!-- notebook (\S+) -->$", re.MULTILINE)
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _HEADLINE = re.compile(r"^<!-- headline -->$", re.MULTILINE)
 _API = re.compile(r"^<!-- api spike4dgs\.(\w+)\.([\w.]+)((?: \w+)*) -->$", re.MULTILINE)
 
@@ -48,11 +50,11 @@ def on_startup(**kwargs: Any) -> None:
     folder that is not there yet when it is configured.
     """
     SOURCES.mkdir(parents=True, exist_ok=True)
-    for room in ROOMS:
-        link = SOURCES / room
-        if not link.is_symlink() or link.resolve() != ROOT / room:
+    for name, source in {**{room: ROOT / room for room in ROOMS}, "__init__.py": ROOT / "front/__init__.py"}.items():
+        link = SOURCES / name
+        if not link.is_symlink() or link.resolve() != source:
             link.unlink(missing_ok=True)
-            link.symlink_to(ROOT / room, target_is_directory=True)
+            link.symlink_to(source, target_is_directory=source.is_dir())
     # The folder of scripts is on the path, and its program `spike4dgs` would be taken for the package.
     sys.path[:] = [path for path in sys.path if not (Path(path) / "spike4dgs").is_file()]
 
@@ -70,15 +72,17 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
     from spike4dgs.leaderboard.page.site import write_site
 
     boards, refused = gather(ROOT / "leaderboard", ())
-    write_site(Path(config["site_dir"]) / "leaderboard_page", boards, refused)
+    write_site(Path(config["site_dir"]) / "leaderboard_page", boards, refused, docs="../")
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand the comments `include FILE [SECTION]`, `names of ROOM`, `recipes of ROOM`, `api MODULE` and `headline`."""
+    """Expand the comments `include FILE [SECTION]`, `notebook FILE`, `names of ROOM`, `recipes of ROOM`, `api MODULE`
+    and `headline`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
     if page.file.src_uri.startswith("results/tables/"):
         markdown += table_images(page.file.src_uri)
         page.meta["search"] = {"boost": 0.2}  # a table has every word of a method's or scene's name
+    markdown = _NOTEBOOK.sub(lambda found: notebook(ROOT / found[1]), markdown)
     markdown = _HEADLINE.sub(lambda found: headline(), markdown)
     markdown = _RECIPES.sub(lambda found: recipe_table(found[1]), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
@@ -107,6 +111,25 @@ def included(name: str, section: str | None, page: str) -> str:
         return f"]({target}{'#' + anchor if anchor else ''})"
 
     return _LINK.sub(moved, text)
+
+
+def notebook(path: Path) -> str:
+    """Return the cells of a notebook and what they gave as Markdown."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        lines: list[str] = []
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            html = " ".join("".join(data.get("text/html", "")).split())
+            if html and "<pre" not in html:
+                parts.append(f'<div class="notebook-output">{html}</div>')
+            else:
+                lines.append("".join(output.get("text") or data.get("text/plain", "")).strip("\n"))
+        if lines:
+            parts.append("```text\n" + _ANSI.sub("", "\n".join(lines)) + "\n```")
+    return "\n\n".join(parts)
 
 
 def table_images(page: str) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS, PUBLIC_VARIANT, PUBLIC_VARIANTS
 from spike4dgs.generators.physics import IDEAL, REALISTIC, Physics
 from spike4dgs.generators.sensor.light import Flicker
@@ -32,11 +33,14 @@ class Profile:
 
 _ALL = tuple(range(9))
 
-PROFILES: dict[str, Profile] = {
-    "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 256, 64, 0.5, 40),
-    "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.5, 100),
-    "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 0.25, 400),
-}
+PROFILES: dict[str, Profile] = Table(
+    "profiles",
+    {
+        "tiny": Profile((0, 2, 4, 7), 64, 40, 0.004, 16, 256, 64, 0.5, 40),
+        "small": Profile(_ALL, 200, 125, 0.02, 32, 512, 256, 0.5, 100),
+        "paper": Profile(_ALL, 400, 250, 0.1, 64, 512, 256, 0.25, 400),
+    },
+)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, place_of
+from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_of
 
 SCHEMA = "spike4dgs-entry/2"
 CLAIMED, RE_SCORED, RE_FITTED = LABELS = ("claimed", "re-scored", "re-fitted")  # from the weakest to the strongest
@@ -52,6 +52,21 @@ def check_folder(leaderboard: Path) -> None:
     if leaderboard == Path() or not empty:
         found = "the working folder" if leaderboard == Path() else "something else"
         raise problem("--leaderboard", f"a leaderboard or a new folder at {leaderboard}", found, "name another folder")
+
+
+def reading_folder(leaderboard: Path | None) -> Path:
+    """Return the leaderboard to show: the one that is named, or `leaderboard` here, or the one that the package ships.
+
+    Raises UserError where the named one does not exist or has no entries.
+    """
+    if leaderboard is None:
+        here = Path("leaderboard")
+        return here if next(entry_paths(here, *FOLDERS), None) else SHIPPED
+    if next(entry_paths(leaderboard, *FOLDERS), None) is None:
+        found = "none" if leaderboard.is_dir() else "no such folder"
+        fix = "`run-benchmark` writes one to OUT/leaderboard; without --leaderboard you see the published entries"
+        raise problem(leaderboard, "a leaderboard with entries", found, fix)
+    return leaderboard
 
 
 def file_name(record: Mapping[str, Any]) -> str:

@@ -29,7 +29,8 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.untrusted import is_id
 
-FOLDER = Path(str(files("spike4dgs.leaderboard") / "releases"))
+SHIPPED = Path(str(files("spike4dgs.leaderboard")))  # the released entries, as the package holds them
+FOLDER = SHIPPED / "releases"
 RELEASE = "1"
 PUBLIC, LOCAL, ARCHIVE = "entries", "local", "archive"
 REVISION_DIGITS = 12  # of revisions in paths and messages

@@ -14,8 +14,9 @@ from torch import Tensor
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
-from spike4dgs.benchmark.method import DEFAULT_GIVEN, FitRequest, Model, Recipe
+from spike4dgs.benchmark.method import DEFAULT_GIVEN, FitRequest, Model, Recipe, no_progress
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
@@ -79,7 +80,7 @@ class Parts:
     algorithms: Mapping[str, Algorithm] = field(default_factory=dict)
 
 
-class RecipeMethod:
+class RecipeMethod(Shown):
     """`benchmark.method.Method` for a recipe whose parts are found in `parts`.
 
     `params` holds the recipe and all settings by part, overridden or not. Raises UserError for an unknown part or
@@ -112,6 +113,9 @@ class RecipeMethod:
         if learned := self.images.learned():
             self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
         self._warm: set[str] = set()  # the devices whose kernels are compiled
+
+    def _about(self) -> str:
+        return f"{self.name}: {self.description}"
 
     def with_settings(self, overrides: Mapping[str, Any], name: str) -> RecipeMethod:
         """Return the same recipe with other settings, by names PART.NAME, under another name.
@@ -146,7 +150,9 @@ class RecipeMethod:
         scene, *points = warm_up_scene()
         start = Start(scene.cameras, *points)
         with kept_random_state(request.device):
-            model = self._fit(scene, start, short(self.settings), FitRequest(device=request.device))
+            model = self._fit(
+                scene, start, short(self.settings), FitRequest(device=request.device, progress=no_progress)
+            )
             model.render(scene.cameras[0], scene.duration_us / 2)
         self._warm.add(request.device)
 

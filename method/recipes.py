@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from spike4dgs.benchmark.method import Method, Recipe
+from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.intervals import INTERVALS
@@ -140,4 +141,6 @@ _DESCRIPTIONS = {
     "spike4dgs": "the paper's method: MSDI's points and images, 4DGS, SPSS",
     "spike4dgs-x": "our own design: means over known spans of time, a fixed background, and paths of what moves",
 }
-METHODS: dict[str, Method] = {r.name: RecipeMethod(r, PARTS, _DESCRIPTIONS.get(r.name, "")) for r in RECIPES}
+METHODS: dict[str, Method] = Table(
+    "methods", {r.name: RecipeMethod(r, PARTS, _DESCRIPTIONS.get(r.name, "")) for r in RECIPES}
+)

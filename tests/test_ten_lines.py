@@ -1,4 +1,4 @@
-"""The ten lines of Python that README and the docs show: they run, and give what they say."""
+"""The ten lines of Python that README and the docs show, and those of `import spike4dgs`, give what they say."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import spike4dgs
 from spike4dgs.cli import main
 
 TEXT = (Path(__file__).resolve().parents[1] / "docs/snippets/ten_lines.md").read_text(encoding="utf-8")
@@ -29,3 +30,6 @@ def test_they_give_what_they_say(tiny_data: Path, tmp_path: Path, monkeypatch: p
     test = doctest.DocTestParser().get_doctest(block, {}, "ten_lines", "docs/snippets/ten_lines.md", 0)
     result = doctest.DocTestRunner().run(test)
     assert result.attempted == len(test.examples) == 10 and not result.failed
+    front = doctest.testmod(spike4dgs, optionflags=doctest.ELLIPSIS)
+    shown = {name for name in spike4dgs.__all__ if f"spike4dgs.{name}(" in (spike4dgs.__doc__ or "")}
+    assert shown == set(spike4dgs.__all__) and front.attempted > len(shown) and not front.failed

@@ -11,6 +11,7 @@ from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.baselines.images.tfstp import TFSTP
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.base import ImageMaker
@@ -18,7 +19,7 @@ from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.images.msdi import MSDI
 
 OURS = (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)
-IMAGES: dict[str, ImageMaker] = {maker.name: maker for maker in (*OURS, *PUBLISHED)}
+IMAGES: dict[str, ImageMaker] = Table("image makers", {maker.name: maker for maker in (*OURS, *PUBLISHED)})
 
 
 def make_image(name: str, stream: SpikeStream, tick: int, gain: float) -> Float32:

@@ -18,6 +18,7 @@ from spike4dgs.baselines.radiance_field.occupancy import Occupancy
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, positive, whole
 from spike4dgs.method.models.fitted_model import count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, make_filled, write_model
@@ -175,8 +176,8 @@ def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Ten
     return Bounds(float(near), float(far), tensor(box.min(0)), tensor(box.max(0)), low, high, scale)
 
 
-@dataclass(frozen=True, eq=False)
-class RadianceModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class RadianceModel(Shown):
     """A fitted field as a model: renders a camera at a time."""
 
     KIND: ClassVar = "radiance-field"
@@ -184,6 +185,9 @@ class RadianceModel:
     field: DynamicField
     duration_us: float
     device: str
+
+    def _about(self) -> str:
+        return f"radiance field: {self.size_bytes / 1e6:.1f} MB, {self.duration_us / 1e3:.6g} ms, on {self.device}"
 
     @property
     def size_bytes(self) -> int:

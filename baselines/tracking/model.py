@@ -89,7 +89,7 @@ class Tracks:
         }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TrackedModel(GaussianModel):
     """The Gaussians of the first time and their tracks."""
 
@@ -103,6 +103,10 @@ class TrackedModel(GaussianModel):
     def device(self) -> str:  # type: ignore[override]
         """The device of the model's tensors."""
         return str(self.gaussians.means.device)
+
+    def _about(self) -> str:
+        times = f"tracks of {len(self.tracks.free)} at {len(self.tracks.times_us)} times"
+        return f"tracking: {len(self.gaussians)} Gaussians, {times}, {self.duration_us / 1e3:.6g} ms"
 
     @property
     def size_bytes(self) -> int:

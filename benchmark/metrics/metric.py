@@ -12,6 +12,7 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.weights import WeightFile
 
 MAX_PSNR_DB = 100.0  # half-float images with any error at all stay far below it
@@ -33,8 +34,8 @@ class Images(Enum):
     RECORDED_MOVING = "images with a moving region around which the camera recorded every tick"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Metric:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Metric(Shown):
     """One row of the table.
 
     `measure` returns the value of an image pair, or None where the dataset defines none. It raises UserError for a
@@ -56,6 +57,9 @@ class Metric:
     blind: bool = False  # it does not use the truth, so the truth has a score of its own
     added_later: bool = False  # records that were written before it lack it
     tolerance: float = 1e-6  # largest difference between two machines' values of the same files
+
+    def _about(self) -> str:
+        return f"{self.id}: {self.definition}"
 
     def format(self, value: float | None) -> str:
         """Return the value as people read it; a dash for null."""

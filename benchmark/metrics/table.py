@@ -24,6 +24,7 @@ from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric, psnr_db
 from spike4dgs.benchmark.metrics.spike_rows import SPIKE_METRICS
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
+from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.benchmark.weights import METAIQA
 
 
@@ -220,6 +221,8 @@ _PERCEPTUAL = (
     ),
 )
 
-METRICS: dict[str, Metric] = {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL, *SPIKE_METRICS)}
+METRICS: dict[str, Metric] = Table(
+    "metrics", {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL, *SPIKE_METRICS)}
+)
 PRIMARY = "psnr"  # what the leaderboard ranks by
 MAIN = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # what a short table or line shows

@@ -1,6 +1,7 @@
 """Run methods on the scenes of one split, and write all that people look at.
 
 OUT/results.csv                 all records, a row for each method, seed and scene
+OUT/table.{md,tex}              means and scenes in the columns of the terminal, the best in bold
 OUT/sheet_SCENE.{png,pdf,mp4}   truth, renders and errors of each scene
 OUT/scatter.{png,pdf}           quality against time
 
@@ -18,6 +19,7 @@ from rich.console import Console
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Method
 from spike4dgs.benchmark.reports.console import Columns, print_results
+from spike4dgs.benchmark.reports.paper_files import write_results_table
 from spike4dgs.benchmark.reports.scatter import write_scatter
 from spike4dgs.benchmark.reports.sheet import write_sheet
 from spike4dgs.benchmark.reports.sheet_video import write_sheet_video
@@ -50,8 +52,9 @@ def run_split(
     print_results(console, every, columns)
     _say(console, *_write_images(scenes, of_one_seed(every), settings))
     write_results(out / "results.csv", every)
+    write_results_table(out, every)
     _say(console, f"images: {out}/sheet_*.png and {out}/scatter.png; values: {out}/results.csv")
-    _say(console, f"for papers and slides: the same as .pdf, and {out}/sheet_*.mp4")
+    _say(console, f"for papers and slides: the same as .pdf, {out}/table.md, table.tex and sheet_*.mp4")
     return SplitRun(scenes, settings, records, earlier)
 
 

@@ -36,15 +36,10 @@ def results_table(records: Sequence[Record], every_column: bool = False) -> Tabl
     standard deviations.
     """
     splits = ", ".join(sorted({r["dataset"]["split"] for r in records}))
-    cells = cells_of(records)
-    metrics = [m for m in METRICS.values() if any(c["metrics"][m.id] is not None for c in cells)]
-    costs = [key for key in COSTS if every_column or key in SHORT]
-    if not every_column:
-        metrics = [m for m in metrics if m.id in SHORT] or metrics  # a recording has other metrics than these
+    metrics, costs, blocks = blocks_of(records, every_column)
     lower = ", ".join(m.title for m in metrics if not m.higher_is_better)
     caption = f"higher is better{f', except {lower}' if lower else ''}; a dash is a value that does not exist"
-    methods = seeds_of_methods(records)
-    if len(methods) < len(records):
+    if len(seeds_of_methods(records)) < len(records):
         caption += "; mean ± standard deviation over the seeds, means of the costs"
     table = Table(title=f"Results, split {splits}", caption=caption, box=None, padding=(0, 0, 0, 1), pad_edge=False)
     table.add_column("method", no_wrap=True, overflow="fold")
@@ -52,14 +47,11 @@ def results_table(records: Sequence[Record], every_column: bool = False) -> Tabl
         table.add_column(_heading(m), justify="right")
     for key in costs:
         table.add_column(COSTS[key][0].replace(", ", "\n"), justify="right")
-    scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
-    for scene in scenes:
-        named = [(m[0]["method"]["name"], [r["scenes"][scene] for r in m if scene in r["scenes"]]) for m in methods]
-        rows = [_Row(name, [cell["metrics"] for cell in cells], cells) for name, cells in named if cells]
-        _add_block(table, scene, metrics, costs, rows)
-    if len(scenes) > 1:
-        means = [_Row(m[0]["method"]["name"], [r["mean"] for r in m], cells_of(m)) for m in methods]
-        _add_block(table, f"mean of {len(scenes)} scenes", metrics, costs, means)
+    for block in blocks:
+        table.add_row(f"[italic]{escape(block.title)}[/italic]")
+        for i, (name, values) in enumerate(block.rows, start=1):
+            texts = [f"[bold]{text}[/bold]" if best else text for text, best in values]
+            table.add_row(f" {escape(name)}", *texts, end_section=i == len(block.rows))
     return table
 
 
@@ -117,24 +109,50 @@ class _Row:
         return "" if value is None else f"{value:.{digits}f}"
 
 
-def _heading(metric: Metric) -> str:
-    first, _, second = metric.id.partition("_")
-    return f"{first}\n{second}"
+@dataclass(frozen=True)
+class Block:
+    """Rows of methods on a scene, or of their means over all: each value as text, and whether it is the best."""
+
+    title: str
+    rows: Sequence[tuple[str, Sequence[tuple[str, bool]]]]
 
 
-def _add_block(table: Table, title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Sequence[_Row]) -> None:
+def blocks_of(
+    records: Sequence[Record], every_column: bool = False
+) -> tuple[Sequence[Metric], Sequence[str], list[Block]]:
+    """Return the metrics and costs that a table of records shows, and its blocks; names say what failed."""
+    cells = cells_of(records)
+    metrics = [m for m in METRICS.values() if any(c["metrics"][m.id] is not None for c in cells)]
+    costs = [key for key in COSTS if every_column or key in SHORT]
+    if not every_column:
+        metrics = [m for m in metrics if m.id in SHORT] or metrics  # a recording has other metrics than these
+    methods, blocks = seeds_of_methods(records), []
+    scenes = list(dict.fromkeys(s for r in records for s in r["scenes"]))
+    for scene in scenes:
+        named = [(m[0]["method"]["name"], [r["scenes"][scene] for r in m if scene in r["scenes"]]) for m in methods]
+        rows = [_Row(name, [cell["metrics"] for cell in cells], cells) for name, cells in named if cells]
+        blocks.append(_block(scene, metrics, costs, rows))
+    if len(scenes) > 1:
+        means = [_Row(m[0]["method"]["name"], [r["mean"] for r in m], cells_of(m)) for m in methods]
+        blocks.append(_block(f"mean of {len(scenes)} scenes", metrics, costs, means))
+    return metrics, costs, blocks
+
+
+def _block(title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Sequence[_Row]) -> Block:
     best: dict[str, float] = {}
     for m in metrics:
         known = [v for row in rows if (v := row.mean(m.id)) is not None]
-        if known:
+        if known and len(rows) > 1:
             best[m.id] = max(known) if m.higher_is_better else min(known)
-    table.add_row(f"[italic]{escape(title)}[/italic]")
-    for i, row in enumerate(rows):
-        texts = []
-        for m in metrics:
-            text = row.text(m)
-            texts.append(f"[bold]{text}[/bold]" if len(rows) > 1 and row.mean(m.id) == best.get(m.id, "") else text)
-        shown = [row.cost(key, COSTS[key][1]) for key in costs]
+    made = []
+    for row in rows:
         failed = sorted({cell["status"] for cell in row.cells} - {"ok"})
-        name = f" {escape(row.name)}" + (f" [red]({', '.join(failed)})[/red]" if failed else "")
-        table.add_row(name, *texts, *shown, end_section=i == len(rows) - 1)
+        values = [(row.text(m), row.mean(m.id) == best.get(m.id, "")) for m in metrics]
+        shown = [(row.cost(key, COSTS[key][1]), False) for key in costs]
+        made.append((row.name + (f" ({', '.join(failed)})" if failed else ""), [*values, *shown]))
+    return Block(title, made)
+
+
+def _heading(metric: Metric) -> str:
+    first, _, second = metric.id.partition("_")
+    return f"{first}\n{second}"

@@ -1,4 +1,4 @@
-"""From a run's records to the files of one of the paper's tables."""
+"""From a run's records to tables for papers: of the run, and one of the paper's tables."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 from spike4dgs.benchmark.files import write_json, write_text
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.reports.console import blocks_of
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
 from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.runs.record import COSTS, Record, dataset_means
@@ -47,7 +48,7 @@ def to_markdown(table: Table) -> str:
     marks: Mark = lambda text, rank: (f"**{text}**", f"<u>{text}</u>")[rank]  # noqa: E731
     lines = [f"# Table {table['table']}: {table['title']}", "", f"Published columns: {table['published_note']}", ""]
     for title, header, body in (_summary(table, marks), *_metric_blocks(table, marks)):
-        lines += [f"## {title}", "", _pipes(header), _pipes(["---"] * len(header)), *map(_pipes, body), ""]
+        lines += [f"## {title}", "", *_markdown_table(header, body), ""]
     if reasons := _reasons(table):
         lines += ["## Values that do not exist", "", *(f"- {r}" for r in reasons), ""]
     return "\n".join(lines)
@@ -58,9 +59,33 @@ def to_latex(table: Table) -> str:
     marks: Mark = lambda text, rank: (rf"\textbf{{{text}}}", rf"\underline{{{text}}}")[rank]  # noqa: E731
     lines = []
     for title, header, body in (_summary(table, marks), *_metric_blocks(table, marks)):
-        lines += [f"% {title}", rf"\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}", r"\toprule"]
-        lines += [_ampersands(header), r"\midrule", *map(_ampersands, body), r"\bottomrule", r"\end{tabular}", ""]
+        lines += _latex_table(title, header, body)
     return "\n".join(lines)
+
+
+def write_results_table(folder: Path, records: Sequence[Record]) -> None:
+    """Write the columns that a terminal shows of a run as table.md and table.tex, the means first, the best in bold."""
+    metrics, costs, blocks = blocks_of(records)
+    header = ["method", *(m.title + (f", {m.unit}" if m.unit else "") for m in metrics), *(COSTS[c][0] for c in costs)]
+    markdown, latex = ["# Results", ""], list[str]()
+    for block in [*blocks[-1:], *blocks[:-1]]:
+        rows = [[name, *(f"**{text}**" if best else text for text, best in values)] for name, values in block.rows]
+        markdown += [f"## {block.title}", "", *_markdown_table(header, rows), ""]
+        rows = [
+            [name, *(rf"\textbf{{{text}}}" if best else text for text, best in values)] for name, values in block.rows
+        ]
+        latex += _latex_table(block.title, header, rows)
+    write_text(folder / "table.md", "\n".join(markdown))
+    write_text(folder / "table.tex", "\n".join(latex))
+
+
+def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [_pipes(header), _pipes(["---"] * len(header)), *map(_pipes, rows)]
+
+
+def _latex_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    begin = [f"% {title}", rf"\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}", r"\toprule", _ampersands(header)]
+    return [*begin, r"\midrule", *map(_ampersands, rows), r"\bottomrule", r"\end{tabular}", ""]
 
 
 def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]:

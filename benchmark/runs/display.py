@@ -78,8 +78,9 @@ class RunDisplay:
             if self._cell is None or total != last:
                 last, self._cell = total, (since, Pace())
             self._cell[1].at(done, total)
-            of_stage = {"total": total if done else None, "completed": done}  # a stage that has only begun has no count
-            self._bars.update(task, **of_stage, description=f"{title} {note}", pace=self._cell[1])
+            count = total if done else None  # a stage that has only begun has no count
+            pace, shown = self._cell[1], f"{title} {note}"
+            self._bars.update(task, total=count, completed=done, description=shown, pace=pace)
             self._bars.update(self._all, completed=self._done + min(done / max(total, 1), 1.0))
 
         def note(text: str) -> None:

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import MOST_BYTES, read_json, sha256_file, write_bytes, write_json, write_text, writing
 from spike4dgs.benchmark.scene.images import read_exr, write_exr
-from spike4dgs.benchmark.scene.scene import Target
+from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 SCHEMA = "spike4dgs-prediction/1"
@@ -200,3 +201,42 @@ class PredictionWriter:
             self._part.rename(self.root)
         else:
             shutil.rmtree(self._part, ignore_errors=True)
+
+
+def write_predictions(
+    root: Path | str,
+    scene: Scene | Path | str,
+    images: Mapping[Target, NDArray[np.floating[Any]]],
+    method: str,
+    *,
+    fit_seconds: float | None = None,
+    render_fps: float | None = None,
+) -> Path:
+    """Write the images that any program made of a scene's targets as a predictions folder, and return its path.
+
+    `images`: gray linear radiance [H, W], 1.0 = white, for each of `scene.targets`; `method`: the program's name. An
+    earlier folder at `root` is replaced if it holds predictions. Raises UserError for missing or further targets, for
+    other shapes or values that are not finite, and where something else is at `root`.
+
+    For example::
+
+        images = {t: render(scene.cameras[t.camera], scene.t_us(t.tick)) for t in scene.targets}
+        write_predictions("runs/mine", scene, images, "my-method")
+    """
+    root, opened = Path(root), scene if isinstance(scene, Scene) else open_scene(scene)
+    if root.exists() and not (root / INFO).is_file():
+        raise problem(root, "a new folder, or earlier predictions", "something else", "choose another folder")
+    fix = "give an image for each of scene.targets"
+    _same_names(root, {t.name for t in images}, {t.name for t in opened.targets}, "the scene's targets", fix)
+    with PredictionWriter(root) as writer:
+        for target, image in images.items():
+            camera = opened.cameras[target.camera]
+            if image.shape != (camera.height, camera.width) or not np.isfinite(image).all():
+                expected = f"finite radiance [{camera.height}, {camera.width}]"
+                found = f"{image.shape}" if np.isfinite(image).all() else "NaN or infinity"
+                raise problem(f"image of {target.name}", expected, found, "correct the image")
+            writer.add(target, np.asarray(image, np.float32), opened.t_us(target.tick))
+        costs = {"fit_seconds": fit_seconds, "render_fps": render_fps}
+        about = {"scene": opened.id, "scene_revision": opened.revision, "split": opened.split, "created": utc_now()}
+        writer.finish(PredictionInfo(MethodInfo(method), **about, **costs))
+    return root

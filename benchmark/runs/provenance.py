@@ -12,11 +12,12 @@ from typing import Any, Protocol, runtime_checkable
 
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio, to_nerfstudio
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import check_ids
 
 
-@dataclass(frozen=True, eq=False)
-class Provenance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Provenance(Shown):
     """The method, the scene and the run that a fitted model comes from."""
 
     method: dict[str, Any]  # name, version, params (recipe and settings), seed, trained_on
@@ -42,6 +43,10 @@ class Provenance:
     def duration_us(self) -> float:
         """Length of the clip in microseconds."""
         return self.n_ticks * 1e6 / self.rate_hz
+
+    def _about(self) -> str:
+        made = f"seed {self.method['seed']}, budget {self.budget}, fitted in {self.fit_seconds:.1f} s on {self.device}"
+        return f"{self.name} on {self.scene}: {made}, {self.created}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; cameras in nerfstudio's keys, as in a scene folder."""

@@ -7,6 +7,7 @@ and a scene without a value makes the mean null, never smaller.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from spike4dgs.benchmark.environment import command_line, environment, harness, 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.metrics.measure import Values, mean, scene_means
-from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import matches
 
 IDEAL, PARTLY, NOISY, RECORDED = "ideal", "partly noisy", "noisy", "recorded"
@@ -45,6 +47,34 @@ SCHEMA = "spike4dgs-result/1"
 PROTOCOL: dict[str, Any] = {"name": "held-out-views", "version": 1}  # raise the version when a score would change
 Record = dict[str, Any]
 Cell = dict[str, Any]
+
+
+class ShownRecord(Shown, Record):
+    """A record that shows its scenes and scores, not every value."""
+
+    _kind = "Record"
+    __repr__ = Shown.__repr__
+
+    def _about(self) -> str:
+        method, scenes = self["method"], self["scenes"]
+        failed = sum(cell["status"] != "ok" for cell in scenes.values())
+        values = [f"{m} {METRICS[m].format(self['mean'][m])}" for m in MAIN if self["mean"].get(m) is not None]
+        number = f"{len(scenes)} scene{'s' * (len(scenes) > 1)}" + (f", {failed} without scores" if failed else "")
+        return f"{method['name']}, seed {method['seed']}: {', '.join([number, *values])}"
+
+    def _repr_html_(self) -> str:
+        metrics = [m for m in MAIN if any(cell["metrics"].get(m) is not None for cell in self["scenes"].values())]
+        rows = {**{scene: cell["metrics"] for scene, cell in self["scenes"].items()}, "mean": self["mean"]}
+        head = "".join(f"<th>{escape(METRICS[m].title)}</th>" for m in metrics)
+        body = "".join(
+            f"<tr><th>{escape(name)}</th>"
+            + "".join(f"<td>{METRICS[m].format(row.get(m))}</td>" for m in metrics)
+            + "</tr>"
+            for name, row in rows.items()
+        )
+        return f"{super()._repr_html_()}<table><tr><th></th>{head}</tr>{body}</table>"
+
+
 COSTS = {  # of a cell -> title, digits shown to people
     "fit_seconds": ("fit, s", 1),
     "render_fps": ("images/s", 1),
@@ -92,7 +122,7 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
         "created": utc_now(),
     }
     check_record(record, f"the record of {method.name}")
-    return record
+    return ShownRecord(record)
 
 
 def with_earlier_scenes(record: Record, path: Path) -> Record:
@@ -231,13 +261,14 @@ def same_value(a: float | None, b: float | None, tolerance: float) -> bool:
     return a == b if a is None or b is None else abs(a - b) <= tolerance
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path | str) -> Record:
     """Read and check a result record. Raises UserError where it is missing, damaged or inconsistent."""
+    path = Path(path)
     record = read_json(path, f"a {SCHEMA} record")
     check_form(record, path)
     record = with_later_metrics(record)
     check_record(record, path)
-    return record
+    return ShownRecord(record)
 
 
 def write_record(path: Path, record: Record) -> None:

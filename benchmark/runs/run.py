@@ -145,7 +145,7 @@ def run_matrix(
     records: dict[int, list[Record]] = {}
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(console, len(jobs), [job.method.name for job in jobs]) as display,
+        RunDisplay(console, len(jobs), [files.job.method.name for files in jobs]) as display,
     ):
         for k, cells in _run_cells(jobs, settings, selection, display):
             found[k] = cells

@@ -20,17 +20,23 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 
-@dataclass(frozen=True, eq=False)
-class Recordings:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recordings(Shown):
     """Two recordings of one camera: under uniform light of a known radiance, and in the dark."""
 
     flat: Recording
     dark: Recording
     flat_radiance: float
+
+    def _about(self) -> str:
+        size = f"{self.flat.width}x{self.flat.height} pixels"
+        ticks = f"{self.flat.n_ticks} ticks under light of {self.flat_radiance:g}, {self.dark.n_ticks} in the dark"
+        return f"of a camera: {size}, {ticks}"
 
 
 def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size: tuple[int, int]) -> Recordings | None:
@@ -52,13 +58,18 @@ def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size:
     return Recordings(found[0], found[1], float(facts["flat_radiance"]))
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Shown):
     """A camera's response to light, as estimated from its recordings."""
 
     gain: Float32  # [H, W] relative sensitivity, mean 1
     dark: Float32  # [H, W] spikes per tick in the dark
     radiance_gain: float  # spikes per tick of a pixel of gain 1 at radiance 1, without the dark rate
+
+    def _about(self) -> str:
+        height, width = self.gain.shape
+        dead = int((self.gain <= 0).sum())
+        return f"of a camera: {width}x{height} pixels, {dead} dead, {self.radiance_gain:.4g} spikes per tick of white"
 
     def radiance(self, rate: Float32) -> Float32:
         """Return the linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""

@@ -14,14 +14,15 @@ from typing import Any
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_file, write_json
 from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import matches
 
 NAME = "manifest.json"
 _SCHEMA = "spike4dgs-manifest/1"
 
 
-@dataclass(frozen=True)
-class Manifest:
+@dataclass(frozen=True, repr=False)
+class Manifest(Shown):
     """The recorded files of a scene folder.
 
     `files` maps a relative path to (bytes, sha256), `recorded` the path of encoded data to the hash of its content, as
@@ -32,6 +33,9 @@ class Manifest:
     files: dict[str, tuple[int, str]]
     recorded: dict[str, str] = field(default_factory=dict)
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
+
+    def _about(self) -> str:
+        return f"of {self.root.name[:100]}: {len(self.files)} files"
 
     def path(self, name: str) -> Path:
         """Return the path of a recorded file after its size and hash were checked (once per process).

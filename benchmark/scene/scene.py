@@ -6,7 +6,7 @@ manifest before it is used, so a damaged stream is refused by whoever reads it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,39 +15,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate, find_recordings
 from spike4dgs.benchmark.scene.camera_state import PERFECT, CameraState
 from spike4dgs.benchmark.scene.cameras import Camera, camera_facts, read_cameras
 from spike4dgs.benchmark.scene.content import revision_of
-from spike4dgs.benchmark.scene.images import read_exr, read_mask, read_rgb
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask, read_rgb
 from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
 from spike4dgs.benchmark.scene.other_sensors import EventStream, Frames, events_of, find_events, find_frames, frames_of
-from spike4dgs.benchmark.scene.splits import Split, check_splits
+from spike4dgs.benchmark.scene.splits import Target as Target
+from spike4dgs.benchmark.scene.splits import check_splits, read_targets
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.screen.shown import Shown, Table
 from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps, refuse_gaps
 from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 
 SCHEMA = "spike4dgs-scene/1"
+_SHOWN = 4  # thumbnails of a scene
 
 
-@dataclass(frozen=True, order=True)
-class Target:
-    """One scored image: a held-out camera at a tick."""
-
-    camera: str
-    tick: int
-
-    @property
-    def name(self) -> str:
-        """The image's path below `images/` or a predictions folder, without suffix: `cam_04/000120`."""
-        return f"{self.camera}/{self.tick:06d}"
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingScene:
+@dataclass(frozen=True, eq=False, repr=False)
+class TrainingScene(Shown):
     """The part of a scene that methods get: the clock, and the training cameras with their streams and recordings.
 
     It has no ground truth, and nothing of a held-out camera: neither its stream nor its frames nor its events.
@@ -92,9 +83,19 @@ class TrainingScene:
         """Return the tick that contains the time `t_us`, clipped to the clip."""
         return int(min(max(t_us * self.rate_hz * 1e-6, 0), self.n_ticks - 1))
 
+    def _about(self) -> str:
+        given = ", ".join(name for name in ("recordings", "found_frames", "found_events") if getattr(self, name))
+        extras = f"; {given.replace('found_', '')}" if given else ""
+        return f"{self.id}: {_clip(self.cameras, self.n_ticks, self.rate_hz)}{extras}"
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+    def _thumbnails(self) -> Iterator[tuple[str, UInt8]]:
+        for camera, stream in list(zip(self.cameras, self.streams, strict=True))[:_SHOWN]:
+            for _, image in stream._thumbnails():
+                yield f"spikes of {camera.id}", image
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Shown):
     """An opened scene folder with one of its splits, which decides `train`, `test`, `targets` and `training`.
 
     Images are gray linear radiance, [H, W] float32, 1.0 = white.
@@ -115,7 +116,7 @@ class Scene:
     @cached_property
     def revision(self) -> str:
         """SHA-256 of what is fitted and scored; see `scene.content`. Texts, versions and encodings do not change it."""
-        every_split = _read_targets(self.manifest.path("targets.json"), self.meta)
+        every_split = read_targets(self.manifest.path("targets.json"), self.meta)
         targets = {name: [[t.camera, t.tick] for t in targets] for name, targets in every_split.items()}
         gaps = [[g.camera, g.first_tick, g.ticks] for g in self.gaps]
         return revision_of(self.meta, camera_facts(self.root), targets, gaps, self.manifest.contents(self.meta))
@@ -208,6 +209,21 @@ class Scene:
         """Ticks that a recording lacks, in order of camera and tick. Raises UserError where scene.json is damaged."""
         return read_gaps(self.meta["gaps"], dict.fromkeys(self.meta["streams"], self.n_ticks), self.root / "scene.json")
 
+    def _about(self) -> str:
+        split = (
+            f"split {self.split}: {len(self.train)} training, {len(self.test)} held out, {len(self.targets)} targets"
+        )
+        return f"{self.id}: {_clip(tuple(self.cameras.values()), self.n_ticks, self.rate_hz)}; {split}"
+
+    def _thumbnails(self) -> Iterator[tuple[str, UInt8]]:
+        """Yield the truth of the middle target, and spikes of training cameras."""
+        if self.targets and "images" in {name.partition("/")[0] for name in self.manifest.files}:
+            target = self.targets[len(self.targets) // 2]
+            yield f"truth of {target.name}", encode_srgb(self.ground_truth(target))
+        for camera in self.train[: _SHOWN - 1]:
+            for _, image in self.stream(camera)._thumbnails():
+                yield f"spikes of {camera}", image
+
     @cached_property
     def training(self) -> TrainingScene:
         """The part of the scene that methods get. The missing ticks of a recording are filled (`spikes.repair`)."""
@@ -218,6 +234,13 @@ class Scene:
         frames = find_frames(self.meta, self.manifest, self.train)
         events = find_events(self.meta, self.manifest, self.train)
         return TrainingScene(self.id, self.revision, cameras, streams, *clock, recordings, frames, events)
+
+
+def _clip(cameras: Sequence[Camera], n_ticks: int, rate_hz: float) -> str:
+    """Return the cameras and the clip in words."""
+    sizes = ", ".join(sorted({f"{c.width}x{c.height}" for c in cameras}))
+    clip = f"{n_ticks} ticks at {rate_hz:.6g} Hz ({1e3 * n_ticks / rate_hz:.6g} ms)"
+    return f"{len(cameras)} cameras of {sizes} pixels, {clip}"
 
 
 def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = None) -> Scene:
@@ -236,12 +259,12 @@ def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = N
         manifest.path(name)
     cameras = read_cameras(root)
     check_splits(meta, cameras, root / "scene.json")
-    targets = _read_targets(root / "targets.json", meta)
+    targets = read_targets(root / "targets.json", meta)
     chosen = meta["default_split"] if split is None else split
     if chosen not in targets:
         expected = f"a split among {', '.join(meta['splits'])}"
         raise problem(root / "scene.json", expected, repr(chosen), "name one of them")
-    scene = Scene(root, meta, cameras, chosen, targets[chosen], manifest)
+    scene = Scene(root, meta, Table("cameras", cameras), chosen, targets[chosen], manifest)
     refuse_gaps(scene.gaps, root / "scene.json", allow_gaps)
     return scene
 
@@ -252,39 +275,6 @@ def check_meta(meta: dict[str, Any], path: Path) -> None:
         found = f"schema {meta.get('schema')!r}"
         raise problem(path, f"schema '{SCHEMA}'", found, "it is not a scene of this format: make or import one")
     check_schema(meta, load_schema("spike4dgs.benchmark", "scene.schema.json"), path, "make or import the scene again")
-
-
-def _read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
-    """Read the targets of every split: splits that hold out the same cameras as the default one have its targets."""
-    data = read_json(path, "the scored images")
-    splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
-    held_out = splits[meta["default_split"]].test
-    try:
-        default = _parse_targets(data["targets"])
-        others = {str(name): _parse_targets(targets) for name, targets in data.get("splits", {}).items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
-        raise problem(path, "lists of {camera, tick}", repr(e), "restore it or make the scene again") from None
-    needed = {name for name, s in splits.items() if set(s.test) != set(held_out)}
-    if set(others) != needed:
-        found = ", ".join(sorted(others)) or "none"
-        raise problem(path, f"targets of the splits {', '.join(sorted(needed)) or '(none)'}", found, "restore the file")
-    targets = {name: others.get(name, default) for name in splits}
-    for name, of_split in targets.items():
-        _check_targets(path, of_split, splits[name].test, meta["n_ticks"])
-    return targets
-
-
-def _parse_targets(items: list[dict[str, Any]]) -> tuple[Target, ...]:
-    return tuple(Target(str(t["camera"]), int(t["tick"])) for t in items)
-
-
-def _check_targets(path: Path, targets: tuple[Target, ...], held_out: tuple[str, ...], n_ticks: int) -> None:
-    for i, t in enumerate(targets):
-        found = f"{t.camera} at tick {t.tick}"
-        if t.camera not in held_out or not 0 <= t.tick < n_ticks:
-            raise problem(path, "held-out cameras and ticks of this scene", found, "restore the file")
-        if t in targets[:i]:
-            raise problem(path, "distinct targets", f"{found} twice", "restore the file")
 
 
 def open_scenes(paths: Sequence[Path], allow_gaps: bool = False, split: str | None = None) -> list[Scene]:

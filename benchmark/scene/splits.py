@@ -1,14 +1,16 @@
-"""Splits: the training cameras and the held-out cameras of a scene, and the standard splits of an array."""
+"""Splits: the training and held-out cameras of a scene, its scored images, and the standard splits of an array."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.untrusted import check_ids
 
@@ -21,6 +23,19 @@ class Split(NamedTuple):
 
     train: tuple[str, ...]
     test: tuple[str, ...]
+
+
+@dataclass(frozen=True, order=True)
+class Target:
+    """One scored image: a held-out camera at a tick."""
+
+    camera: str
+    tick: int
+
+    @property
+    def name(self) -> str:
+        """The image's path below `images/` or a predictions folder, without suffix: `cam_04/000120`."""
+        return f"{self.camera}/{self.tick:06d}"
 
 
 def standard_splits(cameras: Sequence[Camera], held_out: str) -> dict[str, Split]:
@@ -82,3 +97,36 @@ def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: P
         if both or unknown:
             found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
             raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
+
+
+def read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
+    """Read the targets of every split: splits that hold out the same cameras as the default one have its targets."""
+    data = read_json(path, "the scored images")
+    splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
+    held_out = splits[meta["default_split"]].test
+    try:
+        default = _parse_targets(data["targets"])
+        others = {str(name): _parse_targets(targets) for name, targets in data.get("splits", {}).items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise problem(path, "lists of {camera, tick}", repr(e), "restore it or make the scene again") from None
+    needed = {name for name, s in splits.items() if set(s.test) != set(held_out)}
+    if set(others) != needed:
+        found = ", ".join(sorted(others)) or "none"
+        raise problem(path, f"targets of the splits {', '.join(sorted(needed)) or '(none)'}", found, "restore the file")
+    targets = {name: others.get(name, default) for name in splits}
+    for name, of_split in targets.items():
+        _check_targets(path, of_split, splits[name].test, meta["n_ticks"])
+    return targets
+
+
+def _parse_targets(items: list[dict[str, Any]]) -> tuple[Target, ...]:
+    return tuple(Target(str(t["camera"]), int(t["tick"])) for t in items)
+
+
+def _check_targets(path: Path, targets: tuple[Target, ...], held_out: tuple[str, ...], n_ticks: int) -> None:
+    for i, t in enumerate(targets):
+        found = f"{t.camera} at tick {t.tick}"
+        if t.camera not in held_out or not 0 <= t.tick < n_ticks:
+            raise problem(path, "held-out cameras and ticks of this scene", found, "restore the file")
+        if t in targets[:i]:
+            raise problem(path, "distinct targets", f"{found} twice", "restore the file")

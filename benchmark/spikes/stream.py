@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import mmap
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import writing
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.gaps import Gap
+
+_SHOWN_TICKS = 200  # of a thumbnail
 
 
 def bytes_per_tick(width: int, height: int) -> int:
@@ -26,12 +30,15 @@ def bytes_per_tick(width: int, height: int) -> int:
     return (width * height + 7) // 8
 
 
-@dataclass(frozen=True, eq=False)
-class SpikeStream:
+@dataclass(frozen=True, eq=False, repr=False)
+class SpikeStream(Shown):
     """A packed stream. `packed` is [n_ticks, bytes_per_tick] uint8, usually a read-only memory map.
 
     `rows_bottom_up` is the order of rows in the file; every method returns images with row 0 at the top. `gaps` are
     the ticks of a recording that were lost: they hold zeros, which are no measurement.
+
+    >>> SpikeStream(pack(np.tile(np.eye(8), (25, 1, 1))), 8, 8, 20_000.0)
+    <SpikeStream memory: 8x8 pixels, 25 ticks at 20000 Hz (1.25 ms)>
     """
 
     packed: UInt8
@@ -74,6 +81,21 @@ class SpikeStream:
         if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)
 
+    def _about(self) -> str:
+        lost = f", {sum(g.ticks for g in self.gaps)} ticks lost" if self.gaps else ""
+        duration = f"{self.n_ticks} ticks at {self.rate_hz:.6g} Hz ({1e3 * self.n_ticks / self.rate_hz:.6g} ms)"
+        return f"{Path(self.source).name[:100]}: {self.width}x{self.height} pixels, {duration}{lost}"
+
+    def _thumbnails(self) -> Iterator[tuple[str, UInt8]]:
+        """Yield the rates in the middle of the clip: the square root, so that dark pixels show too."""
+        first, ticks = max(0, self.n_ticks - _SHOWN_TICKS) // 2, min(self.n_ticks, _SHOWN_TICKS)
+        counts = self.counts(first, first + ticks).astype(np.float64)
+        white = max(float(np.percentile(counts, 99)), 1.0)
+        yield (
+            f"spikes of ticks {first} to {first + ticks - 1}",
+            np.rint(255 * np.sqrt(np.minimum(counts / white, 1))).astype(np.uint8),
+        )
+
     def _check(self, start: int, stop: int) -> None:
         if not 0 <= start <= stop <= self.n_ticks:
             raise problem(self.source, f"a window within ticks [0, {self.n_ticks})", f"[{start}, {stop})", "shorten it")
@@ -94,7 +116,7 @@ def pack(spikes: NDArray[np.generic], rows_bottom_up: bool = True) -> UInt8:
 
 
 def open_stream(
-    path: Path,
+    path: Path | str,
     width: int,
     height: int,
     rate_hz: float,
@@ -106,7 +128,13 @@ def open_stream(
     """Memory-map a stream file. `gaps`: the ticks that it lacks by its description.
 
     Raises UserError where the file is missing, empty, no whole number of ticks, or not `n_ticks` long (if given).
+
+    >>> with SpikeWriter(Path("car.dat"), 8, 2) as w:
+    ...     w.write(np.zeros((100, 2), np.uint8))
+    >>> open_stream("car.dat", 8, 2, 20_000.0)
+    <SpikeStream car.dat: 8x2 pixels, 100 ticks at 20000 Hz (5 ms)>
     """
+    path = Path(path)
     size = bytes_per_tick(width, height)
     if width <= 0 or height <= 0:
         raise problem(path, "a positive width and height", f"{width}x{height}", "correct them")

@@ -13,7 +13,7 @@ from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.leaderboard.page.intervals import Comparison
 from spike4dgs.leaderboard.page.rows import Board, Row
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded
-from spike4dgs.leaderboard.tracks import current_release
+from spike4dgs.leaderboard.tracks import PUBLIC, current_release
 
 PARTS = ("images", "initialization", "motion", "supervision")
 PAPER_TABLES = (1, 2)  # those of whole methods by scene
@@ -40,6 +40,7 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
         "id": identifier,
         "name": board.name,
         "title": board.title,
+        "label": board.name if board.folder == PUBLIC else board.title,
         "folder": board.folder,
         "why": board.why,
         "withheld": list(board.withheld),

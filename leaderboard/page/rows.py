@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from spike4dgs.leaderboard.tracks import (
     ARCHIVE,
     LOCAL,
     PUBLIC,
+    SHIPPED,
     current_release,
     dataset_revision,
     on_release,
@@ -24,6 +25,7 @@ from spike4dgs.leaderboard.tracks import (
     short,
 )
 
+_NAMED = 4  # scenes that a board's title names
 OWN = "own run"  # the label of a reader's records, beside those of entries
 
 
@@ -69,17 +71,21 @@ class Board:
         return sorted(self.dataset["scenes"])
 
 
-def gather(leaderboard: Path, runs: Sequence[Path]) -> tuple[list[Board], list[dict[str, str]]]:
+def gather(
+    leaderboard: Path, runs: Sequence[Path], published: bool = False
+) -> tuple[list[Board], list[dict[str, str]]]:
     """Return the boards of a leaderboard's entries with the rows of finished runs, and the refused entries.
 
-    A run's record that equals an entry, image by image, lends its images to the entry's row. Raises UserError where a
-    run has no records.
+    With `published` the entries that the package ships stand among them. A run's record that equals an entry, image by
+    image, lends its images to the entry's row. Raises UserError where a run has no records.
     """
     boards, refused = [], []
     for folder, file in make_boards(leaderboard).items():
         entries, _ = read_entries(leaderboard, folder)
         refused += file["refused"]
         boards += [_board(leaderboard, folder, board, entries) for board in file["boards"]]
+    if published and leaderboard.resolve() != SHIPPED.resolve():
+        _add_published(boards)
     for run in runs:
         for records in seeds_of_methods(run_records(run)):
             for board in _boards_of(boards, records[0]):
@@ -105,8 +111,21 @@ def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], entries: Ma
         records = tuple(e["record"] for e in own.values())
         hashes = {path: sha256_json(read_json(leaderboard / path, "a leaderboard entry")) for path in own}
         rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes))
-    name, title = board["track"] or board["title"], board["title"]
+    name, title = (board["track"], board["title"]) if board["track"] else (board["title"], in_words(board["dataset"]))
     return Board(name, title, folder, board["why"], tuple(board["withheld"]), board["dataset"], rows)
+
+
+def _add_published(boards: list[Board]) -> None:
+    """Add the rows of the shipped entries, except those that are there; another row of a name is marked."""
+    for theirs in gather(SHIPPED, ())[0]:
+        same = (theirs.folder, theirs.name, theirs.dataset)
+        ours = next((b for b in boards if (b.folder, b.name, b.dataset) == same), None)
+        if ours is None:
+            boards.append(theirs)
+            continue
+        names, hashes = {row.name for row in ours.rows}, {h for row in ours.rows for h in row.hashes.values()}
+        for row in (r for r in theirs.rows if not hashes.issuperset(r.hashes.values())):
+            ours.rows.append(replace(row, name=f"{row.name} (published)") if row.name in names else row)
 
 
 def _boards_of(boards: list[Board], record: Record) -> Iterator[Board]:
@@ -120,7 +139,7 @@ def _boards_of(boards: list[Board], record: Record) -> Iterator[Board]:
                 break
         else:
             track = tracks.get(name) if place.is_public else None
-            title, withheld = (track.title, tuple(sorted(track.withheld))) if track else (name, ())
+            title, withheld = (track.title, tuple(sorted(track.withheld))) if track else (in_words(dataset), ())
             board = Board(name, title, PUBLIC if track else LOCAL, place.why, withheld, dataset, [])
             boards.append(board)
         yield board
@@ -160,7 +179,31 @@ def find_board(boards: Sequence[Board], name: str) -> Board:
     for board in boards:
         if board.name == name:
             return board
-    raise problem("--track", f"one of {', '.join(b.name for b in boards)}", repr(name), "correct the name")
+    names = ", ".join(dict.fromkeys(b.name for b in boards))
+    if name in {track.name for track in current_release().tracks}:
+        fix = f"choose one of {names}, or enter the first result with `spike4dgs submit`"
+        raise problem("--track", "a track with entries", f"{name}, which has none yet", fix)
+    raise problem("--track", f"one of {names}", repr(name), "correct the name")
+
+
+def in_words(dataset: Mapping[str, Any]) -> str:
+    """Return the scenes of a board that is no track's in words.
+
+    >>> in_words({"scenes": dict.fromkeys(["turntable-0-small", "bird-0-small"])})
+    'bird and turntable, small'
+    >>> in_words({"scenes": {"car-2-small-lens": ""}})
+    'car-2-small-lens'
+    """
+    ids = sorted(dataset["scenes"])
+    parts = [scene.split("-") for scene in ids]
+    worlds, plain = [part[0] for part in parts], {tuple(part[1:]) for part in parts}
+    if len(plain) > 1 or any(len(part) != 3 or part[1] != "0" for part in parts):
+        worlds, profile = ids, ""
+    else:
+        profile = f", {parts[0][2]}"
+    if len(worlds) > _NAMED:
+        worlds = [*worlds[:_NAMED], f"{len(worlds) - _NAMED} more"]
+    return " and ".join([", ".join(worlds[:-1]), worlds[-1]] if len(worlds) > 1 else worlds) + profile
 
 
 def titles(boards: Iterable[Board]) -> list[str]:

@@ -60,8 +60,9 @@ def write_site(
     refused: Sequence[Mapping[str, str]] = (),
     data: Path = Path("data"),
     progress: Callable[[str], None] = lambda text: None,
+    docs: str = "",
 ) -> Site:
-    """Write the page of some boards; equal boards give equal bytes.
+    """Write the page of some boards; equal boards give equal bytes. `docs`: the path of the documentation's site.
 
     An earlier page in `out` is replaced. Raises UserError where something else is there, and where a vendored library
     is not the one that was pinned.
@@ -88,7 +89,7 @@ def write_site(
         one["pictures"] = [p is not None for p in pictures]
         put(f"pictures-{number}", pictures)
         content.append(one)
-    put("boards", {**facts(boards), "boards": content, "refused": list(refused)})
+    put("boards", {**facts(boards), "docs": docs, "boards": content, "refused": list(refused)})
     for earlier in [*(out / "data").glob("*"), *(out / "pictures").rglob("*.webp")]:
         if earlier not in written:
             earlier.unlink()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
 from spike4dgs.method.settings import Settings
@@ -42,8 +43,8 @@ def _no_rate(stream: SpikeStream, tick: int, settings: Any) -> Float32:
     raise NotImplementedError("an image maker without `rate` makes its images in a subclass")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImageMaker:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ImageMaker(Shown):
     """A named way from spikes to images. A table of recipes' parts holds these.
 
     `rate` returns spikes per tick [H, W] float32 at the start of a tick. A pixel's own rate can be corrected by its
@@ -69,6 +70,9 @@ class ImageMaker:
     rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
     label: str | None = None  # in descriptions of recipes, after "images"; None: the name
+
+    def _about(self) -> str:
+        return f"{self.name}: {self.definition}"
 
     def with_settings(self, settings: Settings) -> ImageMaker:
         """Return the same maker with other numbers. Raises TypeError for the settings of another maker."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.arrays import Float32, UInt8
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.model_file import (
@@ -75,7 +77,7 @@ class MotionSpec:
         return cls(value["name"], extent, settings)
 
 
-class GaussianModel:
+class GaussianModel(Shown):
     """A model that renders what its `splats` are at a time."""
 
     duration_us: float
@@ -114,7 +116,7 @@ class GaussianModel:
         return refine_pose(lambda v: self.rendered(splats, v), camera, image, background, depth_m, device=self.device)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FittedModel(GaussianModel):
     """Gaussians and how they move, and others that do not."""
 
@@ -129,6 +131,16 @@ class FittedModel(GaussianModel):
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
     estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
+
+    def _about(self) -> str:
+        moving = ", ".join(str(len(g)) for g in self.pieces)
+        background = f" and {len(self.background)} of a background" if len(self.background) else ""
+        return f"{self.spec.name}: {moving} Gaussians{background}, {self.duration_us / 1e3:.6g} ms, on {self.device}"
+
+    def _thumbnails(self) -> Iterator[tuple[str, UInt8]]:
+        """Yield a render of the first training camera in the middle of the clip."""
+        for camera in self.cameras[:1]:
+            yield f"{camera.id}, middle of the clip", encode_srgb(self.render(camera, self.duration_us / 2))
 
     @property
     def size_bytes(self) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from spike4dgs.baselines.recipes import METHODS, PARTS
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import peak_memory_mb, reset_peak_memory
-from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, training_for
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, no_progress, training_for
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings
@@ -54,7 +54,7 @@ def fitted(recipe: Recipe, trial: Trial, scene: Scene, request: Request, warm_up
     parts = PARTS if trial.pieces is None else replace(PARTS, motion={**PARTS.motion, "paths": cut_in(trial.pieces)})
     changed = replace(recipe, settings={**recipe.settings, **trial.settings})
     method = RecipeMethod(changed, parts)
-    fit = FitRequest(Budget(trial.scale), request.device, request.seed)
+    fit = FitRequest(Budget(trial.scale), request.device, request.seed, no_progress)
     if warm_up:
         method.warm_up(fit)
     reset_peak_memory(request.device)

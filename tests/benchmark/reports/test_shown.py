@@ -13,6 +13,7 @@ from rich.console import Console
 
 from spike4dgs.benchmark.reports.console import Columns, print_results, seeds_of_methods
 from spike4dgs.benchmark.reports.error_map import choose_scale, error_image, error_levels, scale_name
+from spike4dgs.benchmark.reports.paper_files import write_results_table
 from spike4dgs.benchmark.runs.record import missing_cell
 
 
@@ -63,6 +64,20 @@ def test_the_short_table_fits_a_terminal_and_cuts_no_name(small_scene: Path, tmp
         assert row[1] == f"{record['mean']['psnr']:.2f}" and "pattern-0" in text
     assert "temporal" not in text
     assert "temporal" in printed([record], 80, "all") and name in printed([record], 80, "all")
+
+
+def test_tables_for_papers_have_the_best_in_bold(small_scene: Path, tmp_path: Path) -> None:
+    (record,) = run(tmp_path / "run", [small_scene], CountMethod("ours[motion.lr_grid=0.1]"), metrics=("psnr", "ssim"))
+    cell = record["scenes"]["pattern-0"]
+    worse = {**cell, "metrics": {**cell["metrics"], "psnr": cell["metrics"]["psnr"] - 1}}
+    other = {**record, "method": {**record["method"], "name": "a_method"}, "scenes": {"pattern-0": worse}}
+    write_results_table(tmp_path, [record, other])
+    markdown, latex = (tmp_path / "table.md").read_text(), (tmp_path / "table.tex").read_text()
+    psnr, less = f"{cell['metrics']['psnr']:.2f}", f"{worse['metrics']['psnr']:.2f}"
+    assert f"| ours[motion.lr_grid=0.1] | **{psnr}** |" in markdown and f"| a_method | {less} |" in markdown
+    assert rf"ours[motion.lr\_grid=0.1] & \textbf{{{psnr}}} &" in latex and rf"a\_method & {less} &" in latex
+    header, first = (line.split(" & ") for line in latex.splitlines() if " & " in line and "a\\_" not in line)
+    assert len(header) == len(first) == 1 + latex.partition("{l")[2].partition("}")[0].count("r")
 
 
 def test_a_seed_that_failed_leaves_no_mean(small_scene: Path, tmp_path: Path) -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import sys
+import types
 
+import pytest
 from rich.console import Console
 
 from spike4dgs.benchmark.runs import display
 from spike4dgs.benchmark.runs.display import RunDisplay
-from spike4dgs.benchmark.screen import bars
+from spike4dgs.benchmark.screen import bars, fit_progress
 from spike4dgs.benchmark.screen.bars import NotebookBars, Pace, left_text, make_bars
+from spike4dgs.benchmark.screen.fit_progress import FitProgress
 
 
 class Clock:
@@ -80,6 +84,7 @@ def test_a_terminal_has_bars_and_a_file_has_none() -> None:
 
 
 def test_a_notebook_has_bars_of_html(monkeypatch) -> None:
+    pytest.importorskip("IPython")
     shown: list[str] = []
 
     class Handle:
@@ -93,3 +98,30 @@ def test_a_notebook_has_bars_of_html(monkeypatch) -> None:
     made.update(task, completed=2)
     made.stop()
     assert '<progress value="2" max="8"></progress> images of &lt;car&gt; 2/8' in shown[-1]
+
+
+def test_a_fit_in_a_notebook_shows_one_bar_that_ends_full(monkeypatch) -> None:
+    shown: list[str] = []
+
+    class Handle:
+        def update(self, html) -> None:
+            shown.append(html.data)
+
+    def display(html, display_id) -> Handle:
+        shown.append(html.data)
+        return Handle()
+
+    fake = types.SimpleNamespace(HTML=lambda data: types.SimpleNamespace(data=data), display=display)
+    monkeypatch.setattr(fit_progress, "in_notebook", lambda: True)
+    monkeypatch.setitem(sys.modules, "IPython.display", fake)
+    progress = FitProgress()
+    progress(0, 1, "images")
+    progress(10, 30, "loss 0.1")
+    progress(30, 30, "loss 0.02")
+    assert "<progress ></progress> images" in shown[0]
+    assert '<progress value="30" max="30"></progress> loss 0.02 30/30' in shown[-1]
+
+
+def test_a_fit_without_terminal_and_notebook_shows_nothing(capsys) -> None:
+    FitProgress()(30, 30, "loss 0.02")
+    assert capsys.readouterr() == ("", "")

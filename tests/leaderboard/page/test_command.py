@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.cli import main
+from spike4dgs.leaderboard.entry import add_line
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
@@ -23,11 +25,53 @@ def test_the_ranking_has_intervals_ties_and_reasons(capsys: pytest.CaptureFixtur
 
 
 def test_own_runs_stand_beside_and_failures_have_a_reason(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(["leaderboard", "--leaderboard", str(tmp_path / "none"), "--runs", str(finished / "out")]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["leaderboard", "--runs", str(finished / "out")]) == 0
     out = capsys.readouterr().out
-    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out
+    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out and "outdoor-small" in out
+
+
+def test_an_empty_folder_has_the_published_entries(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["leaderboard"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("published entries of release 1") and "41.98" in out
+    assert main(["leaderboard", "--track", "objects-small"]) == 2
+    assert "a track with entries, found objects-small, which has none yet; choose one of outdoor-small" in (
+        capsys.readouterr().err
+    )
+    assert main(["leaderboard", "--track", "outdor"]) == 2
+    assert "expected one of outdoor-small, quick-start, no-flat-field, " in capsys.readouterr().err
+
+
+def test_a_leaderboard_that_does_not_exist_or_is_empty_is_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["leaderboard", "--leaderboard", str(tmp_path / "none")]) == 2
+    assert "a leaderboard with entries, found no such folder" in capsys.readouterr().err
+    assert main(["leaderboard", "--leaderboard", str(tmp_path)]) == 2
+    assert "found none; `run-benchmark` writes one" in capsys.readouterr().err
+
+
+def test_entries_of_ones_own_stand_among_the_published_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A copy of the published entries without one method, and with another record of a second."""
+    own = tmp_path / "own"
+    (folder,) = COMMITTED.glob("entries/1-quick-start@*")
+    shutil.copytree(folder, own / "entries" / folder.name)
+    shutil.copy(COMMITTED / "LEDGER", own)
+    (own / "entries" / folder.name / "tfi+4dgs.json").unlink()
+    path = own / "entries" / folder.name / "tfp+4dgs.json"
+    entry = read_json(path, "an entry") | {"submitted": "2031-01-01T00:00:00Z"}
+    write_json(path, entry)
+    add_line(own, sha256_json(entry), path.relative_to(own).as_posix())
+    assert main(["leaderboard", "--track", "quick-start", "--leaderboard", str(own)]) == 0
+    names = [line.split()[1:3] for line in capsys.readouterr().out.splitlines()[2:]]
+    assert ["tfp+4dgs", "(published)"] in names and ["tfi+4dgs", "31.74"] in names
+    assert sum(name[:1] == ["tfp+4dgs"] for name in names) == 2 and sum(n[:1] == ["spike4dgs-x"] for n in names) == 1
 
 
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -36,11 +80,12 @@ def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_run_without_its_scenes_gives_a_page_without_images(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     shutil.copytree(finished / "out", tmp_path / "first")
     given = ["--out", str(tmp_path / "page"), "--runs", str(tmp_path / "first"), "--data", str(tmp_path)]
-    assert main(["leaderboard", "build", *given, "--leaderboard", str(tmp_path / "none")]) == 0
+    assert main(["leaderboard", "build", *given]) == 0
     out = capsys.readouterr().out
     assert "left out: no images of pattern-0" in out and str(tmp_path / "page/index.html") in out
     assert (tmp_path / "page/data/boards.js").is_file() and not (tmp_path / "page/pictures").exists()

@@ -54,7 +54,7 @@ Spike4DGS.app = (() => {
     if (!board) return;
     const view = Spike4DGS.model.view(page, board, state);
     const act = { change, unfilter: () => { location.hash = serialize(unfiltered(parse(location.hash))); } };
-    document.title = `${board.name}: Spike4DGS leaderboard`;
+    document.title = `${board.label}: Spike4DGS leaderboard`;
     Spike4DGS.controls.tabs(page, board, link);
     Spike4DGS.controls.about(board);
     Spike4DGS.controls.form(page, board, state, view, change);
@@ -86,6 +86,31 @@ Spike4DGS.app = (() => {
 
   const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
 
+  /* A page of the documentation, where it is known. */
+  const docs = (path, text) => page.docs && el("a", { href: page.docs + path }, text);
+
+  function links() {
+    const submit = el("a", { href: "#" }, "Submit a result");
+    submit.addEventListener("click", (e) => {
+      e.preventDefault();
+      byId("submit").open = true;
+      byId("submit").scrollIntoView();
+      byId("submit").querySelector("summary").focus();
+    });
+    fill(byId("links"), docs("index.html", "Documentation"), docs("methods/index.html", "Methods"), submit);
+  }
+
+  function submitting() {
+    const lines = [
+      "spike4dgs run-benchmark --track outdoor-small --methods NAME --out runs/mine",
+      "spike4dgs leaderboard --runs runs/mine   # your row among these",
+      "spike4dgs submit runs/mine/results/NAME.json --predictions runs/mine/predictions/NAME --scenes data/*-small"];
+    return el("details", { id: "submit" }, el("summary", {}, "Submit a result"),
+      el("p", {}, "A track takes every record of exactly its scenes, scored again from the predictions: those of run-benchmark, or of score for the images of any program."),
+      el("pre", {}, lines.join("\n")),
+      page.docs && el("p", {}, "More: ", docs("leaderboard/index.html#submit", "how to submit"), ", ", docs("external_methods/index.html", "your own method"), "."));
+  }
+
   function footer() {
     const empty = page.empty.map((t) => `${t.name} (${t.announced ? "announced" : "open"})`).join(", ");
     fill(byId("footer"),
@@ -94,6 +119,7 @@ Spike4DGS.app = (() => {
       empty && el("p", {}, `Tracks without entries: ${empty}.`),
       page.refused.length ? el("details", {}, el("summary", {}, `${plural(page.refused.length, "entry").replace("entrys", "entries")} not listed`),
         el("ul", {}, page.refused.map((r) => el("li", {}, `${r.entry}: ${r.reason}`)))) : null,
+      submitting(),
       el("p", {}, "Plots: Observable Plot 0.6.17 and D3 7.9.2 (ISC licence), included."));
   }
 
@@ -102,6 +128,7 @@ Spike4DGS.app = (() => {
     page.index = new Map(page.metrics.map((metric, number) => [metric.id, { ...metric, number }]));
     page.published = (board) => board.published;
     page.hint = "No images here: build the page with --runs and --data to see truth and methods side by side.";
+    links();
     Spike4DGS.controls.questions(page, link);
     byId("controls").addEventListener("submit", (e) => e.preventDefault());
     byId("skip").addEventListener("click", (e) => { e.preventDefault(); byId("scroller").focus(); });

@@ -44,7 +44,7 @@ Spike4DGS.controls = (() => {
     once(byId("tabs"), board.id, () => groups.map(([folder, title]) => {
       const boards = page.boards.filter((b) => b.folder === folder);
       return boards.length && el("div", { class: "tabgroup" }, el("span", { class: "group" }, title),
-        boards.map((b) => el("a", { href: link({ t: b.id }), "aria-current": b === board ? "page" : null }, b.name)));
+        boards.map((b) => el("a", { href: link({ t: b.id }), "aria-current": b === board ? "page" : null }, b.label)));
     }));
   }
 
@@ -52,8 +52,8 @@ Spike4DGS.controls = (() => {
     const withheld = board.withheld.length ? `Methods are not given: ${board.withheld.join(", ")}. ` : "";
     const sensors = facetValues(board, "sensor").map((name) => SENSORS[name]).filter(Boolean);
     once(byId("about"), board.id, () => [
-      el("h2", {}, board.name),
-      el("p", {}, board.title === board.name ? "" : `${board.title}. `, withheld, board.why && `Not on a track: ${board.why}. `,
+      el("h2", {}, board.label),
+      el("p", {}, board.title === board.label ? "" : `${board.title}. `, withheld, board.why && `Not on a track: ${board.why}. `,
         `Split ${board.split}. `, sensors.join(" "))]);
   }
 
