@@ -7,6 +7,7 @@ import difflib
 import functools
 import importlib
 import inspect
+import os
 import shutil
 import sys
 import textwrap
@@ -32,11 +33,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 3: a recording lost data;
-    130: interrupted.
+    130: interrupted; 141: who read the output went away, as after `| head`.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _dispatch(arguments)
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        return code
     except UserError as e:
         print(f"error: {e}", file=sys.stderr)
         return 2
@@ -45,6 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its end
+        return 141
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 import time
@@ -150,6 +151,17 @@ def test_an_interruption_is_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(cli, "COMMANDS", {"wait": Command(f"{__name__}:interrupted", "wait", "wait")})
     assert main(["wait"]) == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("command", ["methods", "--help"])
+def test_a_reader_that_goes_away_is_no_traceback(command: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", "spike4dgs.cli", command], stdout=closed, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode in (1, 141) and not done.stderr  # 1 where rich notices first
 
 
 def test_load_finds_the_functions() -> None:
