@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.untrusted import Expected, read_npz
 from spike4dgs.generators.sensor.calibration import write_maps
+from spike4dgs.studies.kit.timing import show_table
 
 
 def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) -> int:
@@ -29,9 +27,7 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
         out: Folder for the maps and their images.
     """
     opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not used
-    table = Table(
-        "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
-    )
+    rows = []
     for camera in opened.cameras.values():
         recordings = opened.recordings(camera.id)
         if recordings is None:
@@ -42,8 +38,9 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
         _plot(found, out / f"{camera.id}.png", camera.id)
         level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
         row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
-        table.add_row(*row, *(f"{e:.3f}" if e is not None else "-" for e in _truth_errors(opened, camera, found)))
-    Console(width=120).print(table)
+        rows.append(row + [f"{e:.3f}" if e is not None else "-" for e in _truth_errors(opened, camera, found)])
+    columns = "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
+    show_table("", columns, rows, None)
     print(f"maps and images: {out}")
     return 0
 
@@ -61,7 +58,7 @@ def _truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[flo
 
 
 def _plot(found: Calibration, path: Path, title: str) -> None:
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = new_figure((11, 3.6), dpi=80)
     left, right = figure.subplots(1, 2)
     for axes, image, name, limits in (
         (left, found.gain, "gain", (0.8, 1.2)),
@@ -69,5 +66,4 @@ def _plot(found: Calibration, path: Path, title: str) -> None:
     ):
         figure.colorbar(axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap="viridis"), ax=axes)
         axes.set(title=f"{title}: {name}", xticks=[], yticks=[])
-    with atomic_path(path) as part:
-        figure.savefig(part, dpi=80)
+    save_figure(figure, path)

@@ -12,7 +12,8 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, write_json, write_text
+from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.generators.recorder.rig_calibration.array_calibration import (
     ArrayCalibration,
     calibrate_array,
@@ -30,6 +31,7 @@ from spike4dgs.generators.recorder.rig_calibration.board_views import (
 )
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import Freedom
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
+from spike4dgs.studies.kit.timing import show_table
 
 _BOARD, _FREEDOM = Board(), Freedom()
 
@@ -102,18 +104,13 @@ def _results(found: ArrayCalibration) -> dict[str, Any]:
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    title = f"reprojection error {report['reprojection_px']:.3f} px RMS"
-    table = Table(
-        "camera", "views", "RMS, px", "focal, px", "+-", "principal, px", "position +-, mm", "turn +-, deg", title=title
-    )
+    rows = []
     for name, c in report["cameras"].items():
         x, y = c["principal_point_px"]
         row = [name, f"{c['views']}", f"{c['reprojection_px']:.3f}", f"{c['focal_px']:.2f}", f"{c['focal_sd_px']:.2f}"]
-        table.add_row(*row, f"{x:.1f}, {y:.1f}", f"{1e3 * c['center_sd_m']:.2f}", f"{c['turn_sd_deg']:.3f}")
-    Console(width=120).print(table)
+        rows.append([*row, f"{x:.1f}, {y:.1f}", f"{1e3 * c['center_sd_m']:.2f}", f"{c['turn_sd_deg']:.3f}"])
+    columns = "camera", "views", "RMS, px", "focal, px", "+-", "principal, px", "position +-, mm", "turn +-, deg"
+    show_table(f"reprojection error {report['reprojection_px']:.3f} px RMS", columns, rows, None)
     for name, c in report["cameras"].items():
         if lens := c.get("distortion"):
             print(f"{name}: k1 {lens[0]:.4f}, k2 {lens[1]:.4f}")
@@ -133,13 +130,11 @@ def _print(report: dict[str, Any]) -> None:
 
 def _plot(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCalibration, path: Path) -> None:
     """Plot each camera's image in the view that most cameras saw, with its corners; small, the corners of all views."""
-    from matplotlib.figure import Figure
-
     s = found.detections
     best = int(np.argmax(np.bincount(s.view)))
     side = math.ceil(math.sqrt(len(found.cameras)))
     aspect = found.cameras[0].height / found.cameras[0].width
-    figure = Figure(figsize=(12, 12 * aspect * math.ceil(len(found.cameras) / side) / side + 1), layout="constrained")
+    figure = new_figure((12, 12 * aspect * math.ceil(len(found.cameras) / side) / side + 1), dpi=100)
     for axes, c in zip(figure.subplots(side, side, squeeze=False).flat, range(side * side), strict=True):
         axes.axis("off")
         if c >= len(found.cameras):
@@ -157,5 +152,4 @@ def _plot(recordings: Sequence[BoardRecording], seen: BoardViews, found: ArrayCa
     figure.suptitle(
         f"Used corners (orange), left out (red), and the board in one view; {found.reprojection_px:.3f} px RMS"
     )
-    with atomic_path(path) as part:
-        figure.savefig(part, dpi=100)
+    save_figure(figure, path)

@@ -15,9 +15,12 @@ MOVED = {
     "run-benchmark --oracle-samples": "report oracle-ladder",
     "inspect --fps": "inspect --rate-hz",
     "inspect --top-down": "inspect --rows-top-down",
+    "spacing": "report speed-error --only keys",
+    "tradeoff": "report speed-error --only rendering",
+    "poses --refine": "run-benchmark SCENE --methods tfp+colmap+4dgs --set trainer.refine_poses=true",
     "speed splat": "report speed-error --only splat-torch",
     "speed ssim": "report speed-error --only ssim",
-    "speed simulate": "report speed-error --only sensor sensor-spikezoo",
+    "speed simulate": "report speed-error --only sensor",
     "speed decode": "report speed-error --only decoding",
     "speed metrics": "report speed-error --only scale-metrics flip",
     "speed tfi": "speed images",
@@ -99,7 +102,7 @@ COMMANDS: dict[str, Command] = {
         "fit captures/turntable --out runs/turntable",
     ),
     "fault-table": Command(
-        "spike4dgs.cli.fault_table:fault_table",
+        "spike4dgs.cli.studies:fault_table",
         "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
         "fault-table data/turntable-0-small --out runs/faults",
     ),
@@ -223,12 +226,12 @@ COMMANDS: dict[str, Command] = {
         "export-spikecv data/car-0-small --out car-spikecv",
     ),
     "poses": Command(
-        "spike4dgs.cli.poses:poses",
+        "spike4dgs.cli.studies:poses",
         "estimate the training cameras' poses and measure their errors",
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
     "patterns": Command(
-        "spike4dgs.cli.patterns:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
+        "spike4dgs.cli.studies:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
     ),
     "export-nerfstudio": Command(
         "spike4dgs.cli.export_nerfstudio:export_nerfstudio",
@@ -248,7 +251,7 @@ COMMANDS: dict[str, Command] = {
     **MEASUREMENTS,
     "completion": Command(
         "spike4dgs.cli.completion:completion",
-        "print a script that completes commands in bash, zsh or fish",
+        "print a script that completes commands and options in bash, zsh or fish",
         "completion bash",
     ),
 }

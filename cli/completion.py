@@ -1,108 +1,43 @@
-"""`completion`: print a script that completes commands in a shell; everything after a command completes as files.
-
-tyro writes such scripts too, but none for fish; with commands that load lazily theirs start Python at each Tab and
-offer no file names.
-"""
+"""`completion`: print a script that completes commands and their options in a shell; tyro writes it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional
+import tyro
+from tyro.conf import Positional, subcommand
 
 from spike4dgs.cli.commands import COMMANDS
+from spike4dgs.cli.dispatch import load
 
 Shell = Literal["bash", "zsh", "fish"]
-Words = Mapping[str, str]  # word -> what it does
 
 
 def completion(shell: Positional[Shell]) -> int:
-    """Print a shell's completion script. The script itself is instant: it has the commands and starts no Python.
+    """Print a shell's completion script. It is made from all commands, which takes some seconds: keep it in a file.
 
-    bash: `eval "$(spike4dgs completion bash)"` in ~/.bashrc. zsh: the same with zsh, in ~/.zshrc after `compinit`.
+    bash: `spike4dgs completion bash > ~/.local/share/bash-completion/completions/spike4dgs`.
+    zsh: `spike4dgs completion zsh > ~/.zfunc/_spike4dgs`, with `fpath+=~/.zfunc` before `compinit` in ~/.zshrc.
     fish: `spike4dgs completion fish > ~/.config/fish/completions/spike4dgs.fish`.
 
     Args:
         shell: bash, zsh or fish.
     """
-    print(script(shell), end="")
-    return 0
-
-
-def script(shell: Shell) -> str:
-    """Return the completion script of a shell."""
-    first = {name.partition(" ")[0]: command.summary for name, command in COMMANDS.items()}
-    second = {
-        **verbs_of_two(),
-        "completion": {name: f"the script for {name}" for name in ("bash", "zsh", "fish")},
-    }
-    return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](first, second)
-
-
-def verbs_of_two() -> dict[str, dict[str, str]]:
-    """Return the second words of the commands that have two, with their summaries, by the first."""
-    verbs: dict[str, dict[str, str]] = {}
-    for name, command in COMMANDS.items():
+    verbs: dict[str, list[Any]] = {}
+    for name in COMMANDS:
         first, _, second = name.partition(" ")
-        if second:
-            verbs.setdefault(first, {})[second] = command.summary
-    return verbs
-
-
-def _bash(first: Words, second: Mapping[str, Words]) -> str:
-    cases = [f"        {command}) words='{' '.join(words)}' ;;" for command, words in second.items()]
-    lines = [
-        "_spike4dgs() {",
-        "    local words=''",
-        '    if [ "$COMP_CWORD" -eq 1 ]; then',
-        f"        words='{' '.join(first)} --help --version'",
-        '    elif [ "$COMP_CWORD" -eq 2 ]; then',
-        '        case "${COMP_WORDS[1]}" in',
-        *cases,
-        "        esac",
-        "    fi",
-        '    COMPREPLY=($(compgen -W "$words" -- "${COMP_WORDS[COMP_CWORD]}"))',
-        "}",
-        "complete -o bashdefault -o default -F _spike4dgs spike4dgs",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _zsh(first: Words, second: Mapping[str, Words]) -> str:
-    def described(words: Words) -> str:
-        return " ".join(_quoted(f"{word}:{text}") for word, text in words.items())
-
-    cases = [f"        {command}) found=({described(words)}) ;;" for command, words in second.items()]
-    lines = [
-        "#compdef spike4dgs",
-        "_spike4dgs() {",
-        "    local -a found",
-        "    if (( CURRENT == 2 )); then",
-        f"        found=({described(first)})",
-        "    elif (( CURRENT == 3 )); then",
-        "        case $words[2] in",
-        *cases,
-        "        esac",
-        "    fi",
-        "    if (( $#found )); then _describe word found; else _files; fi",
-        "}",
-        'if [ "$funcstack[1]" = _spike4dgs ]; then _spike4dgs "$@"; else compdef _spike4dgs spike4dgs; fi',
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _fish(first: Words, second: Mapping[str, Words]) -> str:
-    def lines(condition: str, words: Words) -> list[str]:
-        start = f"complete -c spike4dgs -n {condition} -f"
-        return [f"{start} -a {word} -d {_quoted(text)}" for word, text in words.items()]
-
-    all_lines = lines("__fish_use_subcommand", first)
-    for command, words in second.items():
-        all_lines += lines(f"'__fish_seen_subcommand_from {command}'", words)
-    return "\n".join(all_lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """Return text in single quotes, which all three shells read alike without an apostrophe or a backslash in it."""
-    return "'" + text.replace("\\", "").replace("'", "’") + "'"
+        if not second or first not in COMMANDS:  # a verb of what is a command itself is not completed
+            verbs.setdefault(first, []).append(Annotated[load(name), subcommand(second or first)])
+    kinds = {name: reduce(or_, found) for name, found in verbs.items()}
+    named = [kind if name in COMMANDS else Annotated[kind, subcommand(name)] for name, kind in kinds.items()]
+    every: Any = reduce(or_, named)
+    try:
+        tyro.cli(every, prog="spike4dgs", args=["--tyro-print-completion", shell])
+    except SystemExit as e:  # as after --help
+        if e.code:
+            raise
+    if shell == "bash":  # file names where there is nothing to complete
+        print("complete -o bashdefault -o default -F _tyro_spike4dgs spike4dgs")
+    return 0

@@ -33,10 +33,7 @@ OPTIONAL = (
     ("pandas", "pandas", "results as data frames"),
 )
 # Library, its Debian package, and what needs it.
-LIBRARIES = (
-    ("usb-1.0", "libusb-1.0-0", "`record` from cameras"),
-    ("umockdev", "umockdev", "the tests of `record`"),
-)
+LIBRARIES = (("usb-1.0", "libusb-1.0-0", "`record` from cameras"), ("umockdev", "umockdev", "the tests of `record`"))
 
 METRIC_WEIGHTS = (("LPIPS alex", ALEXNET), ("LPIPS vgg", VGG16), ("LPIPS squeeze", SQUEEZENET), ("MetaIQA", METAIQA))
 
@@ -131,10 +128,8 @@ def _packages() -> Iterator[Finding]:
     required = [r for r in requires("spike4dgs") or () if "extra ==" not in r]
     names = [re.split(r"[^\w.-]", r, maxsplit=1)[0] for r in required]
     absent = [name for name in names if _version(name) is None]
-    if absent:
-        yield Finding("packages", BROKEN, f"not installed: {', '.join(absent)}", f"pip install {' '.join(absent)}")
-    else:
-        yield Finding("packages", OK, f"the {len(names)} that are required are installed")
+    found = f"not installed: {', '.join(absent)}" if absent else f"the {len(names)} that are required are installed"
+    yield Finding("packages", BROKEN if absent else OK, found, f"pip install {' '.join(absent)}" if absent else "")
 
 
 def _torch() -> Iterator[Finding]:
@@ -168,9 +163,8 @@ def _gpu() -> Iterator[Finding]:
             yield Finding("GPU", MISSING, f"an NVIDIA driver, but torch {torch.__version__} sees no device", PYTORCH)
         else:
             yield Finding("GPU", NOTE, "no CUDA device; everything runs on the CPU")
-        yield Finding(
-            "CUDA kernels", NOTE, f"numba-cuda {_version('numba-cuda') or 'none'}; only a CUDA device needs it"
-        )
+        numba = f"numba-cuda {_version('numba-cuda') or 'none'}; only a CUDA device needs it"
+        yield Finding("CUDA kernels", NOTE, numba)
         return
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     yield Finding("GPU", OK, f"{', '.join(names)} (CUDA {torch.version.cuda})")
@@ -182,14 +176,11 @@ def _gpu() -> Iterator[Finding]:
 
 
 def _optional() -> Iterator[Finding]:
-    for name, extra, purpose in OPTIONAL:
-        found = _version(name)
-        fix = "" if found else f"pip install 'spike4dgs[{extra}]'"
-        yield Finding(name, OK if found else MISSING, f"{found or 'none'}, for {purpose}", fix)
+    optional = [(name, _version(name), f"pip install 'spike4dgs[{extra}]'", why) for name, extra, why in OPTIONAL]
     for library, package, purpose in LIBRARIES:
-        found = ctypes.util.find_library(library)
-        fix = "" if found else f"apt-get install {package}"
-        yield Finding(package, OK if found else MISSING, f"{found or 'none'}, for {purpose}", fix)
+        optional.append((package, ctypes.util.find_library(library), f"apt-get install {package}", purpose))
+    for name, found, fix, purpose in optional:
+        yield Finding(name, OK if found else MISSING, f"{found or 'none'}, for {purpose}", "" if found else fix)
 
 
 def _metrics() -> Iterator[Finding]:
@@ -214,27 +205,23 @@ def _network(name: str, find: Callable[[], Path]) -> Iterator[Finding]:
         yield Finding(name, MISSING, "no weights", str(e).rpartition("; ")[2])
 
 
-def _msdi() -> Path:
-    from spike4dgs.method.msdi.weights import WEIGHTS
+def _weights(network: str) -> Path:
+    """Return the file of a network's weights, which is imported here: a room that cannot be imported is a finding."""
+    if network == "DUSt3R":
+        from spike4dgs.baselines.starts.dust3r import weights_path
 
-    return WEIGHTS.check()
+        return weights_path()
+    if network == "MSDI":
+        from spike4dgs.method.msdi.weights import WEIGHTS as msdi
 
+        return msdi.check()
+    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS as spk2img
 
-def _spk2img() -> Path:
-    from spike4dgs.baselines.images.spk2img.maker import WEIGHTS
-
-    return WEIGHTS.check()
-
-
-def _dust3r() -> Path:
-    from spike4dgs.baselines.starts.dust3r import weights_path
-
-    return weights_path()
+    return spk2img.check()
 
 
-# What finds the weights of a network, or raises UserError. They are imported when they are asked for: a room that
-# cannot be imported is a finding.
-NETWORKS: dict[str, Callable[[], Path]] = {"MSDI": _msdi, "Spk2ImgNet": _spk2img, "DUSt3R": _dust3r}
+# What finds the weights of a network, or raises UserError.
+NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for name in ("MSDI", "Spk2ImgNet", "DUSt3R")}
 
 
 def _version(package: str) -> str | None:

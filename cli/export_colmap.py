@@ -22,6 +22,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.cli.options import check_names
 
 _EVERY = 20  # ticks: 1 ms at 20 kHz
 
@@ -52,8 +53,7 @@ def export_colmap(
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
     """
     opened = open_scene(scene, allow_gaps, split)
-    if images not in IMAGES:
-        raise problem("--images", f"one of {', '.join(IMAGES)}", repr(images), "correct the name")
+    check_names("--images", [images], IMAGES)
     chosen = _ticks(ticks, every, opened.n_ticks)
     check_new(out)
     written = {camera: _write_images(out / "images", opened, camera, images, chosen) for camera in opened.train}

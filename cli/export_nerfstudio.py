@@ -10,8 +10,7 @@ Each transforms file has one `camera_angle_x` and frames of `file_path` (without
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from spike4dgs.benchmark.files import check_new, write_json
 from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.cli.options import check_names
 
 _TOLERANCE_PX = 0.005  # the most that one focal length and a principal point in the middle may move a pixel
 _VAL_EVERY = 5  # training images for one validation image, at a time between them
@@ -35,14 +35,6 @@ _LOSSES = """lost on the way:
   - time as a share of the clip, rounded by readers to float32, for ticks
   - masks, geometry, calibration recordings, points and the other splits stay behind
 their parser assumes a scene within 1.5 units of the origin: give it a --scale-factor for a larger one"""
-
-
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """An image of the export: linear radiance [H, W] or [H, W, 3]."""
-
-    target: Target
-    radiance: Float32
 
 
 def export_nerfstudio(
@@ -73,8 +65,7 @@ def export_nerfstudio(
         allow_gaps: Accept a recording with gaps.
     """
     opened = open_scene(scene, allow_gaps, split)
-    if images not in IMAGES:
-        raise problem("--images", f"one of {', '.join(IMAGES)}", repr(images), "correct the name")
+    check_names("--images", [images], IMAGES)
     if every < 2:
         raise problem("--every", "2 ticks or more", str(every), "leave room for the validation images between")
     used = [opened.cameras[c] for c in (*opened.train, *opened.test)]
@@ -82,12 +73,15 @@ def export_nerfstudio(
     check_new(out)
     ticks = range(0, opened.n_ticks, every)
     between = range(every // 2, opened.n_ticks, _VAL_EVERY * every)
-    parts = {
-        "test": _from_truth(opened, colour),
-        "train": _from_spikes(opened, images, ticks),
-        "val": _from_spikes(opened, images, between),
-    }
-    frames = {name: [_write(out, name, opened, image) for image in made] for name, made in parts.items()}
+    truth = opened.ground_truth_rgb if colour else opened.ground_truth
+
+    def from_spikes(target: Target) -> Float32:
+        return IMAGES[images](opened.stream(target.camera), [target.tick], opened.radiance_gain)[0]
+
+    frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in opened.targets]}
+    for name, times in (("train", ticks), ("val", between)):
+        targets = [Target(camera, tick) for camera in opened.train for tick in times]
+        frames[name] = [_write(out, name, opened, target, from_spikes(target)) for target in targets]
     for name, of_part in frames.items():  # after all images: what is cut off has no description
         path = out / f"transforms_{name}.json"
         print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
@@ -118,22 +112,9 @@ def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
     return 2 * math.atan(0.5 * first.width / first.fx)
 
 
-def _from_spikes(scene: Scene, maker: str, ticks: Iterable[int]) -> Iterable[_Image]:
-    for camera in scene.train:
-        stream = scene.stream(camera)
-        for tick in ticks:
-            yield _Image(Target(camera, tick), IMAGES[maker](stream, [tick], scene.radiance_gain)[0])
-
-
-def _from_truth(scene: Scene, colour: bool) -> Iterable[_Image]:
-    for target in scene.targets:
-        yield _Image(target, scene.ground_truth_rgb(target) if colour else scene.ground_truth(target))
-
-
-def _write(out: Path, part: str, scene: Scene, image: _Image) -> dict[str, Any]:
-    """Write one PNG and return its frame."""
-    target, pixels = image.target, encode_srgb(image.radiance)
-    name = f"{target.camera}_{target.tick:06d}"
+def _write(out: Path, part: str, scene: Scene, target: Target, radiance: Float32) -> dict[str, Any]:
+    """Write linear radiance [H, W] or [H, W, 3] as a PNG and return its frame."""
+    pixels, name = encode_srgb(radiance), f"{target.camera}_{target.tick:06d}"
     rgb = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     write_png(out / part / f"{name}.png", rgb)
     pose = to_nerfstudio(scene.cameras[target.camera])["transform_matrix"]

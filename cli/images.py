@@ -17,7 +17,7 @@ from spike4dgs.benchmark.spikes.bad_pixels import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.untrusted import MAX_GAIN
-from spike4dgs.cli.options import warn_of_size
+from spike4dgs.cli.options import check_names, warn_of_size
 from spike4dgs.generators.recorder.resources import free_bytes
 from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_clip_images
 
@@ -58,12 +58,14 @@ def images(
         device: Of a method with a network: auto, cpu or cuda.
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
     """
-    if method not in IMAGES:
-        raise problem("--method", f"one of {', '.join(IMAGES)}", repr(method), "correct the name")
-    _check("--every", every, 1, math.inf, "1 tick or more")
-    _check("--fps", fps, 1e-3, _MOST_FPS, f"0.001 to {_MOST_FPS:g}")
-    if radiance_gain is not None:
-        _check("--radiance-gain", radiance_gain, 1e-6, MAX_GAIN, f"1e-06 to {MAX_GAIN:g} spikes per tick")
+    check_names("--method", [method], IMAGES)
+    for option, value, least, most, expected in (
+        ("--every", every, 1, math.inf, "1 tick or more"),
+        ("--fps", fps, 1e-3, _MOST_FPS, f"0.001 to {_MOST_FPS:g}"),
+        ("--radiance-gain", radiance_gain, 1e-6, MAX_GAIN, f"1e-06 to {MAX_GAIN:g} spikes per tick"),
+    ):
+        if value is not None and not least <= value <= most:
+            raise problem(option, expected, f"{value:g}", "correct it")
     streams, white = _streams(path, dat_file, camera, allow_gaps)
     if not path.is_dir():
         warn_of_size(streams)
@@ -80,11 +82,6 @@ def images(
         print(f"{out / name}: {count} PNG and {count} EXR images" + ("" if made else ", finished before and kept"))
         print(f"{clip_video(out, name)}: {seconds:.2f} s at {fps:g} frames/s, {wanted.slow_motion:.4g} times slower")
     return 0
-
-
-def _check(option: str, value: float, least: float, most: float, expected: str) -> None:
-    if not least <= value <= most:
-        raise problem(option, expected, f"{value:g}", "correct it")
 
 
 def _streams(

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.markup import escape
+from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
-from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
@@ -22,6 +23,7 @@ from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_cou
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.cli.options import warn_of_size
+from spike4dgs.studies.kit.timing import write_csv
 
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
 _TIMELINE_BINS = 400
@@ -97,17 +99,13 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     Where a recording has gaps, a plot of the rate over time marks them, and the images are of the middle of the longest
     stretch without one.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     middle = _middle(stream)
     gain = float(np.percentile(report.rate, 99)) or 1.0  # shown as white; the scale of a raw recording is unknown
     aspect = stream.height / stream.width
     heights = [6 * aspect + 0.6] * 2 + [2.4] * bool(stream.gaps)  # inches
     mosaic: list[Any] = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]
-    figure, axes = plt.subplot_mosaic(mosaic, figsize=(12, sum(heights)), height_ratios=heights, layout="constrained")
+    figure = new_figure((12, sum(heights)), dpi=100)
+    axes: Any = figure.subplot_mosaic(mosaic, height_ratios=heights)
     for name in ("tfp", "tfi"):
         axes[name].imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
         axes[name].set_title(f"{name.upper()} at tick {middle}")
@@ -117,12 +115,9 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     if stream.gaps:
         _plot_gaps(axes["time"], stream)
     for name in ("tfp", "tfi", "bad"):
-        axes[name].set_xticks([])
-        axes[name].set_yticks([])
+        axes[name].set(xticks=[], yticks=[])
     figure.suptitle(f"{report.name}: {stream.n_ticks} ticks of {stream.width}x{stream.height} at {stream.rate_hz:g} Hz")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def _middle(stream: SpikeStream) -> int:
@@ -167,31 +162,16 @@ def _row(r: StreamReport) -> dict[str, Any]:
 
 
 def _print_reports(reports: list[StreamReport]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table(*_COLUMNS)
     for row in map(_row, reports):
         table.add_row(*(escape(format(value, _COLUMNS[name])) for name, value in row.items()))
-    console = Console()
-    if not console.is_terminal:  # a file or a pipe takes the whole table
-        console = Console(width=Console(width=10_000).measure(table).maximum)
-    console.print(table)
+    make_console().print(table)
     print("Rates are spikes per tick and pixel; 'two ISIs' is the share of pixels with only two adjacent intervals.")
     for r in reports:
         for what, mask in r.bad.kinds.items():
             if mask.any():
                 first = ", ".join(f"({x}, {y})" for y, x in np.argwhere(mask)[:5])
                 print(f"{r.name}: {mask.sum()} {what} pixels, the first (x, y): {first}")
-
-
-def _write_csv(path: Path, reports: list[StreamReport]) -> None:
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(_COLUMNS), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(map(_row, reports))
-    write_text(path, out.getvalue())
 
 
 def inspect(
@@ -222,7 +202,7 @@ def inspect(
         reports.append(examine(name, stream, scene.recordings(name) if scene else None))
         write_image(folder / f"{name}.png", reports[-1], stream)
     _print_reports(reports)
-    _write_csv(folder / "statistics.csv", reports)
+    write_csv(folder / "statistics.csv", [*_COLUMNS], [[*_row(r).values()] for r in reports])
     for gap in (gap for stream in streams.values() for gap in stream.gaps):
         print(f"{gap.camera}: no data in ticks [{gap.first_tick}, {gap.stop_tick}): {gap.ticks} ticks, {gap.reason}")
     print(f"images and statistics.csv: {folder}")

@@ -48,11 +48,13 @@ def make_dataset(
 
     if all and worlds:
         raise problem("worlds", "names or --all", "both", "leave one out")
-    names = WORLDS if all or (track and not worlds) else dict.fromkeys(worlds)
+    names = list(WORLDS if all or (track and not worlds) else dict.fromkeys(worlds))
     if not names:
         raise problem("worlds", "at least one world, or --all", "none", f"choose among {', '.join(WORLDS)}")
     chosen = list(names)
     jobs = scenes.track_jobs(track, chosen, settings) if track else [settings.job(name) for name in chosen]
     choose_device(renderers.device)
-    parallel = {"workers": renderers.workers, "scheduler": renderers.scheduler}
-    return scenes.make_dataset(jobs, out, **parallel, audit=audit, replace=replace, check=check)
+    workers, scheduler = renderers.workers, renderers.scheduler
+    return scenes.make_dataset(
+        jobs, out, workers=workers, scheduler=scheduler, audit=audit, replace=replace, check=check
+    )

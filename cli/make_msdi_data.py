@@ -6,8 +6,7 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from spike4dgs.benchmark.errors import problem
-from spike4dgs.cli.options import RENDERERS, Renderers
+from spike4dgs.cli.options import RENDERERS, Renderers, check_names
 from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_shards
 from spike4dgs.generators.rendering.mitsuba_variant import choose_device
 from spike4dgs.generators.worlds import WORLDS
@@ -33,8 +32,7 @@ def make_msdi_data(
         out: Folder for the shards.
         variants: Training variants of each world.
     """
-    if wrong := [w for w in worlds if w not in WORLDS]:
-        raise problem("worlds", f"some of {', '.join(WORLDS)}", ", ".join(wrong), "correct the names")
+    check_names("worlds", worlds, WORLDS)
     choose_device(renderers.device)
     make_shards(out, worlds or WORLDS, variants, bursts, renderers.workers, renderers.scheduler)
     return 0

@@ -6,47 +6,37 @@ from spike4dgs.cli.command import Command
 
 MEASUREMENTS: dict[str, Command] = {
     "report speed-error": Command(
-        "spike4dgs.cli.speed_error:speed_error",
+        "spike4dgs.cli.studies:speed_error",
         "measure every approximation beside its exact twin, and write one page",
         "report speed-error --quick --out runs/speed-error",
     ),
     "report hard-cases": Command(
-        "spike4dgs.cli.hard_cases:hard_cases",
+        "spike4dgs.cli.studies:hard_cases",
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
         "report hard-cases --out runs/hard-cases",
     ),
     "report oracle-ladder": Command(
-        "spike4dgs.cli.oracle_ladder:oracle_ladder",
+        "spike4dgs.cli.studies:oracle_ladder",
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
         "report oracle-ladder data/car-0-small --out runs/oracle",
     ),
     "spike-agreement": Command(
-        "spike4dgs.cli.spike_agreement:spike_agreement",
+        "spike4dgs.cli.studies:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
         "spike-agreement runs/small --data data --out runs/spike-agreement",
     ),
-    "tradeoff": Command(
-        "spike4dgs.cli.spacing:tradeoff",
-        "report render time against error for several settings",
-        "tradeoff car --profile paper",
-    ),
-    "spacing": Command(
-        "spike4dgs.cli.spacing:spacing",
-        "report key-frame spacing against error and render time",
-        "spacing --help",
-    ),
     "speed render": Command(
-        "spike4dgs.cli.speed_render:render",
+        "spike4dgs.cli.studies:render",
         "render images of saved models, side by side",
         "speed render runs/small/models/*/car-0-small.safetensors",
     ),
     "speed record": Command(
-        "spike4dgs.cli.speed_record:record",
+        "spike4dgs.cli.studies:record",
         "record emulated cameras into memory and to disk, queued beside single reads",
         "speed record",
     ),
     "speed images": Command(
-        "spike4dgs.cli.speed_images:images",
+        "spike4dgs.cli.studies:images",
         "time and quality of each way from spikes to an image, beside the paper's Table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.image_size import size_doubt
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -54,3 +55,10 @@ def warn_of_size(streams: Mapping[str, SpikeStream]) -> None:
     """Print a line for each stream whose given size looks wrong."""
     for doubt in filter(None, map(size_doubt, streams.values())):
         print(f"warning: {doubt}", file=sys.stderr)
+
+
+def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise UserError for a name that is not among the known ones."""
+    listed = list(known)
+    if unknown := [name for name in names if name not in listed]:
+        raise problem(option, f"one of {', '.join(listed)}", repr(unknown[0]), "correct the name")

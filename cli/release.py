@@ -6,7 +6,6 @@ import re
 import sys
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
@@ -17,6 +16,7 @@ from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fing
 from spike4dgs.benchmark.release.index import Release, read_release
 from spike4dgs.benchmark.release.pack import pack as pack_scenes
 from spike4dgs.benchmark.release.source import size_text
+from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 
@@ -37,7 +37,7 @@ def pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", sh
         raise problem("--shard-mb", "at least 1", str(shard_mb), "correct the number")
     opened = open_scenes(scenes, allow_gaps=True)
     release = pack_scenes(opened, out, name, shard_mb * 1_000_000)
-    _console().print(_costs(release))
+    make_console().print(_costs(release))
     size = sum(shard.bytes for shard in release.shards)
     print(f"{out}: {len(release.scenes)} scenes, {size} bytes in {len(release.shards)} shards")
     print(f"release.json has sha256 {release.sha256}: publish it, and downloads can be pinned with --sha256")
@@ -59,7 +59,7 @@ def check(folder: Positional[Path]) -> int:
         problems += 1
     if not problems:
         release = read_release(folder)
-        _console().print(_costs(release))
+        make_console().print(_costs(release))
         print(f"{folder}: good; release.json has sha256 {release.sha256}")
     return 2 if problems else 0
 
@@ -76,11 +76,6 @@ def fingerprint(scenes: Positional[tuple[Path, ...]], *, out: Path) -> int:
         write_fingerprint(path, make_fingerprint(scene))
         print(f"{path}: {size_text(path.stat().st_size)}, sha256 {sha256_file(path)}")
     return 0
-
-
-def _console() -> Console:
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=200)
 
 
 def _costs(release: Release) -> Table:

@@ -191,7 +191,7 @@ def _run(
     device = fits.device
     if fits.scheduler is None or device == "auto":
         device = choose_device_for(methods, device)
-    budget, console, runs = make_budget(fits.budget), make_console(), []
+    budget, console, runs = make_budget(fits.budget), make_console(), list[SplitRun]()
     for split in splits:
         opened = open_scenes(scenes, allow_gaps, split)
         if not runs and (line := release_line(opened)):

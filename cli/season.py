@@ -146,8 +146,9 @@ def score(
         device: Of the methods: auto, cpu or cuda.
         seasons: Folder of the public files.
     """
-    given = {"predictions": predictions, "methods": methods, "metrics": metrics}
-    table, refused = score_season(number, secret, seasons, device=device, **given)
+    table, refused = score_season(
+        number, secret, seasons, predictions=predictions, methods=methods, metrics=metrics, device=device
+    )
     for line in refused:
         print(f"error: {line}", file=sys.stderr)
     results = read_results(seasons, read_season(seasons, number))

@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file
-from spike4dgs.cli.options import COMPUTE, Compute
+from spike4dgs.cli.options import COMPUTE, Compute, check_names
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings
 from spike4dgs.method.msdi.train import Run, Training, checkpoint_key, start_from, training_shards
@@ -42,8 +42,7 @@ def train_msdi(
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
         rate: Adam's learning rate, after the warm-up, of the layers that make points.
     """
-    if config not in CONFIGS:
-        raise problem("--config", f"one of {', '.join(CONFIGS)}", repr(config), "correct the name")
+    check_names("--config", [config], CONFIGS)
     if steps < 1 or views < 2 or not rate > 0:
         found = f"{steps}, {views} and {rate}"
         raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,13 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_text
+from spike4dgs.cli.options import check_names
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, Job
+from spike4dgs.generators.render_tasks import cameras_of, held_out_view, plan_of, world_of
+from spike4dgs.generators.rendering.image_motion import max_image_speed
+from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.worlds import WORLDS
+from spike4dgs.studies.kit.timing import markdown, show_table
 
 COLUMNS = (
     "world",
@@ -47,34 +52,20 @@ def worlds(
         reports: Folder of scenes made with this profile, for the last column (WORLD-VARIANT-PROFILE.report.json).
         out: Markdown file.
     """
-    from rich.console import Console
-    from rich.table import Table
-
-    from spike4dgs.generators.worlds import WORLDS
-
-    unknown = [n for n in names if n not in WORLDS]
-    if unknown:
-        raise problem("world", f"one of {', '.join(WORLDS)}", ", ".join(unknown), "correct the name")
-    if profile not in PROFILES:
-        raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(profile), "correct the name")
+    check_names("world", names, WORLDS)
+    check_names("--profile", [profile], PROFILES)
     if reports is not None and not reports.is_dir():
         raise problem("--reports", "a folder with reports of scenes", str(reports), "correct the path")
     p = PROFILES[profile]
     rows = [_row(Job(n, variant, seed, profile, p, p.seconds), reports) for n in names or WORLDS]
-    write_text(out, _markdown(rows))
-    table = Table(*COLUMNS)
-    for row in rows:
-        table.add_row(*row)
-    Console(width=120).print(table)
+    note = f"Ticks are {1e6 / RATE_HZ:g} us. Key spacings: of whole keys, then of those for faster parts.\n"
+    write_text(out, "\n".join([*markdown(COLUMNS, rows), "", note]))
+    show_table("", COLUMNS, rows, None)
     print(f"written: {out}")
     return 0
 
 
 def _row(job: Job, reports: Path | None) -> list[str]:
-    from spike4dgs.generators.render_tasks import cameras_of, held_out_view, plan_of, world_of
-    from spike4dgs.generators.rendering.image_motion import max_image_speed
-    from spike4dgs.generators.rendering.render import MultiViewRenderer
-
     world, views, view = world_of(job), cameras_of(job), held_out_view(job)
     renderer = MultiViewRenderer(world, views[view : view + 1], seed=job.seed, spp=1, background_spp=1)
     depths, moving = [], []
@@ -106,11 +97,3 @@ def _made_in(job: Job, reports: Path | None) -> str:
     except (KeyError, TypeError, AttributeError):
         found = f"keys {', '.join(report) or 'none'}"
         raise problem(path, "numbers total_s and stages_s", found, "make the scene again") from None
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(cells) + " |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
-    return (
-        "\n".join(lines)
-        + f"\n\nTicks are {1e6 / RATE_HZ:g} us. Key spacings: of whole keys, then of those for faster parts.\n"
-    )

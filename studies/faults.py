@@ -13,11 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tyro.conf import Positional
+
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.environment import command_line, environment, harness
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
-from spike4dgs.benchmark.method import FitRequest, choose_device_for, get_method, make_budget
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
 from spike4dgs.benchmark.runs.predictions import open_predictions
@@ -86,19 +88,34 @@ class Outcome:
 
 
 def fault_table(
-    scene: Path,
-    lens_scene: Path | None,
-    methods: Sequence[str],
-    out: Path,
-    budget: str,
-    seed: int,
-    device: str,
-) -> None:
-    """Make the captures, fit each with each method, and write OUT/table.{md,csv,json,png} after each fit."""
+    scene: Positional[Path],
+    *,
+    lens_scene: Path | None = None,
+    methods: tuple[str, ...] = ("spike4dgs-x", "spk2img+stg"),
+    out: Path = Path("runs/faults"),
+    budget: str = DEFAULT_BUDGET,
+    seed: int = 0,
+    device: str = "auto",
+) -> int:
+    """Make captures of a scene worse on purpose, fit each, and tabulate the dB that a held-out camera loses.
+
+    A killed run continues: give the same command again.
+
+    Args:
+        scene: A made scene with ground truth.
+        lens_scene: The same scene made with `make-dataset --lens`, for the rows of lens distortion; its held-out camera
+            is judged through its lens.
+        methods: Methods by name.
+        out: Folder for table.md, table.csv, table.json and table.png; captures and fits are kept there too.
+        budget: quick, standard (4 times the steps), or a multiple of quick.
+        seed: Seed of the imperfections and of the fits.
+        device: auto, cpu or cuda.
+    """
     truth = _with_truth(scene)
     curved = None if lens_scene is None else _with_truth(lens_scene)
     found: list[Outcome] = []
-    about = {"scene": truth.id, "budget": budget, "seed": seed}
+    about = {"scene": truth.id, "budget": budget, "seed": seed, "command": command_line(), "harness": harness()}
+    about["environment"] = environment("cpu")
     for case in (*CASES, *(LENS_CASES if curved else ())):
         shown = curved if curved and case.lens else truth
         capture = out / "captures" / case.name
@@ -109,11 +126,9 @@ def fault_table(
             request = FitRequest(make_budget(budget), choose_device_for([wanted], device), seed)
             run = partial(fit_recording, capture / "clip", wanted, folder, request, TFP)
             found.append(Outcome(case, method, **_scored(run, folder, shown)))
-            _write(
-                out,
-                found,
-                {**about, "command": command_line(), "harness": harness(), "environment": environment("cpu")},
-            )
+            _write(out, found, about)
+    print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
+    return 0
 
 
 def _with_truth(scene: Path) -> Scene:

@@ -17,7 +17,6 @@ from spike4dgs.benchmark.reports.html_page import (
     Html,
     bullets,
     contents,
-    facts,
     folded,
     paragraph,
     run_facts,
@@ -27,6 +26,7 @@ from spike4dgs.benchmark.reports.html_page import (
     write_page,
 )
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.studies.kit.page import program_facts
 
 FORMAT = "spike4dgs-hard-cases/1"
 Rows = Sequence[dict[str, Any]]
@@ -152,6 +152,8 @@ def case_id(nodeid: str) -> str:
 
     >>> case_id("tests/method/splat/test_hard_splat.py::test_a_scene[needles]")
     'method/splat/a-scene-needles'
+    >>> case_id("tests/method/test_trainer.py::test_a[pixel+spike-1.0]")
+    'method/trainer/a-pixel+spike-1-0'
     """
     path, _, name = nodeid.partition("::")
     room, file = re.findall(r"tests/(\w+)/.*?(?:test_hard_|test_)(\w+)\.py", path)[0]
@@ -163,27 +165,23 @@ def _write_page(path: Path, report: dict[str, Any]) -> None:
     """Write the page: what failed, then seeds, resumed fits and threads, then the cases by part."""
     cases: Rows = report["cases"]
     failed = [c for c in cases if c["passed"] is False]
-    kinds = {title: (text, [c for c in cases if c["kind"] == kind]) for kind, (title, text) in _KINDS.items()}
-    kinds = {title: (text, rows) for title, (text, rows) in kinds.items() if rows}
-    twins = [c for c in cases if c["kind"] == "twin"]
-    parts = {part: [c for c in twins if _part(c) == part] for part in dict.fromkeys(map(_part, twins))}
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for c in sorted(cases, key=lambda c: [*_KINDS, "twin"].index(c["kind"])):
+        groups.setdefault(_KINDS.get(c["kind"], (c["id"].rpartition("/")[0],))[0], []).append(c)
+    texts = {title: [paragraph(text)] for title, text in _KINDS.values()}
     warned = [f"`{c['id']}`: {text}" for c in cases for text in c["warnings"]]
     heard = [folded(f"{len(warned)} warnings of libraries", [bullets(warned)])] if warned else []
-    sections = [
-        *(section("Failed", [_table(failed, whole_ids=True)]) for _ in failed[:1]),
-        section("Summary", [_summary({title: rows for title, (_, rows) in kinds.items()} | parts), *heard]),
-        *(section(title, [paragraph(text), _table(rows, whole_ids=True)]) for title, (text, rows) in kinds.items()),
-        *(section(part, [_table(rows)]) for part, rows in parts.items()),
-        section("Program", [_program(report)]),
+    parts = [
+        paragraph(_INTRO),
+        paragraph(_counted(cases), "bad" if failed else "good"),
+        run_facts(report, ("seed", "device"), "run"),
+        contents(["Summary", *groups, "Program"]),
+        *(section("Failed", [_table(failed)]) for _ in failed[:1]),
+        section("Summary", [_summary(groups), *heard]),
+        *(section(title, [*texts.get(title, ()), _table(rows)]) for title, rows in groups.items()),
+        section("Program", [program_facts(report)]),
     ]
-    verdict = paragraph(_counted(cases), "bad" if failed else "good")
-    links = contents(["Summary", *kinds, *parts, "Program"])
-    about = run_facts(report, ("seed", "device"), "run")
-    write_page(path, "Hard cases", [paragraph(_INTRO), verdict, about, links, *sections])
-
-
-def _part(case: dict[str, Any]) -> str:
-    return str(case["id"]).rpartition("/")[0]
+    write_page(path, "Hard cases", parts)
 
 
 def _counted(cases: Rows) -> str:
@@ -205,23 +203,12 @@ def _summary(parts: dict[str, Any]) -> Html:
     return table(("part", "cases", "passed", "s", "most of a tolerance used"), rows, words=(0, 4))
 
 
-def _table(cases: Rows, whole_ids: bool = False) -> Html:
+def _table(cases: Rows) -> Html:
+    rows = []
+    for c in cases:
+        device = "" if c["device"] == "cpu" else f" on {c['device']}"
+        error = "none" if c["error"] is None else f"{short(c['error'])} {c['unit']}".strip()
+        what = (_VERDICTS[c["passed"]], f"`{c['id']}`", c["asked"] + device, c["came_out"], c["twin"], error)
+        rows.append((*what, short(c["tolerance"]), "yes" if c["finite"] else "NO", f"{c['seconds']:.2f}"))
     marked = [i for i, c in enumerate(cases) if c["passed"] is False]
-    return wide(table(_HEADS, [_cells(c, whole_ids) for c in cases], words=(0, 1, 2, 3, 4, 7), marked=marked))
-
-
-def _cells(c: dict[str, Any], whole_id: bool) -> tuple[str, ...]:
-    name = c["id"] if whole_id else c["id"].rpartition("/")[2]
-    device = "" if c["device"] == "cpu" else f" on {c['device']}"
-    error = "none" if c["error"] is None else f"{short(c['error'])} {c['unit']}".strip()
-    return (
-        _VERDICTS[c["passed"]], f"`{name}`", c["asked"] + device, c["came_out"], c["twin"], error,
-        short(c["tolerance"]), "yes" if c["finite"] else "NO", f"{c['seconds']:.2f}",
-    )  # fmt: skip
-
-
-def _program(report: dict[str, Any]) -> Html:
-    machine = report["environment"]
-    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
-    rows = [("command", f"`{report['command']}`"), ("Python", machine["python"]), ("platform", machine["platform"])]
-    return facts([*rows, ("processor", machine["cpu"]), ("packages", packages), ("JSON", "`hard_cases.json`")])
+    return wide(table(_HEADS, rows, words=(0, 1, 2, 3, 4, 7), marked=marked))

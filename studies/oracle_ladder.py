@@ -9,14 +9,15 @@ leaderboard takes them.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+import textwrap
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 from rich.console import Console
-from rich.table import Table
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
@@ -37,6 +38,7 @@ SAMPLES = 128  # of a pixel of the true images: their noise is then a third of t
 MEAN = "mean"
 COLUMNS = {"psnr": "PSNR, dB", "psnr_dynamic": "PSNR where things move, dB", "fit_seconds": "fit, s"}
 _GAINS = ("psnr", "psnr_dynamic")  # columns that are compared with the fit as it is
+Values = dict[str, float | None]  # by column
 
 
 def oracle_ladder(
@@ -118,115 +120,74 @@ def climb(
         for line in ladder.left_out:
             console.print(f"{ladder.method}: left out: {line}", highlight=False, markup=False)
     tables = [make_table(ladder, [scene.id for scene in scenes], records) for ladder in ladders]
-    for table in tables:
-        print_ladder(table, console)
     write_ladder(settings.out, tables)
+    for table in tables:
+        console.print(to_markdown(table), highlight=False, markup=False)
     return records
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A rung on a scene, or in the mean: values by `COLUMNS`, None where there is none, and why."""
-
-    values: dict[str, float | None]
-    error: str = ""
-
-
-@dataclass(frozen=True)
 class LadderTable:
-    """The rungs of a method, the fit as it is first: title -> scene, or the mean -> cell."""
+    """The rungs of a method, the fit as it is first: rung -> scene, or the mean -> column -> value.
+
+    A value is None where there is none; `errors` says why, by rung and scene.
+    """
 
     method: str
-    scenes: tuple[str, ...]
-    rungs: dict[str, dict[str, Cell]]
-
-    @property
-    def places(self) -> tuple[str, ...]:
-        """The scenes, and their mean where there are several."""
-        return (*self.scenes, MEAN) if len(self.scenes) > 1 else self.scenes
+    places: tuple[str, ...]  # the scenes, and their mean where there are several
+    rungs: dict[str, dict[str, Values]]
+    errors: dict[tuple[str, str], str]
 
     def gain(self, title: str, place: str, column: str) -> float | None:
         """Return by how much a rung is above the fit as it is; None where either has no value."""
-        plain = next(iter(self.rungs.values()))[place].values[column]
-        value = self.rungs[title][place].values[column]
+        plain = next(iter(self.rungs.values()))[place][column]
+        value = self.rungs[title][place][column]
         return None if plain is None or value is None else value - plain
 
 
 def make_table(ladder: Ladder, scenes: Sequence[str], records: Sequence[Record]) -> LadderTable:
     """Return the table of a ladder, each rung the mean over the seeds in `records`."""
-    rows = {}
+    rungs, errors = {}, {}
     for rung in ladder.rungs:
         mine = [r for r in records if r["method"]["name"] == rung.method.name]
-        cells = {scene: _of_seeds([r["scenes"][scene] for r in mine]) for scene in scenes}
-        every = {c: mean([cell.values[c] for cell in cells.values()]) for c in COLUMNS}
-        rows[rung.title] = {**cells, MEAN: Cell(every)}
-    return LadderTable(ladder.method, tuple(scenes), rows)
-
-
-def _of_seeds(cells: Sequence[dict[str, Any]]) -> Cell:
-    errors = [str(c["error"]) for c in cells if c["error"]]
-    found = [{**dict.fromkeys(COLUMNS), **_metrics(c), "fit_seconds": c["fit_seconds"]} for c in cells]
-    return Cell({name: mean([v[name] for v in found]) for name in COLUMNS}, "; ".join(errors))
-
-
-def _metrics(cell: dict[str, Any]) -> dict[str, Any]:
-    metrics = cell["metrics"]
-    return {name: metrics[name] for name in _GAINS} if isinstance(metrics, dict) else {}
+        found = {}
+        for scene in scenes:
+            cells = [r["scenes"][scene] for r in mine]
+            values = [{**(c["metrics"] or {}), "fit_seconds": c["fit_seconds"]} for c in cells]
+            found[scene] = {column: mean([v.get(column) for v in values]) for column in COLUMNS}
+            if why := "; ".join(str(c["error"]) for c in cells if c["error"]):
+                errors[rung.title, scene] = why
+        every = {column: mean([v[column] for v in found.values()]) for column in COLUMNS}
+        rungs[rung.title] = {**found, MEAN: every} if len(scenes) > 1 else found
+    return LadderTable(ladder.method, (*scenes, MEAN) if len(scenes) > 1 else (*scenes,), rungs, errors)
 
 
 def write_ladder(out: Path, tables: Sequence[LadderTable]) -> None:
     """Write ladder.md and ladder.csv, with the gains over the fit as it is, and ladder_METHOD.png for each method."""
+    lines = []
+    for table in tables:
+        for title, place in itertools.product(table.rungs, table.places):
+            values = [*table.rungs[title][place].values(), *(table.gain(title, place, c) for c in _GAINS)]
+            texts = ("" if v is None else f"{v:.4f}" for v in values)
+            lines.append([table.method, title, place, *texts, table.errors.get((title, place), "")])
+        plot(out / f"ladder_{table.method}.png", table)
     columns = ["method", "rung", "scene", *COLUMNS, *(f"{c}_gain" for c in _GAINS), "error"]
-    lines = [line for table in tables for line in _lines(table)]
     write_csv(out / "ladder.csv", columns, lines)
     write_text(out / "ladder.md", "\n".join(to_markdown(table) for table in tables))
-    for table in tables:
-        plot(out / f"ladder_{table.method}.png", table)
-
-
-def _lines(table: LadderTable) -> Iterator[list[str]]:
-    for title, cells in table.rungs.items():
-        for place in table.places:
-            values = [cells[place].values[c] for c in COLUMNS] + [table.gain(title, place, c) for c in _GAINS]
-            yield [table.method, title, place, *("" if v is None else f"{v:.4f}" for v in values), cells[place].error]
 
 
 def to_markdown(table: LadderTable) -> str:
     """Return Markdown: a block for each column, its value and the gain in brackets, then errors."""
     lines = [f"# Where the dB of {table.method} are lost", ""]
-    for title, header, body in _blocks(table):
-        lines += [f"## {title}", "", *markdown(header, body), ""]
-    errors = [
-        f"- {title}, {scene}: {cells[scene].error}"
-        for title, cells in table.rungs.items()
-        for scene in table.scenes
-        if cells[scene].error
-    ]
+    for column, title in COLUMNS.items():
+        rows = [[rung, *(_text(table, rung, place, column) for place in table.places)] for rung in table.rungs]
+        lines += [f"## {title}", "", *markdown(["rung", *table.places], rows), ""]
+    errors = [f"- {title}, {scene}: {why}" for (title, scene), why in table.errors.items()]
     return "\n".join([*lines, *errors, ""] if errors else lines)
 
 
-def print_ladder(table: LadderTable, console: Console) -> None:
-    """Print the same blocks."""
-    for title, header, body in _blocks(table):
-        shown = Table(title=f"{table.method}: {title}", box=None)
-        for k, name in enumerate(header):
-            shown.add_column(name.replace(" ", "\n") if k else name, justify="right" if k else "left")
-        for row in body:
-            shown.add_row(*row)
-        console.print(shown)
-
-
-def _blocks(table: LadderTable) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Return title, header and body of a block for each column."""
-    header = ["rung", *table.places]
-    return [
-        (COLUMNS[c], header, [[title, *(_text(table, title, p, c) for p in table.places)] for title in table.rungs])
-        for c in COLUMNS
-    ]
-
-
 def _text(table: LadderTable, title: str, place: str, column: str) -> str:
-    value = table.rungs[title][place].values[column]
+    value = table.rungs[title][place][column]
     if value is None:
         return "-"
     if column not in _GAINS:
@@ -245,19 +206,16 @@ def plot(path: Path, table: LadderTable) -> None:
     plain, *others = table.rungs
     places = table.places
     figure = new_figure((3.2 + 1.9 * len(others), 1.9 + 0.42 * len(places)))
-    largest = max([abs(g) for t in others for p in places for c in _GAINS if (g := table.gain(t, p, c))], default=1.0)
-    for axes, column in zip(figure.subplots(1, 2, sharey=True), _GAINS, strict=True):
-        gains = [[_or_nan(table.gain(title, place, column)) for title in others] for place in places]
-        axes.imshow(gains, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
-        for y, row in enumerate(gains):
-            for x, gain in enumerate(row):
-                text, color = ("-", "black") if math.isnan(gain) else (_signed(gain), _ink(gain / largest))
-                axes.text(x, y, text, ha="center", va="center", fontsize=8, color=color)
-        axes.set_xticks(range(len(others)), [_folded(title) for title in others], fontsize=7)
+    gains = {c: [[_or_nan(table.gain(title, place, c)) for title in others] for place in places] for c in _GAINS}
+    largest = float(np.nanmax(np.abs([*gains.values()]), initial=1e-9))
+    for axes, (column, values) in zip(figure.subplots(1, 2, sharey=True), gains.items(), strict=True):
+        axes.imshow(values, cmap="RdBu", vmin=-largest, vmax=largest, aspect="auto")
+        for (y, x), gain in np.ndenumerate(values):
+            color = "white" if abs(gain) > 0.6 * largest else "black"
+            axes.text(x, y, "-" if np.isnan(gain) else _signed(gain), ha="center", va="center", fontsize=8, color=color)
+        axes.set_xticks(range(len(others)), [textwrap.fill(title, 14) for title in others], fontsize=7)
         labels = [f"{p}: {_text(table, plain, p, _GAINS[0])} / {_text(table, plain, p, _GAINS[1])}" for p in places]
         axes.set_yticks(range(len(places)), labels, fontsize=8)
-        if MEAN in places:
-            axes.axhline(len(places) - 1.5, color="black", linewidth=1)
         axes.set_title(COLUMNS[column].replace("PSNR", "gain in PSNR"), fontsize=9)
     figure.suptitle(f"{table.method}: dB gained over the fit as it is (its PSNR / where things move)", fontsize=10)
     save_figure(figure, path)
@@ -265,16 +223,3 @@ def plot(path: Path, table: LadderTable) -> None:
 
 def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-def _ink(share: float) -> str:
-    """Return the colour of text on a cell whose colour is `share` of the way to its end."""
-    return "white" if abs(share) > 0.6 else "black"
-
-
-def _folded(title: str) -> str:
-    """Return a title in lines of about 14 letters."""
-    lines = [""]
-    for word in title.split():
-        lines = [*lines[:-1], f"{lines[-1]} {word}".strip()] if len(lines[-1] + word) < 14 else [*lines, word]
-    return "\n".join(lines)

@@ -48,10 +48,7 @@ TITLES = {
     "steps": f"{MORE_STEPS:g} x steps",
 }
 RUNGS = (*((name,) for name in TITLES), ("images", "gaussians", "steps"))
-_NO_LIMIT: dict[str, Any] = {
-    "density.max_moving_per_pixel": 1e3,
-    "density.max_gaussians": 10_000_000,
-}
+_NO_LIMIT: dict[str, Any] = {"density.max_moving_per_pixel": 1e3, "density.max_gaussians": 10_000_000}
 
 
 @dataclass(frozen=True, eq=False)

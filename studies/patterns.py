@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float64
@@ -19,11 +18,13 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.recipes import METHODS, SELF_CALIBRATED
+from spike4dgs.studies.kit.timing import show_table
 
 Row = dict[str, float | str]
 COLUMNS = {  # key of the row -> heading
@@ -81,9 +82,8 @@ def patterns(
     """
     training = open_scene(scene, allow_gaps).training
     if any(camera.distortion for camera in training.cameras):
-        raise problem(
-            scene, "lenses without distortion", "distorted ones", "undistorted pixels have no map of their own"
-        )
+        fix = "undistorted pixels have no map of their own"
+        raise problem(scene, "lenses without distortion", "distorted ones", fix)
     with RunDisplay(make_console(), 1) as display, display.cell(f"patterns of {training.id}") as shown:
         request = FitRequest(make_budget(budget), device, seed, shown.progress)
         method = METHODS[SELF_CALIBRATED.name]
@@ -96,32 +96,24 @@ def patterns(
     _plot(training, gain, out / "gain.png")
     if training.calibrations:
         rows = pattern_errors(gain, dark, training.calibrations)
-        _print(training, rows)
-        write_json(out / "errors.json", dict(zip((c.id for c in training.cameras), rows, strict=True)))
+        ids = [camera.id for camera in training.cameras]
+        texts = [[id, *(f"{row[key]:.2f}" for key in COLUMNS)] for id, row in zip(ids, rows, strict=True)]
+        show_table("", ["camera", *COLUMNS.values()], texts, None)
+        write_json(out / "errors.json", dict(zip(ids, rows, strict=True)))
     print(f"maps and images: {out}")
     return 0
 
 
-def _print(scene: TrainingScene, rows: Sequence[Row]) -> None:
-    table = Table("camera", *COLUMNS.values())
-    for camera, row in zip(scene.cameras, rows, strict=True):
-        table.add_row(camera.id, *(f"{row[key]:.2f}" for key in COLUMNS))
-    make_console().print(table)
-
-
 def _plot(scene: TrainingScene, gain: Float64, path: Path) -> None:
     """Write an image of all gain maps, those of the calibration below where there is one."""
-    from matplotlib.figure import Figure
-
     rows = {"from the clip": list(gain)}
     if scene.calibrations:
         rows["from flat fields"] = [c.gain.astype(np.float64) for c in scene.calibrations]
-    figure = Figure(figsize=(2.2 * len(gain), 0.4 + 1.6 * len(rows)), layout="constrained")
+    figure = new_figure((2.2 * len(gain), 0.4 + 1.6 * len(rows)))
     grid = figure.subplots(len(rows), len(gain), squeeze=False)
     for row, (title, maps) in zip(grid, rows.items(), strict=True):
         for axes, camera, image in zip(row, scene.cameras, maps, strict=True):
             axes.imshow(image, vmin=0.85, vmax=1.15, cmap="viridis")
             axes.set(title=f"{camera.id} {title}", xticks=[], yticks=[])
             axes.title.set_fontsize(8)
-    with atomic_path(path) as part:
-        figure.savefig(part, dpi=110)
+    save_figure(figure, path)

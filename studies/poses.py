@@ -4,59 +4,41 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from rich.table import Table
 from tyro.conf import Positional
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
-from spike4dgs.benchmark.reports.console import make_console
-from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
-from spike4dgs.method.fit import RecipeMethod
-from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.msdi.pose import solve_poses
-from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.starts.msdi import DEFAULTS, infer, matched_poses
 from spike4dgs.method.starts.rig import rig, window_means
 from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
 from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
+from spike4dgs.studies.kit.timing import show_table
 
 Row = dict[str, float | int | str | None]
 CLIP = "clip"  # means of the whole clip, as they are
 FLAT = "flat"  # the same, corrected by the cameras' calibrations
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Cameras with poses, and how many points came with them."""
+class Posed(NamedTuple):
+    """Cameras with poses, and the points [N, 3] in metres that came with them."""
 
     cameras: Sequence[Camera]
-    points: int
+    points: Any
 
 
-def _rig(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = rig(scene)
-    return Estimate(start.cameras, len(start.points))
-
-
-def _colmap(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    focal = None if calibrated else FOCAL_PRIOR
-    found = map_views(scene, images, seed, focal_prior=focal)
-    return Estimate(found.cameras, len(found.points))
-
-
-def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Posed:
     """Return the poses by the network alone: each view's from its own points, by PnP."""
     found, cameras = infer(scene, calibrated=calibrated), []
     known = np.stack([c.K for c in found.cameras]) if calibrated else None
@@ -66,25 +48,21 @@ def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) ->
             raise problem(f"MSDI on {scene.id}", f"a pose for {camera.id}", f"none ({pose.reason})", fix)
         focal = {} if pose.focal_px is None else dict.fromkeys(("fx", "fy"), pose.focal_px * found.factor)
         cameras.append(replace(camera, R=pose.w2c[:3, :3], t=pose.w2c[:3, 3], **focal))
-    return Estimate(cameras, int(found.sure(DEFAULTS).sum()))
+    return Posed(cameras, found.points[found.sure(DEFAULTS)])
 
 
-def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
+def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Any:
     if not calibrated:
         raise problem("msdi-matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
-    found = matched_poses(scene, infer(scene, calibrated=True), seed)
-    return Estimate(found.cameras, len(found.points))
+    return matched_poses(scene, infer(scene, calibrated=True), seed)
 
 
-def _dust3r(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Estimate:
-    start = estimate_dust3r(scene, images, seed, calibrated=calibrated)
-    return Estimate(start.cameras, len(start.points))
-
-
-ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Estimate]] = {
-    "rig": _rig,
-    "colmap": _colmap,
-    "dust3r": _dust3r,
+ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Any]] = {  # of what has `cameras` and `points`
+    "rig": lambda scene, images, seed, known: rig(scene),
+    "colmap": lambda scene, images, seed, known: map_views(
+        scene, images, seed, focal_prior=None if known else FOCAL_PRIOR
+    ),
+    "dust3r": lambda scene, images, seed, known: estimate_dust3r(scene, images, seed, calibrated=known),
     "msdi": _msdi,
     "msdi-matched": _msdi_matched,
 }
@@ -110,7 +88,6 @@ def poses(
     initialization: tuple[str, ...] = ("colmap",),
     images: str = CLIP,
     unknown_intrinsics: bool = False,
-    refine: bool = False,
     seed: int = 0,
     split: str | None = None,
     out: Path | None = None,
@@ -128,7 +105,6 @@ def poses(
         images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
             calibrations, as in recipes with flat_field), or images of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.
-        refine: Also fit 4DGS to TFP images from these poses, poses included, and measure what they became.
         seed: Seed of everything random.
         split: Split whose training cameras are taken; each scene's default one if left out.
         out: Write the rows to this JSON file.
@@ -142,13 +118,14 @@ def poses(
     rows = []
     for path in scenes:
         scene = as_pinholes(open_scene(path, allow_gaps, split).training)
-        shown = _images(scene, images)
+        made = _images(scene, images)
         for name in initialization:
-            budget = Budget() if refine else None
-            rows += measure_poses(scene, shown, name, seed, calibrated=not unknown_intrinsics, refine=budget)
-    _print(rows)
+            rows.append(measure_poses(scene, made, name, seed, calibrated=not unknown_intrinsics))
+    shown = [[str(row["scene"]), str(row["initialization"]), *_texts(row)] for row in rows]
+    headings = ("scene", "poses", *(heading for heading, _ in COLUMNS.values()))
+    show_table("", headings, shown, None, [str(row.get("error", "")) for row in rows])
     if out:
-        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "refine": refine, "seed": seed}
+        settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "seed": seed}
         write_json(out, {"settings": settings, "rows": rows})
     return 0
 
@@ -163,42 +140,19 @@ def _images(scene: TrainingScene, images: str) -> Float32:
     return undistorted(scene, np.concatenate(made), unseen=None)
 
 
-def measure_poses(
-    scene: TrainingScene, images: Float32, name: str, seed: int, *, calibrated: bool, refine: Budget | None = None
-) -> list[Row]:
-    """Return rows of the table: errors (None where fewer than two views have poses) and seconds.
+def measure_poses(scene: TrainingScene, images: Float32, name: str, seed: int, *, calibrated: bool) -> Row:
+    """Return a row of the table: errors (None where fewer than two views have poses) and seconds.
 
-    An estimator's refusal is the row's `error`. With a budget to refine, a row of the refined poses follows.
+    An estimator's refusal is the row's `error`.
     """
+    row: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
     start = time.perf_counter()
     try:
         found = ESTIMATORS[name](scene, images, seed, calibrated)
     except UserError as e:
-        empty: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS)}
-        return [{**empty, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}]
-    rows = [_row(scene, name, found, time.perf_counter() - start)]
-    if refine and len(found.cameras) == len(scene.cameras):
-        start = time.perf_counter()
-        better = Estimate(refined(scene, found.cameras, refine, seed), found.points)
-        rows.append(_row(scene, f"{name}, refined", better, time.perf_counter() - start))
-    return rows
-
-
-def refined(scene: TrainingScene, cameras: Sequence[Camera], budget: Budget, seed: int) -> tuple[Camera, ...]:
-    """Return `cameras`, in any order, after 4DGS was fitted to TFP images from their poses, poses included."""
-    posed = {camera.id: camera for camera in cameras}
-    start = rig(replace(scene, cameras=tuple(posed[camera.id] for camera in scene.cameras)))
-    parts = replace(PARTS, initialization={"given": Initialization(lambda request: start)})
-    recipe = Recipe("refined", "tfp", "given", "hexplane", "pixel", {"trainer.refine_poses": True})
-    with RunDisplay(make_console(), 1) as display, display.cell(f"poses of {scene.id}, refined") as shown:
-        model = RecipeMethod(recipe, parts).fit(scene, FitRequest(budget, "cpu", seed, shown.progress))
-    assert isinstance(model, FittedModel)
-    return model.cameras
-
-
-def _row(scene: TrainingScene, name: str, found: Estimate, seconds: float) -> Row:
-    row: Row = {"scene": scene.id, "initialization": name, **dict.fromkeys(COLUMNS), "seconds": seconds}
-    row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": found.points}
+        return {**row, "registered": f"0 of {len(scene.cameras)}", "error": str(e)}
+    row |= {"registered": f"{len(found.cameras)} of {len(scene.cameras)}", "points": len(found.points)}
+    row["seconds"] = time.perf_counter() - start
     if len(found.cameras) < 2:
         return {**row, "error": "fewer than two views have poses"}
     true = {camera.id: camera for camera in scene.cameras}
@@ -207,14 +161,5 @@ def _row(scene: TrainingScene, name: str, found: Estimate, seconds: float) -> Ro
     return {**row, **pose_errors(found.cameras, partners).summary(), "focal_ratio": float(np.mean(ratios))}
 
 
-def _print(rows: Sequence[Row]) -> None:
-    table = Table("scene", "poses", *(heading for heading, _ in COLUMNS.values()))
-    for row in rows:
-        values = ((row[key], text) for key, (_, text) in COLUMNS.items())
-        shown = ["-" if value is None else text.format(value) for value, text in values]
-        table.add_row(str(row["scene"]), str(row["initialization"]), *shown)
-    console = make_console()
-    console.print(table)
-    for row in rows:
-        if row.get("error"):
-            console.print(f"{row['scene']}, {row['initialization']}: {row['error']}", highlight=False, markup=False)
+def _texts(row: Row) -> list[str]:
+    return ["-" if row[key] is None else text.format(row[key]) for key, (_, text) in COLUMNS.items()]

@@ -7,38 +7,43 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from spike4dgs.generators.recorder.resources import real_time
-from spike4dgs.studies.kit.timing import show_table, write_csv
+from spike4dgs.studies.kit.timing import show_table
 from spike4dgs.studies.recorder_runs import FRAME_BYTES, Load, Outcome, disk_rate, run
 
-COLUMNS = (
-    "reads", "cameras", "MB/s sent", "frames/s kept", "ticks in gaps", "lost unseen, MB", "wrong frames",
-    "no read in flight: mean, ms", "worst, ms", "cores busy",
-)  # fmt: skip
-DISK_COLUMNS = (
-    "cameras", "runs sustained", "frames/s to disk, least", "longest write, s", "fullest buffer, s",
-    "still waiting, s", "ticks in gaps", "unseen, MB", "fsync, ms", "disk alone, MB/s", "cores busy", "of it emulator",
-    "limit",
-)  # fmt: skip
-RUN_COLUMNS = (
-    "cameras", "run", "result", "frames/s to disk", "longest write, s", "fullest buffer, s", "of, s",
-    "still waiting, s", "ticks in gaps", "unseen, bytes", "wrong frames", "fsync, ms", "wait for disk, s",
-    "longest time without a read, ms", "cores busy", "of it emulator",
-)  # fmt: skip
-
-DISK, PROCESSOR = "disk", "processor"
+COLUMNS: dict[str, Callable[[Outcome], str]] = {  # heading -> text, of a clip in memory
+    "cameras": lambda o: str(len(o.clip.cameras)),
+    "frames/s kept": lambda o: f"{o.frames_per_s:.0f}",
+    "ticks in gaps": lambda o: str(o.lost_ticks),
+    "lost unseen, MB": lambda o: f"{o.unseen_bytes / 1e6:.1f}",
+    "wrong frames": lambda o: str(o.wrong_frames),
+    "no read in flight: mean, ms": lambda o: f"{np.mean([c.stats.idle_mean_ms for c in o.clip.cameras]):.3g}",
+    "worst, ms": lambda o: f"{max(c.stats.idle_worst_ms for c in o.clip.cameras):.3g}",
+    "cores busy": lambda o: f"{o.cpu:.2f}",
+}
+DISK_COLUMNS: dict[str, Callable[[Sequence[Outcome]], str]] = {  # of all runs with a number of cameras
+    "frames/s to disk, least": lambda runs: f"{min(o.frames_per_s for o in runs):.0f}",
+    "longest write, s": lambda runs: f"{max(o.longest_write_s for o in runs):.2f}",
+    "fullest buffer, s": lambda runs: f"{max(o.fullest_s for o in runs):.2f}",
+    "of, s": lambda runs: f"{runs[0].buffer_s:.2f}",
+    "ticks in gaps": lambda runs: str(sum(o.lost_ticks for o in runs)),
+    "unseen, MB": lambda runs: f"{sum(o.unseen_bytes for o in runs) / 1e6:.1f}",
+    "fsync, ms": lambda runs: f"{max(o.flush_s for o in runs) * 1e3:.0f}",
+    "waits for disk, s": lambda runs: f"{max(o.waited_s for o in runs):.2f}",
+    "cores busy": lambda runs: f"{np.mean([o.cpu for o in runs]):.2f}",
+    "of it emulator": lambda runs: f"{np.mean([o.emulator_cpu for o in runs]):.2f}",
+}
 
 _LEAST_S = 4.0  # length of a clip; in a shorter one a disk that is too slow does not show
 # Of data, that may wait when the buffers are emptiest in the second half: the files' own hold 0.07 s. A disk that is
 # slower than the cameras by a share x leaves x times half the clip, so 2.5 % show in 8 s.
 _LEFT_S = 0.1
-_WAITS = 0.5  # share of a clip: a delivery that waits longer than this for the disk is limited by it
 
 
 def record(
@@ -75,65 +80,44 @@ def record(
         runs: Recordings to disk of each number of cameras.
         buffer_s: Seconds that may wait for the disk; as `record` chooses if left out.
         disk: Folder for them; a temporary one if left out.
-        csv: Also write the tables here, and with -disk and -disk-runs behind the name.
+        csv: Also write the tables here, and with -disk behind the name.
     """
     load = Load(cameras, fps, transfer_kib << 10, transfers, memory_kib << 10, buffer_s)
     mb_s = load.fps * FRAME_BYTES / 1e6
     title = f"emulated cameras of {mb_s:g} MB/s, {load.transfers} reads of {transfer_kib} KiB, {os.cpu_count()} cores"
     if seconds:
-        rows = [_memory_row(some, run(some, seconds)) for some in (load, replace(load, transfers=1))]
-        show_table(f"into memory: {title}", COLUMNS, rows, csv)
+        found = {"queued": run(load, seconds), "one at a time": run(replace(load, transfers=1), seconds)}
+        rows = [[name, *(text(o) for text in COLUMNS.values())] for name, o in found.items()]
+        show_table(f"into memory: {title}", ["reads", *COLUMNS], rows, csv)
     if disk_seconds:
         with tempfile.TemporaryDirectory(dir=disk) as folder:
             show_disk(title, load, disk_seconds, max(runs, 1), Path(folder), csv)
     return 0
 
 
-def _memory_row(load: Load, outcome: Outcome) -> list[str]:
-    stats = [c.stats for c in outcome.clip.cameras]
-    return [
-        f"{load.transfers} queued" if load.transfers > 1 else "one at a time",
-        str(load.cameras),
-        f"{load.bytes_per_s / 1e6:.0f}",
-        f"{outcome.frames_per_s:.0f}",
-        str(outcome.lost_ticks),
-        f"{outcome.unseen_bytes / 1e6:.1f}",
-        str(outcome.wrong_frames),
-        f"{np.mean([s.idle_mean_ms for s in stats]):.3g}",
-        f"{max(s.idle_worst_ms for s in stats):.3g}",
-        f"{outcome.cpu:.2f}",
-    ]
-
-
 def show_disk(title: str, load: Load, seconds: float, runs: int, folder: Path, csv: Path | None) -> None:
-    """Record one camera to disk `runs` times, then two, and so on until a run is not sustained; print the tables."""
+    """Record one camera to disk `runs` times, then two, and so on until a run is not sustained; print the table."""
     rows: list[list[str]] = []
-    each: list[list[str]] = []
-    every: list[Outcome] = []
     most, end = 0, ", and may more"
     for n in range(1, load.cameras + 1):
-        some = replace(load, cameras=n)
-        outcomes = []
+        some, outcomes, failed = replace(load, cameras=n), list[Outcome](), list[str]()
         for i in range(runs):
             outcomes.append(run(some, seconds, folder / "clip"))
-            each.append(_run_row(some, i + 1, outcomes[-1]))
-            print(f"{_cameras(n)}, run {i + 1} of {runs}: {each[-1][2]}", flush=True)
+            reason = not_sustained(some, outcomes[-1])
+            failed += [reason] if reason else []
+            print(f"{_cameras(n)}, run {i + 1} of {runs}: {reason or 'sustained'}", flush=True)
         with real_time():  # as the recordings
             alone = disk_rate(folder, n, seconds, some.bytes_per_s)
-        rows.append(_row(some, outcomes, alone))
-        every += outcomes
-        if failed := [reason for o in outcomes if (reason := not_sustained(some, o))]:
+        texts = [text(outcomes) for text in DISK_COLUMNS.values()]
+        rows.append([str(n), f"{runs - len(failed)} of {runs}", *texts, f"{alone / 1e6:.0f}"])
+        if failed:
             end = f"; {n}: {runs - len(failed)} of {runs}, {failed[0]}"
             break
         most = n
-    show_table(f"to disk: {title}", DISK_COLUMNS, rows, csv and csv.with_stem(f"{csv.stem}-disk"))
-    if csv:
-        runs_path = csv.with_stem(f"{csv.stem}-disk-runs")
-        write_csv(runs_path, RUN_COLUMNS, each)
-        print(f"written: {runs_path}")
-    cache, priority = "past" if every[-1].direct else "through", "real-time" if every[-1].urgent else "ordinary"
+    columns = ["cameras", "runs sustained", *DISK_COLUMNS, "disk alone, MB/s"]
+    show_table(f"to disk: {title}", columns, rows, csv and csv.with_stem(f"{csv.stem}-disk"))
+    cache, priority = "past" if outcomes[-1].direct else "through", "real-time" if outcomes[-1].urgent else "ordinary"
     print(f"runs of {seconds:g} s at {priority} priority; written {cache} the page cache")
-    print(_worst(every))
     print(f"every run of {runs} sustained {_cameras(most)} to disk{end}")
 
 
@@ -162,67 +146,5 @@ def left_s(load: Load, outcome: Outcome) -> float:
     return float(late.min()) / load.bytes_per_s if len(late) else 0.0
 
 
-def limit(load: Load, outcome: Outcome) -> str | None:
-    """Return what a run that is not sustained lacks: the disk or the processor; None where it lacks nothing.
-
-    Bytes are lost unseen when a reading thread gets no processor in time. The buffer fills because the delivery waits
-    for the disk, or because it gets no processor to copy frames.
-    """
-    if not_sustained(load, outcome) is None:
-        return None
-    waits = outcome.waited_s > _WAITS * outcome.seconds
-    return DISK if waits and not outcome.unseen_bytes else PROCESSOR
-
-
-def _row(load: Load, outcomes: Sequence[Outcome], alone: float) -> list[str]:
-    good = sum(not_sustained(load, o) is None for o in outcomes)
-    limits = sorted({found for o in outcomes if (found := limit(load, o)) is not None})
-    return [
-        str(load.cameras),
-        f"{good} of {len(outcomes)}",
-        f"{min(o.frames_per_s for o in outcomes):.0f}",
-        f"{max(o.longest_write_s for o in outcomes):.2f}",
-        f"{max(o.fullest_s for o in outcomes):.2f}",
-        f"{max(left_s(load, o) for o in outcomes):.2f}",
-        str(sum(o.lost_ticks for o in outcomes)),
-        f"{sum(o.unseen_bytes for o in outcomes) / 1e6:.1f}",
-        f"{max(o.flush_s for o in outcomes) * 1e3:.0f}",
-        f"{alone / 1e6:.0f}",
-        f"{np.mean([o.cpu for o in outcomes]):.2f}",
-        f"{np.mean([o.emulator_cpu for o in outcomes]):.2f}",
-        " and ".join(limits) or "-",
-    ]
-
-
-def _run_row(load: Load, number: int, o: Outcome) -> list[str]:
-    return [
-        str(load.cameras),
-        str(number),
-        not_sustained(load, o) or "sustained",
-        f"{o.frames_per_s:.0f}",
-        f"{o.longest_write_s:.3f}",
-        f"{o.fullest_s:.3f}",
-        f"{o.buffer_s:.3f}",
-        f"{left_s(load, o):.3f}",
-        str(o.lost_ticks),
-        str(o.unseen_bytes),
-        str(o.wrong_frames),
-        f"{o.flush_s * 1e3:.0f}",
-        f"{o.waited_s:.3f}",
-        f"{max(c.stats.idle_worst_ms for c in o.clip.cameras):.2f}",
-        f"{o.cpu:.2f}",
-        f"{o.emulator_cpu:.2f}",
-    ]
-
-
 def _cameras(n: int) -> str:
     return f"{n} camera{'s' * (n != 1)}"
-
-
-def _worst(outcomes: Sequence[Outcome]) -> str:
-    longest, fullest = max(o.longest_write_s for o in outcomes), max(outcomes, key=lambda o: o.fullest_s / o.buffer_s)
-    return (
-        f"in all runs: the longest write took {longest:.2f} s; the fullest buffer held {fullest.fullest_s:.2f} of "
-        f"{fullest.buffer_s:.2f} s; {sum(o.lost_ticks for o in outcomes)} ticks lost and listed as gaps; "
-        f"{sum(o.unseen_bytes for o in outcomes)} bytes lost unseen"
-    )

@@ -25,7 +25,6 @@ GROUPS = (  # of the page, in this order; the runner takes them in it too
     "Losses and networks",
     "Sensor and rendering",
     "Metrics and streams",
-    "Fits",
     "How costs grow",
 )
 
@@ -62,11 +61,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Request:
-    """What a measurement may use: the size of its work, the seed, the device, and a scene, made when first asked."""
+    """What a measurement may use: the size of its work, the seed, and a scene, made when first asked."""
 
     size: Size
     seed: int
-    device: str
     scene: Callable[[], Path]
 
     def pick(self, tiny: Any, quick: Any, whole: Any) -> Any:
@@ -91,10 +89,7 @@ class Measurement:
     x: str  # of the plot, by column
     y: tuple[str, ...]  # a plot each
     run: Run = field(compare=False)
-    seconds: Mapping[Size, float] = field(default_factory=dict)  # by size: what it took on two cores, for the estimate
     held_by: str = ""  # the test that holds the error
-    cost: str = ""  # column of the summary, where it is not x
-    error: str = ""  # column of the summary, where it is not the first of y
     sizes: tuple[Size, ...] = SIZES  # that it is part of
 
 
@@ -104,26 +99,22 @@ def measurement(
     title: str,
     columns: tuple[Column, ...],
     y: tuple[str, ...],
-    seconds: tuple[float | None, float | None, float | None],
     *,
-    cost: str = "",
-    error: str = "",
+    least: Size | None = "tiny",
 ) -> Callable[[Run], Measurement]:
     """Make a measurement of the decorated function; the paragraphs of its docstring are the texts.
 
     They are the approximation, the exact twin, the reason for the chosen point, and the test that holds the error;
-    where a cost grows, the first alone. The first column is the x of plots. `seconds` are those of each size, None
-    where it is no part of that size.
+    where a cost grows, the first alone. The first column is the x of plots. `least` is the smallest size that includes
+    the measurement; with None it is measured only where it is asked for by its id.
     """
-    took: dict[Size, float] = {size: s for size, s in zip(SIZES, seconds, strict=True) if s is not None}
+    sizes = SIZES[SIZES.index(least) :] if least else ()
 
     def made(run: Run) -> Measurement:
         paragraphs = [" ".join(p.split()) for p in (inspect.getdoc(run) or "").split("\n\n")]
         approximation, exact, reason, held_by = (*paragraphs, "", "", "")[:4]
-        x, sizes = columns[0].id, tuple(took)
-        return Measurement(
-            id, group, title, approximation, exact, reason, columns, x, y, run, took, held_by, cost, error, sizes
-        )
+        texts = approximation, exact, reason, columns, columns[0].id, y, run, held_by
+        return Measurement(id, group, title, *texts, sizes)
 
     return made
 

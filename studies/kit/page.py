@@ -41,12 +41,13 @@ def write_page_of(path: Path, report: dict[str, Any]) -> None:
         contents(["Summary", *groups]),
         section("Summary", [_summary(results), *_failures(results)]),
         *sections,
-        section("Program", [_program(report)]),
+        section("Program", [program_facts(report)]),
     ]
     write_page(path, "Speed against error", parts)
 
 
-def _program(report: dict[str, Any]) -> Html:
+def program_facts(report: dict[str, Any]) -> Html:
+    """Return the table of the command, the system and the packages of a report."""
     machine = report["environment"]
     packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
     return facts(
@@ -63,9 +64,10 @@ def _summary(results: Iterable[dict[str, Any]]) -> Html:
     rows = []
     for r in results:
         for s in r["series"][:1]:
-            chosen, exact = _pair(r, s)
-            if chosen is None or exact is None:
+            roles = {p["role"]: p for p in reversed(s["points"])}  # the first of each
+            if not {"chosen", "exact"} <= roles.keys():
                 continue
+            chosen, exact = roles["chosen"], roles["exact"]
             x, y = (next(c for c in r["columns"] if c["id"] == i) for i in (r["cost"], r["error"]))
             cost, base, error = chosen["values"][x["id"]], exact["values"][x["id"]], chosen["values"][y["id"]]
             ratio = f"{short(base / cost)}" if cost and base is not None else "-"
@@ -73,14 +75,6 @@ def _summary(results: Iterable[dict[str, Any]]) -> Html:
             rows.append((link(r["title"], r["title"]), chosen["name"], *costs, x["title"], _number(error), y["title"]))
     heads = ("approximation", "chosen", "its cost", "exact twin", "ratio", "cost in", "its error", "error in")
     return table(heads, rows, words=(0, 1, 5, 7))
-
-
-def _pair(r: dict[str, Any], s: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the chosen point of a series and its exact one; where that is a series of its own, the one of its name."""
-    chosen = next((p for p in s["points"] if p["role"] == "chosen"), None)
-    exact = [p for of in (s, *r["series"]) for p in of["points"] if p["role"] == "exact"]
-    own = [p for p in exact if p in s["points"] or (chosen and p["name"] == chosen["name"])]
-    return chosen, own[0] if own else None
 
 
 def _failures(results: Iterable[dict[str, Any]]) -> list[Html]:

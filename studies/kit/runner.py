@@ -22,9 +22,6 @@ from spike4dgs.studies.kit.measurement import GROUPS, Measurement, Point, Reques
 from spike4dgs.studies.kit.timing import write_csv
 
 Result = dict[str, Any]  # a measurement of speed_error.schema.json
-_UNKNOWN_S = 10.0  # of a measurement that does not say how long it takes
-
-
 FORMAT = "spike4dgs-speed-error/1"
 
 
@@ -37,7 +34,7 @@ def run_study(
     """
     from spike4dgs.studies.kit.page import write_page_of
 
-    shared: dict[str, Any] = {"size": request.size, "seed": request.seed, "device": request.device}
+    shared: dict[str, Any] = {"size": request.size, "seed": request.seed, "device": "cpu"}
     folder = out / "measurements"
     for m in measurements if again else ():
         (folder / f"{m.id}.json").unlink(missing_ok=True)
@@ -46,7 +43,7 @@ def run_study(
     started, finished = measured_from_to(results)
     report = {
         "format": FORMAT, **shared, "started": started, "finished": finished, "command": command_line(),
-        "harness": harness(), "environment": environment(request.device), "measurements": results,
+        "harness": harness(), "environment": environment("cpu"), "measurements": results,
     }  # fmt: skip
     check_schema(report, load_schema("spike4dgs.studies.kit", "speed_error.schema.json"), "the report", "report this")
     write_json(out / "speed_error.json", report)
@@ -69,25 +66,17 @@ def measure_all(
     measurements: Sequence[Measurement], request: Request, folder: Path, key: dict[str, Any], say: Callable[[str], None]
 ) -> list[Result]:
     """Return a result for each measurement, failed ones too. Files FOLDER/ID.json of the same `key` are kept."""
-    left = {m.id: m.seconds.get(request.size, _UNKNOWN_S) for m in measurements}
-    told = spent = 0.0  # seconds: expected and measured, of what is done
     results = []
-    for i, m in enumerate(measurements):
+    for i, m in enumerate(measurements, start=1):
         path, own = folder / f"{m.id}.json", sha256_json({**key, "machine": cpu_name(), "id": m.id})
-        label = f"[{i + 1}/{len(measurements)}] {m.title}"
-        if (kept := _kept(path, own)) is not None:
-            say(f"{label}: kept")
-            results.append(kept)
-            left.pop(m.id)
-            continue
-        factor = spent / told if told else 1.0
-        say(f"{label}; about {_minutes(factor * sum(left.values()))} to go")
-        result = measure(m, request)
-        told, spent = told + left.pop(m.id), spent + result["seconds"]
-        if result["problem"]:
-            say(f"    failed: {result['problem']}")
-        else:
-            write_json(path, {"key": own, "result": result})
+        result = _kept(path, own)
+        say(f"[{i}/{len(measurements)}] {m.title}{': kept' if result else ''}")
+        if result is None:
+            result = measure(m, request)
+            if result["problem"]:
+                say(f"    failed: {result['problem']}")
+            else:
+                write_json(path, {"key": own, "result": result})
         results.append(result)
     return results
 
@@ -113,8 +102,8 @@ def measure(m: Measurement, request: Request) -> Result:
     return {
         **{name: getattr(m, name) for name in texts},
         "y": list(m.y),
-        "cost": m.cost or m.x,
-        "error": m.error or m.y[0],
+        "cost": m.x,
+        "error": m.y[0],
         "columns": [asdict(c) for c in m.columns],
         "series": [{"name": s.name, "points": [_point(p, m) for p in s.points]} for s in series],
         "seconds": time.perf_counter() - start,
@@ -140,18 +129,12 @@ def _point(p: Point, m: Measurement) -> dict[str, Any]:
 
 def _kept(path: Path, key: str) -> Result | None:
     """Return the result in a file, if it is of the same key."""
-    if not path.is_file():
-        return None
     try:
         content = read_json(path, "a measurement of the report")
-    except UserError:  # a damaged file is measured again
+    except UserError:  # no file, or a damaged one
         return None
     result: Result | None = content.get("result")
     return result if content.get("key") == key else None
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def in_order(measurements: Iterable[Measurement]) -> list[Measurement]:

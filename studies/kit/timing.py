@@ -1,15 +1,13 @@
-"""Repeated timing, modules of other packages, and tables on the console, as CSV and as Markdown, for all studies."""
+"""Repeated timing, and tables on the console, as CSV and as Markdown, for all studies."""
 
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from spike4dgs.benchmark.files import write_text
@@ -29,26 +27,6 @@ def by_turns_ms(runs: Sequence[Callable[[], object]], repeats: int) -> list[tupl
             run()
             own.append((time.perf_counter() - start) * 1e3)
     return [(min(own), statistics.median(own)) for own in times]
-
-
-def module_of(package: str, file: str) -> ModuleType | None:
-    """Import one file of a package without running its `__init__`; return None where the package is not installed.
-
-    Raises ImportError where the file is missing, or imports something that is missing.
-    """
-    found = importlib.util.find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        return None
-    path = Path(next(iter(found.submodule_search_locations))) / file
-    spec = importlib.util.spec_from_file_location(f"_{package}_{path.stem}", path)
-    if not path.is_file() or spec is None or spec.loader is None:
-        raise ImportError(f"{package} has no {file}")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except (ImportError, FileNotFoundError) as e:
-        raise ImportError(f"{package}/{file} cannot be imported: {e}") from e
-    return module
 
 
 def show_table(

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Literal
 
-from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.studies.kit.measurement import Measurement, Request, Size
 from spike4dgs.studies.kit.runner import in_order, run_study
 
 
 def plan() -> Sequence[Measurement]:
-    """Return all measurements. Raises ValueError where two have one id."""
+    """Return all measurements, which are decorated functions of these modules."""
     from spike4dgs.studies.speed_error import (
         cuts,
-        fits,
         growth,
         images,
         keys,
@@ -28,17 +25,8 @@ def plan() -> Sequence[Measurement]:
         splat,
     )
 
-    return in_order(
-        (
-            *(splat.precision, splat.gradients, cuts.exponential, cuts.extent, cuts.transmittance, cuts.pixel_filter),
-            *(splat.background, splat.beside_torch, networks.fused_ssim, networks.lookup, networks.msdi_images),
-            *(images.makers, images.half_floats, *fits.FITS),
-            *(sensor.integration, sensor.other_program, keys.keys, rendering.savings, rendering.soft_light),
-            *(scores.scores, scores.flip_score, scores.decoding),
-            *(growth.pixels, growth.gaussians, growth.views, growth.threads),
-            *(growth.sensor_pixels, growth.sensor_clip, growth.sensor_threads, growth.metrics),
-        )
-    )
+    modules = (splat, cuts, images, networks, sensor, keys, rendering, scores, growth)
+    return in_order(m for module in modules for m in vars(module).values() if isinstance(m, Measurement))
 
 
 def speed_error(
@@ -49,7 +37,6 @@ def speed_error(
     only: tuple[str, ...] = (),
     scene: Path | None = None,
     seed: int = 0,
-    device: Literal["auto", "cpu", "cuda"] = "cpu",
     again: bool = False,
 ) -> int:
     """Measure every approximation of the project beside its exact twin, and how costs grow, in one run.
@@ -60,13 +47,12 @@ def speed_error(
 
     Args:
         out: Folder for the page, the JSON and the scene.
-        size: whole (about an hour on two cores), quick (ten minutes), or tiny (seconds, to try the command).
+        size: whole (less than an hour on two cores), quick (less than ten minutes), or tiny (to try the command).
         quick: The same as --size quick.
-        only: Measure these alone, by the ids in the page's sections, such as splat ssim; splat-torch and
-            sensor-spikezoo, which compare with other programs, are measured only so.
-        scene: A scene folder for the fits and the images; without it, OUT/scenes has a new one of the world car.
+        only: Measure these alone, by the ids in the page's sections, such as splat ssim; splat-torch, which compares
+            with another program, is measured only so.
+        scene: A scene folder for the images; without it, OUT/scenes has a new one of the world car.
         seed: Seed of all random inputs.
-        device: cpu, cuda, or auto: cuda where there is one. Most twins are measured on the CPU in any case.
         again: Measure again what OUT has already.
     """
     size = "quick" if quick else size
@@ -86,5 +72,5 @@ def speed_error(
         make_dataset([SceneSettings(profile, seed).job("car")], out / "scenes")
         return out / "scenes" / f"car-0-{profile}"
 
-    request = Request(size, seed, choose_device(device), made)
+    request = Request(size, seed, made)
     return run_study(measurements, request, out, {"scene": str(scene or "")}, again)

@@ -18,16 +18,7 @@ from spike4dgs.method.splat.kernels.vector_ir import EXP2_POLYNOMIAL, Lanes, arr
 from spike4dgs.method.splat.reference import project
 from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, CUSTOMARY, T_MIN, PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
-from spike4dgs.studies.kit.measurement import (
-    TIMES,
-    Column,
-    Point,
-    Request,
-    Series,
-    compared,
-    max_rms,
-    measurement,
-)
+from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Series, compared, max_rms, measurement
 from spike4dgs.studies.speed_error.gaussians import random_scene, wide
 from spike4dgs.studies.speed_error.splat import GROUP, MAX, RMS
 
@@ -84,7 +75,7 @@ def _cuts(request: Request, limits: dict[str, tuple[float, float]], chosen: str)
         yield Series(f"{n} Gaussians, {name}", tuple(points))
 
 
-@measurement("splat-extent", GROUP, "Rasterizer: faint Gaussians", (PAIRS, MAX, RMS), ("rms", "max"), (1, 15, 120))
+@measurement("splat-extent", GROUP, "Rasterizer: faint Gaussians", (PAIRS, MAX, RMS), ("rms", "max"))
 def extent(request: Request) -> Iterator[Series]:
     """A Gaussian is left out of a pixel, and of a tile, where its alpha is below 1/255.
 
@@ -101,9 +92,7 @@ def extent(request: Request) -> Iterator[Series]:
     yield from _cuts(request, {"0": (1e-300, 0.0), **fractions}, "1/255")
 
 
-@measurement(
-    "splat-opaque", GROUP, "Rasterizer: what is behind opaque pixels", (PAIRS, MAX, RMS), ("rms", "max"), (1, 15, 120)
-)
+@measurement("splat-opaque", GROUP, "Rasterizer: what is behind opaque pixels", (PAIRS, MAX, RMS), ("rms", "max"))
 def transmittance(request: Request) -> Iterator[Series]:
     """A pixel is finished before the Gaussian that would bring its transmittance down to 1e-4.
 
@@ -119,7 +108,7 @@ def transmittance(request: Request) -> Iterator[Series]:
     yield from _cuts(request, {"0": (ALPHA_MIN, 0.0), **powers}, "1e-4")
 
 
-@measurement("splat-filter", GROUP, "Pixel filter", (*TIMES, MAX, RMS), ("rms", "max"), (2, 20, 240))
+@measurement("splat-filter", GROUP, "Pixel filter", (*TIMES, MAX, RMS), ("rms", "max"))
 def pixel_filter(request: Request) -> Iterator[Series]:
     """A Gaussian of 0.3 px^2 or of 1/12 px^2 is added to each projection, in place of the pixel's square.
 
@@ -203,7 +192,6 @@ def fitted_polynomial(degree: int) -> tuple[float, ...]:
         Column("relative", "largest relative error"),
     ),
     ("relative",),
-    (6, 8, 10),
 )
 def exponential(request: Request) -> Iterator[Series]:
     """2^x is a polynomial of degree 5 from -0.5 to 0.5; the rest goes into the exponent's bits.

@@ -11,34 +11,29 @@ import numpy as np
 import torch
 
 from spike4dgs.benchmark.environment import available_cores
-from spike4dgs.benchmark.metrics.held_out_spikes import record_around, response_of, view_spikes
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network, predict
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, empty_trunk, make_network
-from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.kernels.threads import get_threads, set_threads
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.torch_state import one_torch_thread
-from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, measurement, timed
+from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, Size, measurement, timed
 from spike4dgs.studies.speed_error.gaussians import random_scene
 from spike4dgs.studies.speed_error.networks import differentiate
 from spike4dgs.studies.speed_error.scores import make_image_pair
 from spike4dgs.studies.speed_error.sensor import SPACING, pattern
 
 SIZES = ((200, 125), (283, 177), (400, 250), (566, 354), (800, 500), (1000, 1000))  # width, height
-SPIKE_TICKS = 120  # of the stream that the metrics of spikes see
 Call = Callable[[], Any]
 
 
-def _grows(id: str, title: str, column: Column, seconds: tuple[float | None, float, float]) -> Any:
-    return measurement(id, "How costs grow", title, (column, *TIMES), ("ms",), seconds)
+def _grows(id: str, title: str, column: Column, least: Size = "tiny") -> Any:
+    return measurement(id, "How costs grow", title, (column, *TIMES), ("ms",), least=least)
 
 
 def _image(splats: Splats, views: Views) -> Any:
@@ -60,7 +55,7 @@ def _timed(calls: dict[float, Call], name: str, column: str, request: Request) -
         return timed(calls, name, column, request.pick(1, 5, 9))
 
 
-@_grows("scale-pixels", "Pixels", Column("pixels", "pixels"), (2, 25, 60))
+@_grows("scale-pixels", "Pixels", Column("pixels", "pixels"))
 def pixels(request: Request) -> Iterator[Series]:
     """125x200 to 1000x1000; the Gaussians grow with the image."""
     n, sizes = request.pick((100, ((24, 16), (48, 32))), (20_000, SIZES), (20_000, SIZES))
@@ -73,7 +68,7 @@ def pixels(request: Request) -> Iterator[Series]:
     yield _timed(calls, "SSIM and its gradient", "pixels", request)
 
 
-@_grows("scale-gaussians", "Gaussians", Column("count", "Gaussians"), (1, 40, 90))
+@_grows("scale-gaussians", "Gaussians", Column("count", "Gaussians"))
 def gaussians(request: Request) -> Iterator[Series]:
     """More Gaussians are smaller, so that they cover the same image."""
     counts = request.pick(
@@ -90,7 +85,7 @@ def gaussians(request: Request) -> Iterator[Series]:
         yield _timed({n: partial(call, *s) for n, s in scenes.items()}, title, "count", request)
 
 
-@_grows("scale-views", "Views", Column("views", "views", log=False), (1, 20, 60))
+@_grows("scale-views", "Views", Column("views", "views", log=False))
 def views(request: Request) -> Iterator[Series]:
     """All views are rendered in one call, whose threads share them out."""
     counts = request.pick((1, 2), (3, 8, 15, 25), (3, 5, 8, 15, 25))
@@ -106,7 +101,7 @@ def thread_counts() -> list[int]:
     return [n for n in (1, 2, 4, 8, 16) if n <= available_cores()]
 
 
-@_grows("scale-threads", "Threads", Column("threads", "threads"), (1, 15, 60))
+@_grows("scale-threads", "Threads", Column("threads", "threads"))
 def threads(request: Request) -> Iterator[Series]:
     """1 to 16, as many as the machine has cores."""
     n, size = request.pick(50, 50_000, 50_000), request.pick((24, 16), (400, 250), (800, 500))
@@ -123,10 +118,10 @@ def threads(request: Request) -> Iterator[Series]:
         set_threads(before)
 
 
-def _sensor(width: int, height: int, ticks: int, moving: float, threads: int | None = None) -> Call:
+def _sensor(width: int, height: int, ticks: int, threads: int) -> Call:
     """Return a call that simulates one camera with maps and shot noise; all keys are made in advance."""
     at = list(range(0, ticks + SPACING, SPACING))
-    few = pattern(height, width, min(len(at), 16), moving)
+    few = pattern(height, width, min(len(at), 16), 1.0)
     keys = [few[k % len(few)] for k in range(len(at))]  # a long clip repeats them: its memory does not grow
     maps = gain_map(height, width, 0, "cam_00"), dark_map(height, width, 0, "cam_00")
     sensor = Sensor(gain=maps[0], dark=maps[1], photons=SENSOR.photons_per_spike)
@@ -134,40 +129,18 @@ def _sensor(width: int, height: int, ticks: int, moving: float, threads: int | N
     return lambda: sum(len(part) for part in simulate(keys, at, ticks, sensor, charge, threads=threads))
 
 
-@_grows("scale-sensor-pixels", "Sensor: pixels", Column("pixels", "pixels"), (1, 15, 60))
-def sensor_pixels(request: Request) -> Iterator[Series]:
-    """One camera, with maps and shot noise; a key every 10 ticks."""
-    large = ((200, 125), (400, 250), (800, 500), (1000, 1000))
-    sizes, ticks = request.pick((((24, 16), (48, 32)), 40), (large, 200), (large, 1000))
-    for moving in (1.0, 0.1):
-        calls = {float(w * h): _sensor(w, h, ticks, moving) for w, h in sizes}
-        name = f"{ticks} ticks, {moving:.0%} of the pixels move"
-        yield timed(calls, name, "pixels", request.pick(1, 3, 5))
-
-
-@_grows("scale-sensor-clip", "Sensor: length of the clip", Column("clip", "clip, ms"), (1, 10, 90))
-def sensor_clip(request: Request) -> Iterator[Series]:
-    """10 to 1000 ms; memory does not grow with the clip."""
-    lengths = request.pick((1, 2), (10, 30, 100), (10, 30, 100, 300, 1000))
-    width, height = request.pick((24, 16), (200, 125), (400, 250))
-    for moving in (1.0, 0.1):
-        calls = {float(ms): _sensor(width, height, ms * RATE_HZ // 1000, moving) for ms in lengths}
-        name = f"{width}x{height}, {moving:.0%} of the pixels move"
-        yield timed(calls, name, "clip", request.pick(1, 3, 5))
-
-
-@_grows("scale-sensor-threads", "Sensor: threads", Column("threads", "threads"), (1, 5, 30))
+@_grows("scale-sensor-threads", "Sensor: threads", Column("threads", "threads"))
 def sensor_threads(request: Request) -> Iterator[Series]:
     """1 to 16, as many as the machine has cores."""
     width, height, ticks = request.pick((24, 16, 40), (400, 250, 400), (400, 250, 2000))
-    calls = {float(n): _sensor(width, height, ticks, 1.0, n) for n in thread_counts()}
+    calls = {float(n): _sensor(width, height, ticks, int(n)) for n in thread_counts()}
     yield timed(calls, f"{ticks} ticks of {width}x{height}", "threads", request.pick(1, 3, 5))
 
 
-@_grows("scale-metrics", "Metrics", Column("pixels", "pixels"), (None, 30, 60))
+@_grows("scale-metrics", "Metrics", Column("pixels", "pixels"), least="quick")
 def metrics(request: Request) -> Iterator[Series]:
-    """Every metric for one image of the profiles small and paper. Those of spikes read the spikes and take the means
-    over time, which in a scene all of them share. Networks have random weights: that changes the value, not the work.
+    """Every metric of images, for one image of the profiles small and paper. Networks have random weights: that changes
+    the value, not the work.
     """
     sizes = request.pick(((96, 192),), ((125, 200), (250, 400)), ((125, 200), (250, 400)))
     calls = {float(h * w): _metrics(make_image_pair(h, w)) for h, w in sizes}
@@ -176,35 +149,10 @@ def metrics(request: Request) -> Iterator[Series]:
 
 
 def _metrics(pair: ImagePair) -> dict[str, Call]:
-    """Return a call for each metric that is not another one with a gain; a copy of the pair has nothing cached."""
-    stream = _stream(pair)
-    calls: dict[str, Call] = {
-        m.id: partial(_of_spikes, m, pair, stream) if m.takes == "spikes" else partial(_anew, m, pair)
-        for m in METRICS.values()
-        if not m.aligned and m.weights is None
-    }
+    """Return a call for each metric of images; a copy of the pair has nothing cached."""
+    own = [m for m in METRICS.values() if not m.aligned and m.weights is None and m.takes != "spikes"]
+    calls: dict[str, Call] = {m.id: partial(lambda m: m.measure(replace(pair)), m) for m in own}
     for net in TRUNKS:
         network = make_network(net, empty_trunk(net).eval())
         calls[f"lpips_{net}"] = partial(network.distance, pair.truth8, pair.prediction8)
     return {**calls, "metaiqa": partial(predict, metaiqa_network().eval(), pair.prediction8)}
-
-
-def _anew(metric: Metric, pair: ImagePair) -> float | None:
-    return metric.measure(replace(pair))
-
-
-def _stream(pair: ImagePair) -> SpikeStream:
-    """Return the stream of a camera that sees the truth of a pair, which does not change."""
-    charge = np.random.default_rng(0).random(pair.truth.shape)
-    gathered = charge + SENSOR.radiance_gain * pair.truth * np.arange(SPIKE_TICKS + 1)[:, None, None]
-    height, width = pair.truth.shape
-    return SpikeStream(pack(np.diff(np.floor(gathered), axis=0)), width, height, 20_000.0)
-
-
-def _of_spikes(metric: Metric, pair: ImagePair, stream: SpikeStream) -> float | None:
-    """Return the metric's value from the stream on, with a prediction and a truth each millisecond."""
-    response = response_of(None, pair.truth.shape, SENSOR.radiance_gain)
-    recorded = record_around(stream, SPIKE_TICKS // 2, response)
-    ticks = [recorded.tick + 20 * k for k in (-3, -2, -1, 0, 1, 2, 3)]
-    images = [[image] * len(ticks) for image in (pair.predicted_radiance, pair.truth_radiance)]
-    return metric.measure(replace(pair, spikes=view_spikes(recorded, ticks, *images)))

@@ -41,7 +41,7 @@ _COLUMNS = (
 )
 
 
-@measurement("keys", GROUP, "Key frames: spacing and interpolation", _COLUMNS, ("tick", "counts"), (None, 40, 900))
+@measurement("keys", GROUP, "Key frames: spacing and interpolation", _COLUMNS, ("tick", "counts"), least="quick")
 def keys(request: Request) -> Iterator[Series]:
     """Radiance is rendered at keys; the simulator follows a clamped Catmull-Rom curve between them.
 
@@ -54,26 +54,16 @@ def keys(request: Request) -> Iterator[Series]:
     """
     width, height, spp, ticks = request.pick(None, (64, 40, 16, 64), (200, 125, 64, 256))
     for world in OF_SIZE[request.size]:
-        yield from spaced(world, (width, height), ticks, spp, request.seed)
-
-
-def spaced(
-    world: str, size: tuple[int, int], ticks: int, spp: int, seed: int, variant: int = 0, limits: bool = False
-) -> Iterator[Series]:
-    """Yield the series of a world for each curve, and with `limits` the yardstick of `compare`."""
-    built = WORLDS[world].build(seed, variant, ticks / RATE_HZ)
-    found = compare(*render_every_tick(built, size, ticks, spp, seed), SPACINGS, seed)
-    for series in found if limits else found[:-1]:
-        yield Series(f"{world}, {series.name}", series.points)
+        built = WORLDS[world].build(request.seed, 0, ticks / RATE_HZ)
+        frames, speed, seconds = render_every_tick(built, (width, height), ticks, spp, request.seed)
+        for series in compare(frames, speed, seconds, SPACINGS, request.seed):
+            yield Series(f"{world}, {series.name}", series.points)
 
 
 def compare(
     frames: Float32, speed_px_s: float, seconds_per_key: float, spacings: Sequence[int], seed: int = 0
 ) -> list[Series]:
-    """Return the series of both curves, a point for each spacing, from frames [n + 1, H, W] at every tick's start.
-
-    The last series is a yardstick: the change of counts with another random initial phase, and exact radiance.
-    """
+    """Return the series of both curves, a point for each spacing, from frames [n + 1, H, W] at every tick's start."""
     n = len(frames) - 1
     truth = np.stack(list(tick_means(frames, range(n + 1), n)))
     moving = _moving(frames)
@@ -87,12 +77,9 @@ def compare(
     for step, (name, curve) in itertools.product(spacings, zip(found, (tick_means, linear_means), strict=True)):
         means = np.stack(list(curve(frames[::step], range(0, n + 1, step), n)))
         values = {"render": per_tick / step, "px": speed_px_s * step / RATE_HZ, **_errors(means, truth, moving)}
-        values["counts"] = _share_off(_counts(means, charge), counts, moving)
+        values["counts"] = 100 * float((_counts(means, charge) != counts)[moving].mean())
         chosen = name == "Catmull-Rom" and step == limit
         found[name].append(Point(f"{step} ticks", values, "chosen" if chosen else ""))
-    other = _counts(truth, random_charge(frames.shape[1], frames.shape[2], [seed, 1]))
-    phase = {"tick": 0.0, "worst": 0.0, "integral": 0.0, "counts": _share_off(other, counts, moving)}
-    found["another initial phase"] = [Point("exact radiance", phase)]
     return [Series(name, tuple(points)) for name, points in found.items()]
 
 
@@ -129,10 +116,6 @@ def _counts(means: Float64, charge: NDArray[np.int32]) -> NDArray[np.int64]:
     """Return the spikes per window [n / 32, H, W]."""
     spikes = np.stack([fired for fired, _ in fire(iter(means), Sensor(), charge)])
     return np.asarray(_windows(spikes).sum(1))
-
-
-def _share_off(a: NDArray[np.int64], b: NDArray[np.int64], moving: NDArray[np.bool_]) -> float:
-    return 100 * float((a != b)[moving].mean())
 
 
 def render_every_tick(world: Any, size: tuple[int, int], n: int, spp: int, seed: int) -> tuple[Float32, float, float]:

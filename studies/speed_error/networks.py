@@ -67,7 +67,6 @@ def images(seed: int, height: int, width: int) -> dict[str, tuple[Tensor, Tensor
     "SSIM and its gradient",
     (*TIMES, Column("value", "error of the value"), Column("gradient", "relative L2 error of the gradient")),
     ("value", "gradient"),
-    (3, 10, 40),
 )
 def fused_ssim(request: Request) -> Iterator[Series]:
     """One fused pass in float32 with a separable 11x11 window.
@@ -104,7 +103,7 @@ def fused_ssim(request: Request) -> Iterator[Series]:
     "MSDI: numbers of its image generator",
     (*TIMES, Column("rms", "RMS error, spikes per tick"), Column("max", "largest error, spikes per tick")),
     ("rms",),
-    (None, 15, 60),  # loading the network takes longer than the others of tiny
+    least="quick",  # loading the network takes longer than the others of tiny
 )
 def msdi_images(request: Request) -> Iterator[Series]:
     """Weights are kept as half floats; features are bfloat16 where the processor multiplies them.
@@ -142,7 +141,6 @@ def msdi_images(request: Request) -> Iterator[Series]:
     "HexPlane: lookup and its gradient",
     (*TIMES, Column("max", "largest error of a feature"), Column("gradient", "relative L2 error of the slope")),
     ("max", "gradient"),
-    (4, 8, 30),
 )
 def lookup(request: Request) -> Iterator[Series]:
     """Numba kernels in float32; the time planes are lines, as a step has one time.

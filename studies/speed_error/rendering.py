@@ -60,7 +60,7 @@ def _job(request: Request, world: str) -> Job:
     "Rendering: adaptive keys and samples",
     (Column("minutes", "time of a clip's keys, min"), *(Column(*e) for e in ERRORS.items())),
     ("mean_percent", "mean_percent_moving"),
-    (None, 60, 1500),  # Mitsuba alone takes longer than the whole size tiny
+    least="quick",  # Mitsuba alone takes longer than the whole size tiny
 )
 def savings(request: Request) -> Iterator[Series]:
     """Only what changes is traced, as often as its motion asks, with the profile's samples per pixel.
@@ -186,7 +186,7 @@ def measure(
         Column("traced", "pixels traced, %"),
     ),
     ("all", "soft"),
-    (None, 20, 200),
+    least="quick",
 )
 def soft_light(request: Request) -> Iterator[Series]:
     """Outside of the traced pixels, light that moving objects add is a smooth ratio on the background.

@@ -1,4 +1,4 @@
-"""Scores beside slow ones and other packages, and the decoding of spikes beside numpy."""
+"""FLIP beside its authors' package, and the decoding of spikes beside numpy."""
 
 from __future__ import annotations
 
@@ -8,46 +8,17 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.flip import flip
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA, SSIM_WINDOW
-from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.spikes.stream import SpikeStream, bytes_per_tick
 from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, compared, measurement
 
 GROUP = "Metrics and streams"
 Calls = dict[str, Callable[[], float]]
 _COLUMNS = (*TIMES, Column("error", "error of the score"))
-_C1, _C2 = 0.01**2, 0.03**2  # of SSIM, for the data range 1
-
-
-def ssim_slowly(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return SSIM (Wang et al. 2004) window by window in extended precision, without the border; [H, W] in [0, 1]."""
-    at = np.arange(SSIM_WINDOW, dtype=np.longdouble) - SSIM_WINDOW // 2
-    line = np.exp(-0.5 * (at / SSIM_SIGMA) ** 2)
-    window = np.outer(line, line) / line.sum() ** 2
-    wide = [x.astype(np.longdouble) for x in (a, b)]
-    views = [np.lib.stride_tricks.sliding_window_view(x, window.shape) for x in wide]
-    means = [np.einsum("yxij,ij->yx", v, window) for v in views]
-    s1, s2, s12 = (
-        np.einsum("yxij,yxij,ij->yx", *pair, window) - m * n
-        for pair, m, n in (
-            ((views[0], views[0]), means[0], means[0]),
-            ((views[1], views[1]), means[1], means[1]),
-            ((views[0], views[1]), means[0], means[1]),
-        )
-    )
-    m1, m2 = means
-    return float(np.mean((2 * m1 * m2 + _C1) * (2 * s12 + _C2) / ((m1**2 + m2**2 + _C1) * (s1 + s2 + _C2))))
-
-
-def psnr_slowly(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return PSNR in dB for the range 1, in extended precision."""
-    return float(-10 * np.log10(np.mean((a.astype(np.longdouble) - b) ** 2)))
 
 
 def make_image_pair(height: int, width: int, seed: int = 0) -> ImagePair:
@@ -85,42 +56,7 @@ def _error(found: float, exact: float) -> dict[str, float]:
     return {"error": abs(found - exact)}
 
 
-@measurement("scores", GROUP, "Scores: PSNR and SSIM", _COLUMNS, ("error",), (3, 15, 60))
-def scores(request: Request) -> Iterator[Series]:
-    """Scores are computed in float64 from linear radiance, by scikit-image.
-
-    The formulas in extended precision, window by window.
-
-    Rounding is far below the last digit of tables, for almost equal and almost black images too. 8-bit images would cap
-    the PSNR of good models and change dark ones.
-
-    tests/studies/speed_error/test_scores.py
-    """
-    for name, pair in pairs(request).items():
-        for metric, slowly in (("psnr", psnr_slowly), ("ssim", ssim_slowly)):
-            calls: Calls = {
-                "extended precision": partial(slowly, pair.truth, pair.prediction),
-                "the score": partial(_score, metric, pair, np.asarray),
-                "of float32 images": partial(_score, metric, pair, np.float32),
-                "of 8-bit images": partial(_score, metric, _in_8_bits(pair), np.asarray),
-            }
-            yield compared(f"{metric.upper()} of {name}", calls, _error, request.pick(1, 3, 7), "the score")
-
-
-def _score(metric: str, pair: ImagePair, kept: Callable[[Any], Any]) -> float:
-    """Return a score of images as they are kept; a copy of the pair has nothing cached."""
-    truth, prediction = kept(pair.truth_radiance), kept(pair.predicted_radiance)
-    value = METRICS[metric].measure(replace(pair, truth_radiance=truth, predicted_radiance=prediction))
-    assert value is not None
-    return value
-
-
-def _in_8_bits(pair: ImagePair) -> ImagePair:
-    a, b = (np.rint(255 * x) / 255 for x in (pair.truth, pair.prediction))
-    return replace(pair, truth_radiance=a, predicted_radiance=b)
-
-
-@measurement("flip", GROUP, "Scores: FLIP", _COLUMNS, ("error",), (4, 15, 60))
+@measurement("flip", GROUP, "Scores: FLIP", _COLUMNS, ("error",))
 def flip_score(request: Request) -> Iterator[Series]:
     """Gray images have one channel: the other two are left out, and filters are separable.
 
@@ -166,7 +102,6 @@ def unpack_plainly(stream: SpikeStream) -> UInt8:
     "Spikes: decoding packed bits",
     (*TIMES, Column("error", "largest difference, spikes")),
     ("error",),
-    (1, 4, 10),
 )
 def decoding(request: Request) -> Iterator[Series]:
     """Windows and counts come from the packed bits, many pixels at a time.

@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32, Int32, UInt8
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import count_bits, pack
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Keys, Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import fire, tick_means
 from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, compared, measurement
-from spike4dgs.studies.kit.timing import module_of
 
 SPACING = 10  # ticks between keys
 COLUMNS = (
@@ -94,7 +92,7 @@ def _kernel(threads: int, keys: Keys, ticks: NDArray[np.int64], *clip: Any) -> U
     return np.concatenate(list(simulate(keys, ticks.tolist(), *clip, threads=threads)))
 
 
-@measurement("sensor", "Sensor and rendering", "Sensor: integration of light", COLUMNS, ("off",), (3, 30, 300))
+@measurement("sensor", "Sensor and rendering", "Sensor: integration of light", COLUMNS, ("off",))
 def integration(request: Request) -> Iterator[Series]:
     """Charge is a 32-bit integer; light between keys is a cubic in float32, static light is in float64.
 
@@ -120,40 +118,3 @@ def integration(request: Request) -> Iterator[Series]:
         }
         title = f"{name}, {ticks} ticks of {width}x{height}"
         yield compared(title, calls, _off, request.pick(1, 3, 7), "kernel, 2 threads", once=True)
-
-
-@measurement(
-    "sensor-spikezoo", "Sensor and rendering", "Sensor: beside spikezoo", COLUMNS, ("off",), (None, None, None)
-)
-def other_program(request: Request) -> Iterator[Series]:
-    """Charge is a 32-bit integer; light between keys is a cubic. spikezoo's `video2spike_simulation` takes one frame a
-    tick, made in advance; it models neither maps nor noise, so that the kernel leaves them out here.
-
-    The same model in float64, from the initial charges that spikezoo draws.
-
-    The kernel reads keys, not frames, and packs its spikes.
-
-    tests/studies/speed_error/test_sensor.py
-    """
-    if (module := module_of("spikezoo", "utils/spike_utils.py")) is None:
-        raise problem("sensor-spikezoo", "the package spikezoo to compare with", "none", "pip install spikezoo")
-    height, width, ticks = request.pick((25, 41, 90), (125, 200, 400), (250, 400, 1000))
-    key_ticks = np.arange(-(-ticks // SPACING) + 1, dtype=np.int64) * SPACING
-    keys, sensor = pattern(height, width, len(key_ticks), 1.0), Sensor()
-    frames = np.stack([m.astype(np.float32) for m in tick_means(keys, key_ticks.tolist(), ticks)])
-
-    def theirs() -> UInt8:
-        np.random.seed(0)  # noqa: NPY002
-        return pack(module.video2spike_simulation(frames, 1 / sensor.radiance_gain))
-
-    np.random.seed(0)  # noqa: NPY002
-    charge = (np.random.random((height, width)) * THRESHOLD).astype(np.int32)  # noqa: NPY002
-    clip = (keys, key_ticks, ticks, sensor, charge)
-    calls: dict[str, Callable[[], Any]] = {
-        "float64, tick by tick": partial(exact_counts, *clip),
-        "spikezoo": theirs,
-        "kernel, 1 thread": partial(_kernel, 1, *clip),
-        "kernel, 2 threads": partial(_kernel, 2, *clip),
-    }
-    title = f"{ticks} ticks of {width}x{height}"
-    yield compared(title, calls, _off, request.pick(1, 3, 5), "kernel, 2 threads", once=True)

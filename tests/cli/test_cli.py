@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,7 +13,6 @@ from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.cli import COMMANDS, Command, main
 from spike4dgs.cli import dispatch as cli
 from spike4dgs.cli.commands import GROUPS
-from spike4dgs.cli.score import score
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
@@ -24,17 +21,15 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
 
 
-def test_help_answers_in_under_a_second_and_imports_nothing_heavy() -> None:
+def test_help_takes_no_time_of_the_processor_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; from spike4dgs.cli import main; code = main(['--help']); "
         f"loaded = [m for m in {HEAVY!r} if m in sys.modules]; print(code, loaded, file=sys.stderr)"
     )
-    seconds = []
-    for _ in range(3):  # the machine may be busy: the best of three
-        start = time.perf_counter()
-        done = python("-c", code)
-        seconds.append(time.perf_counter() - start)
-    assert min(seconds) < 1
+    before = os.times()
+    done = python("-c", code)
+    after = os.times()  # processor time, which other programs hardly change
+    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.5
     assert done.stderr == "0 []\n"
     for name in COMMANDS:
         assert f"  {name} " in done.stdout
@@ -83,25 +78,13 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out.strip() == version("spike4dgs")
 
 
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=lambda c: c.target)
-def test_every_command_exists(command: Command) -> None:
-    module, _, function = command.target.partition(":")
-    assert module.startswith("spike4dgs.cli.") and callable(getattr(importlib.import_module(module), function))
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"usage: spike4dgs {name}" in text
     assert f"Example:\n  spike4dgs {name}" in text.replace("│", "")
-    assert f"{COMMANDS[name].example} ".startswith(f"{name} ")
-
-
-@pytest.mark.parametrize("name", ["run-benchmark", "make-dataset"])
-def test_what_computes_takes_a_seed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    main([name, "--help"])
-    assert "--seed" in capsys.readouterr().out
+    assert f"{COMMANDS[name].example} ".startswith(f"{name} ") and COMMANDS[name].target.startswith("spike4dgs.cli.")
 
 
 @pytest.mark.parametrize(
@@ -162,10 +145,6 @@ def test_a_reader_that_goes_away_is_no_traceback(command: str) -> None:
             [sys.executable, "-m", "spike4dgs.cli", command], stdout=closed, stderr=subprocess.PIPE, text=True
         )
     assert done.returncode in (1, 141) and not done.stderr  # 1 where rich notices first
-
-
-def test_load_finds_the_functions() -> None:
-    assert cli.load("score") is score
 
 
 def test_score_prints_a_line_for_each_scene_and_writes_a_record(

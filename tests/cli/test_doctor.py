@@ -18,15 +18,7 @@ from spike4dgs.benchmark.environment import Missing
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.cli import doctor
-from spike4dgs.cli.doctor import (
-    BROKEN,
-    MISSING,
-    NOTE,
-    OK,
-    Finding,
-    examine,
-    report,
-)
+from spike4dgs.cli.doctor import BROKEN, MISSING, NOTE, OK, Finding, examine, report
 
 LLVM = SimpleNamespace(name="llvm_ad_rgb", why_not_fast="", llvm=("/usr/lib/libLLVM.so.19.1", "/usr/lib/libLLVM-15.so"))
 

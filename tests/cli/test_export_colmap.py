@@ -8,14 +8,12 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from small_scenes import HEIGHT, WIDTH
+from small_scenes import HEIGHT, WIDTH, add_gap
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
-from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.export_colmap import export_colmap
 
@@ -61,10 +59,7 @@ def test_the_way_there_and_back(small_scene: Path, tmp_path: Path, capsys: pytes
 
 
 def test_images_at_missing_ticks_are_left_out(small_scene: Path, tmp_path: Path) -> None:
-    meta = read_json(small_scene / "scene.json", "a scene")
-    gap = {"camera": "cam_01", "first_tick": 35, "ticks": 10, "reason": "test"}
-    write_json(small_scene / "scene.json", {**meta, "gaps": [gap]})
-    write_manifest(small_scene)
+    add_gap(small_scene, "cam_01", 35, 10)
     with pytest.raises(UserError, match="a recording without gaps"):
         export_colmap(small_scene, tmp_path / "out")
     export_colmap(small_scene, tmp_path / "out", ticks=(20, 40), allow_gaps=True)

@@ -8,14 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, shared_file
+from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, add_gap, shared_file
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
-from spike4dgs.benchmark.files import read_json, write_json
+from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
-from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.stream import open_stream, pack
 from spike4dgs.cli import main
@@ -137,12 +136,7 @@ def test_a_stopped_run_goes_on(dat: Path, tmp_path: Path, monkeypatch: pytest.Mo
 def test_images_at_missing_ticks_are_left_out(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    meta = read_json(small_scene / "scene.json", "a scene")
-    write_json(
-        small_scene / "scene.json",
-        {**meta, "gaps": [{"camera": "cam_01", "first_tick": 35, "ticks": 10, "reason": "test"}]},
-    )
-    write_manifest(small_scene)
+    add_gap(small_scene, "cam_01", 35, 10)
     arguments = ["images", str(small_scene), "--camera", "cam_01", "--out", str(tmp_path / "out")]
     assert main(arguments) == 2
     assert "a recording without gaps" in capsys.readouterr().err

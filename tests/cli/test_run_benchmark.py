@@ -19,7 +19,6 @@ from run_command import run_benchmark
 from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
@@ -215,13 +214,6 @@ def test_bad_arguments_are_user_errors(
         run_benchmark(**{"scenes": (small_scene,), "out": tmp_path / "out", **arguments})
     assert message in str(e.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    import torch
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert choose_device("auto") == "cpu" == choose_device("cpu")
 
 
 @pytest.mark.usefixtures("installed")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import subprocess
 import sys
@@ -22,7 +21,7 @@ from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.studies import hard_cases as module
-from spike4dgs.studies.hard_cases import case_id, hard_cases
+from spike4dgs.studies.hard_cases import hard_cases
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
 SCHEMA = load_schema("spike4dgs.studies", "hard_cases.schema.json")
@@ -167,14 +166,6 @@ def test_without_tests_the_command_says_what_to_do(tmp_path: Path, monkeypatch: 
         hard_cases(out=tmp_path)
 
 
-def test_a_case_is_named_by_its_room_file_and_test() -> None:
-    assert (
-        case_id("tests/method/splat/test_hard_splat.py::test_image[tiny-and-huge]")
-        == "method/splat/image-tiny-and-huge"
-    )
-    assert case_id("tests/method/test_trainer.py::test_a[pixel+spike-1.0]") == "method/trainer/a-pixel+spike-1-0"
-
-
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     with browser(tmp_path_factory.mktemp("profile")) as shown:
@@ -254,11 +245,11 @@ def test_differing_bytes_are_counted_and_named_and_cores_are_given_back(judge: H
         judge.same_bytes([b"abcd", b"abcd", b"axyd"], ["one", "two", "three"])
     with pytest.raises(AssertionError, match="two differ: 4 px"):
         judge.same_bytes([b"abcd", b"abc"], ["one", "two"])
-    before = os.sched_getaffinity(0)
+    before = available_cores()
     with on_cores(1):
         assert available_cores() == 1
-    assert os.sched_getaffinity(0) == before and core_counts()[0] == 1 and core_counts()[-1] == len(before)
-    if len(before) > 1:
+    assert available_cores() == before and core_counts()[0] == 1 and core_counts()[-1] == before
+    if before > 1:
         with pytest.raises(AssertionError):
             judge.same_on_all_cores(lambda: bytes([available_cores()] * 3))
 

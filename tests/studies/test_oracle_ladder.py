@@ -123,7 +123,7 @@ def test_cells_are_means_over_the_seeds(tmp_path: Path) -> None:
     records = [record("m", 0, 30, 10), record("m", 1, 32, 20), record("o", 0, 35, 5), record("o", 1, 36, 6)]
     rungs = (Rung("as it is", CountMethod("m")), Rung("more", CountMethod("o")))
     table = make_table(Ladder("m", rungs, range), ["a"], records)
-    assert table.rungs["as it is"]["a"].values == {"psnr": 31, "psnr_dynamic": 27, "fit_seconds": 15}
+    assert table.rungs["as it is"]["a"] == {"psnr": 31, "psnr_dynamic": 27, "fit_seconds": 15}
     assert table.gain("more", "a", "psnr") == pytest.approx(4.5) and table.places == ("a",)
     assert "| more | 35.50 (+4.50) |" in to_markdown(table) and "| as it is | 31.00 |" in to_markdown(table)
     write_ladder(tmp_path, [table])

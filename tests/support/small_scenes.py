@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
@@ -97,3 +99,11 @@ def write_small_scene(
         ),
     )
     return root
+
+
+def add_gap(scene: Path, camera: str, first_tick: int, ticks: int) -> None:
+    """State in a scene's files that ticks of a camera are missing."""
+    meta = json.loads((scene / "scene.json").read_text())
+    gap = {"camera": camera, "first_tick": first_tick, "ticks": ticks, "reason": "test"}
+    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": [gap]}))
+    write_manifest(scene)

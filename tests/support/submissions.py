@@ -23,11 +23,7 @@ Record = dict[str, Any]
 def enter(done: Path, name: str = "tfp+4dgs", verified: bool = True, **options: Any) -> Path:
     """Submit a method's record and return the path of its entry."""
     if verified:
-        options = {
-            "predictions": done / "out/predictions" / name,
-            "scenes": (done / "s0", done / "s1"),
-            **options,
-        }
+        options = {"predictions": done / "out/predictions" / name, "scenes": (done / "s0", done / "s1"), **options}
     assert submit(done / f"out/results/{name}.json", leaderboard=done / "board", **options) == 0
     return entry_of(done, name)
 

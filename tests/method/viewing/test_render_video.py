@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 
@@ -17,11 +16,8 @@ from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.cli import main
-from spike4dgs.method.splat import Views
-from spike4dgs.method.splat import render as rasterise
 from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
 from spike4dgs.method.viewing.render_video import frame_times
-from spike4dgs.studies.saved_models import exact_patch
 
 S = np.linspace(0, 1, 33)
 UP = np.array([0.0, 0.0, 1.0])
@@ -173,17 +169,6 @@ def test_bad_options_are_one_line(
     assert message in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["spacetime", "tracking"])
-def test_an_exact_patch_is_part_of_the_exact_image(name: str) -> None:
-    made, camera, t_us = model(name), WORLD.held_out, 0.3 * DURATION_US
-    views = Views.from_cameras([camera])
-    with torch.no_grad():
-        image = rasterise(made.splats(t_us), views, backend="reference").image
-        whole = made.image(image, views)[0].clamp(min=0).numpy()
-    found = exact_patch(made, camera, t_us, (7, 5), (20, 13))
-    np.testing.assert_allclose(found, whole[5:18, 7:27], atol=1e-6)
-
-
 def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = ("static", "tracking", "radiance-field")
     for name in names:
@@ -195,7 +180,6 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
     assert all(r["pixels"] == "40x24" and float(r["frames/s"]) > 0 for r in rows)
     assert [r["Gaussians"] for r in rows] == ["120", "120", ""], "a radiance field has none"
     for row in rows[:2]:
-        assert 0 < float(row["mean error"]) < 1e-5 and float(row["largest error"]) < 5e-3  # 1/255 at a cut-off
         assert float(row["min ms"]) <= float(row["median ms"])
         assert float(row["frames/s"]) == pytest.approx(1e3 / float(row["median ms"]), rel=0.05)
 

@@ -11,15 +11,22 @@ import pytest
 from spike4dgs.studies.kit.measurement import MS, Column, Measurement, Point, Request, Series
 from spike4dgs.studies.kit.runner import in_order, measure, measure_all
 
+GROUP = "Images from spikes"
 ERROR = Column("error", "error, radiance")
 
 
 def request(tmp_path: Path) -> Request:
-    return Request("tiny", 3, "cpu", lambda: tmp_path)
+    return Request("tiny", 3, lambda: tmp_path)
 
 
 def measured(id: str, run: Any, **changes: Any) -> Measurement:
-    texts = {"group": "Fits", "title": f"title of {id}", "approximation": "less", "exact": "all", "reason": "because"}
+    texts = {
+        "group": GROUP,
+        "title": f"title of {id}",
+        "approximation": "less",
+        "exact": "all",
+        "reason": "because",
+    }
     return Measurement(id, **texts | {"columns": (MS, ERROR), "x": "ms", "y": ("error",), "run": run} | changes)
 
 
@@ -54,7 +61,7 @@ def test_what_fails_is_told_beside_what_was_measured_and_ends_nothing(
     results = measure_all(ms, request(tmp_path), tmp_path / "m", {}, lines.append)
     assert [r["problem"] for r in results] == ["RuntimeError: out of luck", "nothing was measured", ""]
     assert results[0]["series"] == results[2]["series"]
-    assert "    failed: RuntimeError: out of luck" in lines and lines[-1].startswith("[3/3] title of good; about ")
+    assert "    failed: RuntimeError: out of luck" in lines and lines[-1] == "[3/3] title of good"
     assert [p.name for p in (tmp_path / "m").iterdir()] == ["good.json"], "a failed one is measured again"
     assert "Traceback" in capsys.readouterr().err
 

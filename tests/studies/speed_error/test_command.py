@@ -22,7 +22,7 @@ def measurements(fail: bool = False) -> tuple[Measurement, ...]:
             raise OSError("no luck")
         yield Series(request.scene().name, (Point(request.size, {"ms": 1.0}, "chosen"),))
 
-    return (Measurement("one", "Fits", "one", "a", "b", "c", (MS,), "ms", ("ms",), run),)
+    return (Measurement("one", "Images from spikes", "one", "a", "b", "c", (MS,), "ms", ("ms",), run),)
 
 
 def test_the_whole_command_in_its_smallest_size(
@@ -35,7 +35,7 @@ def test_the_whole_command_in_its_smallest_size(
     report = json.loads((out / "speed_error.json").read_text())
     check_schema(report, load_schema("spike4dgs.studies.kit", "speed_error.schema.json"), "the report", "")
     ids = {m["id"] for m in report["measurements"]}
-    assert {"splat", "images", "sensor", "scores", "budget", "scale-pixels"} <= ids and not ids & {"keys", "msdi"}
+    assert {"splat", "images", "sensor", "flip", "scale-pixels"} <= ids and not ids & {"keys", "msdi"}
     groups = [m["group"] for m in report["measurements"]]
     assert groups == sorted(groups, key=GROUPS.index)
     for m in report["measurements"]:

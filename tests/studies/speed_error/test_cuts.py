@@ -17,7 +17,7 @@ from spike4dgs.studies.speed_error.cuts import (
     transmittance,
 )
 
-REQUEST = Request("tiny", 1, "cpu", lambda: pytest.fail("no scene is needed"))
+REQUEST = Request("tiny", 1, lambda: pytest.fail("no scene is needed"))
 
 
 @pytest.mark.parametrize(("polynomial", "limit"), [(EXP2_POLYNOMIAL, 3e-7), (fitted_polynomial(2), 3e-3)])

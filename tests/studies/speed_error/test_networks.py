@@ -5,7 +5,7 @@ import pytest
 from spike4dgs.studies.kit.measurement import Request
 from spike4dgs.studies.speed_error.networks import fused_ssim, lookup, msdi_images
 
-REQUEST = Request("tiny", 1, "cpu", lambda: pytest.fail("no scene is needed"))
+REQUEST = Request("tiny", 1, lambda: pytest.fail("no scene is needed"))
 
 
 def test_the_lookups_kernels_agree_with_float64() -> None:

@@ -1,0 +1,14 @@
+"""The commands that measure the project: each is a study's own function."""
+
+from __future__ import annotations
+
+from spike4dgs.studies.faults import fault_table as fault_table
+from spike4dgs.studies.hard_cases import hard_cases as hard_cases
+from spike4dgs.studies.images import images as images
+from spike4dgs.studies.oracle_ladder import oracle_ladder as oracle_ladder
+from spike4dgs.studies.patterns import patterns as patterns
+from spike4dgs.studies.poses import poses as poses
+from spike4dgs.studies.recorder import record as record
+from spike4dgs.studies.saved_models import render as render
+from spike4dgs.studies.speed_error.command import speed_error as speed_error
+from spike4dgs.studies.spike_agreement import spike_agreement as spike_agreement
