@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import usb.backend.libusb1
 from recorder_rig import FRAME, TICKS, check_identical, check_recording, record, source_scene
 from usb_mock import UsbMock
 
@@ -42,8 +43,9 @@ def bus() -> Iterator[Any]:
         def plug_in(scene: Scene, profile: RigProfile, *faults: Fault) -> tuple[UsbMock, list[UsbPort]]:
             mock = UsbMock(EmulatedArray(profile, scene_streams(scene), paced=False, faults=faults))
             mocks.enter_context(mock)
+            usb.backend.libusb1._lib_object = None  # PyUSB's context of a process outlives a mocked bus
             ports = usb_ports()
-            mocks.callback(lambda: ports[0]._bus.close())  # before the devices go
+            mocks.callback(lambda: ports[0]._context.close())  # before the devices go
             return mock, ports
 
         yield plug_in

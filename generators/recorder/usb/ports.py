@@ -1,4 +1,7 @@
-"""Devices on the bus: what the recorder asks of one, and libusb's devices, through the package `libusb1`."""
+"""Devices on the bus: what the recorder asks of one, and those that libusb finds.
+
+PyUSB lists the devices. The package `libusb1` opens one and reads it, as PyUSB has no asynchronous transfers.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Collection
 from contextlib import suppress
 from typing import Protocol
 
+import usb.core
 import usb1
 
 from spike4dgs.benchmark.errors import problem
@@ -37,18 +41,25 @@ class Port(Protocol):
 
 
 class UsbPort:
-    """A device that libusb has found."""
+    """A device that PyUSB has found; `context` opens it."""
 
-    def __init__(self, bus: usb1.USBContext, device: usb1.USBDevice) -> None:
-        self._bus, self._device = bus, device
+    def __init__(self, context: usb1.USBContext, found: usb.core.Device) -> None:
+        self._context = context
         self._handle: usb1.USBDeviceHandle | None = None
-        self.vendor_id, self.product_id = device.getVendorID(), device.getProductID()
-        self.speed = device.getDeviceSpeed()
-        self.where = f"bus {device.getBusNumber()} address {device.getDeviceAddress()}"
+        self._address = (found.bus, found.address)
+        self.vendor_id, self.product_id, self.speed = found.idVendor, found.idProduct, found.speed
+        self.where = f"bus {found.bus} address {found.address}"
+
+    def _device(self) -> usb1.USBDevice:
+        """Return the device as libusb1 has it. Raises USBErrorNoDevice where it is gone."""
+        for device in self._context.getDeviceIterator(skip_on_error=True):
+            if (device.getBusNumber(), device.getDeviceAddress()) == self._address:
+                return device
+        raise usb1.USBErrorNoDevice
 
     def serial(self) -> str:
         """Return the serial number, "" where the device has none."""
-        handle = self._device.open()
+        handle = self._device().open()
         try:
             return handle.getSerialNumber() or ""
         finally:
@@ -56,9 +67,10 @@ class UsbPort:
 
     def open(self, interfaces: Collection[int]) -> None:
         """Open the device, give it a configuration if it has none, and claim interfaces from the kernel's drivers."""
-        self._handle = self._device.open()
+        device = self._device()
+        self._handle = device.open()
         if self._handle.getConfiguration() == 0:
-            self._handle.setConfiguration(next(iter(self._device)).getConfigurationValue())
+            self._handle.setConfiguration(next(iter(device)).getConfigurationValue())
         with suppress(usb1.USBErrorNotSupported):  # some systems have no kernel drivers
             self._handle.setAutoDetachKernelDriver(True)
         for interface in interfaces:
@@ -72,7 +84,7 @@ class UsbPort:
     def transfers(self, endpoint: int, transfer_bytes: int, depth: int) -> Transfers:
         """Return libusb's queue."""
         assert self._handle is not None
-        return QueuedReads(self._bus, self._handle, endpoint, depth)
+        return QueuedReads(self._context, self._handle, endpoint, depth)
 
     def close(self) -> None:
         """Close the device, which releases its interfaces."""
@@ -83,8 +95,9 @@ class UsbPort:
 def usb_ports() -> list[UsbPort]:
     """Return the devices on this computer's buses. Raises UserError without libusb."""
     try:
-        bus = usb1.USBContext().open()
-    except OSError:
+        found = list(usb.core.find(find_all=True))
+        context = usb1.USBContext().open()
+    except (OSError, usb.core.NoBackendError):
         fix = "install it (Debian, Ubuntu: sudo apt install libusb-1.0-0)"
-        raise problem("libusb1", "the library libusb-1.0", "no such library", fix) from None
-    return [UsbPort(bus, device) for device in bus.getDeviceIterator(skip_on_error=True)]
+        raise problem("libusb", "the library libusb-1.0", "no such library", fix) from None
+    return [UsbPort(context, device) for device in found]
