@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from spike4dgs.generators.worlds.meshes import Mesh
+from spike4dgs.generators.worlds.meshes import Mesh, vertex_normals
 
 Colour = tuple[float, float, float]
 
@@ -51,8 +50,6 @@ def _texture(albedo: Colour | np.ndarray) -> dict[str, Any]:
 def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
     """Return a `mitsuba.Mesh` that can be a value in a scene dictionary, also inside a shape group."""
     import mitsuba as mi
-
-    from spike4dgs.generators.worlds.meshes import vertex_normals
 
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material.to_mitsuba())

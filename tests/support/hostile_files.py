@@ -38,6 +38,7 @@ Read = Callable[[Path, Path], Any]  # folder of the files, folder for what is ma
 class Case:
     """A kind of input: valid files, what may be changed in them, and who reads them."""
 
+    share: int  # of every hundred inputs; the readers of most formats get most
     make: Callable[[Path], Any]
     read: Read
     files: dict[str, m.Mutation | None]  # glob -> a mutation that knows the format
@@ -399,6 +400,7 @@ def read_recording(folder: Path, out: Path) -> None:
 
 CASES: dict[str, Case] = {
     "scene": Case(
+        35,
         make_scene,
         read_scene,
         {
@@ -413,6 +415,7 @@ CASES: dict[str, Case] = {
         rehash,
     ),
     "predictions": Case(
+        10,
         make_predictions,
         read_predictions,
         {
@@ -422,13 +425,17 @@ CASES: dict[str, Case] = {
         },
         resum,
     ),
-    "record": Case(make_record, read_record_file, {"mine.json": m.in_json}),
-    "board": Case(make_board, read_board, {"board/local/*/*.json": m.in_json, "board/LEDGER": m.in_text}, relist),
-    "models": Case(make_models, read_models, {"*.safetensors": in_model}, rehash_model),
+    "record": Case(13, make_record, read_record_file, {"mine.json": m.in_json}),
+    "board": Case(6, make_board, read_board, {"board/local/*/*.json": m.in_json, "board/LEDGER": m.in_text}, relist),
+    "models": Case(8, make_models, read_models, {"*.safetensors": in_model}, rehash_model),
     "tensors": Case(
-        make_tensors, read_tensors, {"*.safetensors": m.in_safetensors, "fit.ckpt": m.in_safetensors, "state.pth": None}
+        8,
+        make_tensors,
+        read_tensors,
+        {"*.safetensors": m.in_safetensors, "fit.ckpt": m.in_safetensors, "state.pth": None},
     ),
     "imports": Case(
+        10,
         make_imports,
         read_imports,
         {
@@ -437,21 +444,9 @@ CASES: dict[str, Case] = {
         },
     ),
     "recording": Case(
-        make_recording, read_recording, {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
+        10, make_recording, read_recording, {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
     ),
 }
-# Of every hundred inputs; the readers of most formats get most.
-SHARES = {
-    "scene": 35,
-    "predictions": 10,
-    "record": 13,
-    "board": 6,
-    "models": 8,
-    "tensors": 8,
-    "imports": 10,
-    "recording": 10,
-}
-
 
 # ---------------------------------------------------------------- running
 
@@ -499,7 +494,7 @@ def run(root: Path, inputs: int, seed: int, only: str = "") -> dict[str, Outcome
     os.environ.update(HOME=str(home), XDG_CACHE_HOME=str(home / "cache"), TMPDIR=str(work))
     (root / "untouched").write_text("untouched")
     os.chdir(root / "cwd")
-    names = [name for name, share in SHARES.items() for _ in range(share) if only in ("", name)]
+    names = [name for name, case in CASES.items() for _ in range(case.share) if only in ("", name)]
     order = np.random.default_rng(seed).choice(names, inputs)
     for name in dict.fromkeys(order):
         (root / "valid" / name).mkdir(parents=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from small_scenes import array_cameras
+from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.scene.splits import standard_splits
@@ -20,6 +20,8 @@ from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.record import open_links
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.usb.ports import Port
+from spike4dgs.generators.sensor import calibration
+from spike4dgs.generators.sensor.model import Sensor
 
 WIDTH, HEIGHT, TICKS = 40, 24, 64
 FRAME = WIDTH * HEIGHT // 8
@@ -51,6 +53,14 @@ def source_scene(root: Path, cameras: int = 9, ticks: int = TICKS) -> Scene:
         ),
     )
     return open_scene(root)
+
+
+def calibrated_scene(root: Path, **sensor: float) -> Path:
+    """Write four cameras, 80 ticks, the standard splits, ground truth of two cameras, and calibration recordings."""
+    for i, camera in enumerate(array_cameras()):
+        calibration.write_calibration(root / "calibration", camera, Sensor(noise_seed=(i,), **sensor), [i])
+    facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
+    return write_small_scene(root, splits=True, extras={"calibration": facts})
 
 
 def record(out: Path, profile: RigProfile, ports: Sequence[Port], ticks: int) -> Clip:

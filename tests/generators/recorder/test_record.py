@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorder_rig import calibrated_scene
 from rig_text import RIG
-from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -21,18 +21,11 @@ from spike4dgs.generators.recorder import sources
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import Fault
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
-from spike4dgs.generators.sensor import calibration as calibration
-from spike4dgs.generators.sensor.model import Sensor
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Four cameras, 80 ticks, the standard splits, ground truth of two cameras, and calibration recordings."""
-    root = tmp_path_factory.mktemp("source") / "pattern"
-    for i, camera in enumerate(array_cameras()):
-        calibration.write_calibration(root / "calibration", camera, Sensor(noise_seed=(i,), photons=5e4), [i])
-    facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
-    return write_small_scene(root, splits=True, extras={"calibration": facts})
+    return calibrated_scene(tmp_path_factory.mktemp("source") / "pattern", photons=5e4)
 
 
 def record(*arguments):

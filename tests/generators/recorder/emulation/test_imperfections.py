@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scenes import array_cameras, write_small_scene
+from recorder_rig import calibrated_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
@@ -18,16 +18,11 @@ from spike4dgs.cli import main
 from spike4dgs.generators.recorder.emulation.array import scene_profile
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections, draw, with_wrong_calibrations
 from spike4dgs.generators.sensor import calibration as calibration
-from spike4dgs.generators.sensor.model import Sensor
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    root = tmp_path_factory.mktemp("source") / "pattern"
-    for i, camera in enumerate(array_cameras()):
-        calibration.write_calibration(root / "calibration", camera, Sensor(noise_seed=(i,)), [i])
-    facts = {"flat_radiance": 0.7, "flat_ticks": calibration.FLAT_TICKS, "dark_ticks": calibration.DARK_TICKS}
-    return write_small_scene(root, splits=True, extras={"calibration": facts})
+    return calibrated_scene(tmp_path_factory.mktemp("source") / "pattern")
 
 
 def record(*arguments):
