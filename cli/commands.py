@@ -36,7 +36,7 @@ GROUPS: dict[str, str] = {
     "Recorder": "record board-clip calibrate-rig",
     "Exchange": "import-dat import-spikecv export-spikecv export-nerfstudio export-colmap export-ply download release",
     "Train": "make-msdi-data train-msdi train-spk2img",
-    "Measure": "report speed poses patterns spike-agreement tradeoff spacing",
+    "Measure": "report speed poses patterns spike-agreement",
     "This machine": "doctor completion",
 }
 
