@@ -23,7 +23,7 @@ Any program's images become predictions that can be scored:
 >>> images = {t: model.render(scene.cameras[t.camera], scene.t_us(t.tick)) for t in scene.targets}
 >>> folder = spike4dgs.write_predictions("runs/mine", scene, images, "my-method")
 >>> spike4dgs.score_predictions(folder, [scene])
-<Record my-method, seed None: 1 scene, psnr ...>
+<Record my-method: 1 scene, psnr ...>
 
 What a run left is read back:
 

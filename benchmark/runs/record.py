@@ -60,11 +60,14 @@ class ShownRecord(Shown, Record):
         failed = sum(cell["status"] != "ok" for cell in scenes.values())
         values = [f"{m} {METRICS[m].format(self['mean'][m])}" for m in MAIN if self["mean"].get(m) is not None]
         number = f"{len(scenes)} scene{'s' * (len(scenes) > 1)}" + (f", {failed} without scores" if failed else "")
-        return f"{method['name']}, seed {method['seed']}: {', '.join([number, *values])}"
+        seed = "" if method["seed"] is None else f", seed {method['seed']}"
+        return f"{method['name']}{seed}: {', '.join([number, *values])}"
 
     def _repr_html_(self) -> str:
         metrics = [m for m in MAIN if any(cell["metrics"].get(m) is not None for cell in self["scenes"].values())]
-        rows = {**{scene: cell["metrics"] for scene, cell in self["scenes"].items()}, "mean": self["mean"]}
+        rows = {scene: cell["metrics"] for scene, cell in self["scenes"].items()}
+        if len(rows) > 1:
+            rows["mean"] = self["mean"]
         head = "".join(f"<th>{escape(METRICS[m].title)}</th>" for m in metrics)
         body = "".join(
             f"<tr><th>{escape(name)}</th>"
