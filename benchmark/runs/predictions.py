@@ -236,7 +236,15 @@ def write_predictions(
                 found = f"{image.shape}" if np.isfinite(image).all() else "NaN or infinity"
                 raise problem(f"image of {target.name}", expected, found, "correct the image")
             writer.add(target, np.asarray(image, np.float32), opened.t_us(target.tick))
-        costs = {"fit_seconds": fit_seconds, "render_fps": render_fps}
-        about = {"scene": opened.id, "scene_revision": opened.revision, "split": opened.split, "created": utc_now()}
-        writer.finish(PredictionInfo(MethodInfo(method), **about, **costs))
+        writer.finish(
+            PredictionInfo(
+                MethodInfo(method),
+                scene=opened.id,
+                scene_revision=opened.revision,
+                split=opened.split,
+                created=utc_now(),
+                fit_seconds=fit_seconds,
+                render_fps=render_fps,
+            )
+        )
     return root
