@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import torch
 
-P, R = TypeVar("P"), TypeVar("R")
+P = TypeVar("P")
+R = TypeVar("R")
 
 
 @cache

@@ -25,7 +25,8 @@ from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_fi
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
-from spike4dgs.generators.recorder.record import record
+from spike4dgs.generators.recorder.record import Emulation, record
+from spike4dgs.generators.recorder.sources import Light
 from spike4dgs.method.recordings.fit import PREDICTIONS, fit_recording
 from spike4dgs.studies.kit.timing import markdown, write_csv
 
@@ -144,9 +145,11 @@ def _capture(worse: Imperfections, scene: Path, out: Path, seed: int) -> None:
         return
     shutil.rmtree(out, ignore_errors=True)
     flat, dark = out / "flat", out / "dark"
-    record(emulate=scene, out=flat, mode="flat", worse=worse, seed=seed)
-    record(emulate=scene, out=dark, mode="dark", worse=worse, seed=seed)
-    record(emulate=scene, out=out / "clip", worse=worse, seed=seed, flat_radiance=FLAT_RADIANCE, flat=flat, dark=dark)
+    shown = Emulation(scene, seed=seed)
+    record(out=flat, mode="flat", emulation=shown, worse=worse)
+    record(out=dark, mode="dark", emulation=shown, worse=worse)
+    light = Light(flat_radiance=FLAT_RADIANCE, flat=flat, dark=dark)
+    record(out=out / "clip", emulation=shown, light=light, worse=worse)
 
 
 def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:

@@ -46,8 +46,8 @@ def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) ->
         if pose.w2c is None:
             fix = "use rig or colmap"
             raise problem(f"MSDI on {scene.id}", f"a pose for {camera.id}", f"none ({pose.reason})", fix)
-        focal = {} if pose.focal_px is None else dict.fromkeys(("fx", "fy"), pose.focal_px * found.factor)
-        cameras.append(replace(camera, R=pose.w2c[:3, :3], t=pose.w2c[:3, 3], **focal))
+        fx, fy = (camera.fx, camera.fy) if pose.focal_px is None else (pose.focal_px * found.factor,) * 2
+        cameras.append(replace(camera, R=pose.w2c[:3, :3], t=pose.w2c[:3, 3], fx=fx, fy=fy))
     return Posed(cameras, found.points[found.sure(DEFAULTS)])
 
 

@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -149,10 +149,11 @@ def simulate(
     n_intervals = int(np.searchsorted(ticks, n_ticks))
     window = np.zeros((per_batch + 3, len(state)), dtype=np.float32)
     tangents, bounds = _tangent_weights(ticks), _shares(blocks, threads)
-    loop: Any = integrate
+    loops: dict[bool, Callable[..., Any]] = {False: integrate, True: integrate_uneven}
+    loop = loops[sensor.is_uneven]
     more: tuple[Any, ...] = ()
     if sensor.is_uneven:
-        loop, state = integrate_uneven, state.astype(np.int64)
+        state = state.astype(np.int64)
         top, rest = np.int64(head * unit + unit if sensor.dead_ticks else THRESHOLD), np.zeros(len(state))
         more = _steps(sensor.read_noise, unit), top, float(sensor.dead_ticks), rest
     with ThreadPoolExecutor(threads) as pool:
