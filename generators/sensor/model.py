@@ -47,6 +47,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,8 @@ def simulate(
             words = np.empty((end - ticks[first], blocks), dtype=np.uint64)
             batch = window, ticks[first : last + 1], tangents[first:last]
             camera = sensor.radiance_gain, gain, dark, state, unit, noise, np.uint32(sensor.noise_key), means
-            jobs = [pool.submit(loop, *batch, *camera, *more, words, a, b) for a, b in itertools.pairwise(bounds)]
+            work = partial(loop, *batch, *camera, *more, words)
+            jobs = [pool.submit(work, a, b) for a, b in itertools.pairwise(bounds)]
             for job in jobs:
                 job.result()
             yield words.view(np.uint8)[:, : bytes_per_tick(width, height)]
