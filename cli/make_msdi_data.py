@@ -7,9 +7,8 @@ from pathlib import Path
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.cli.options import RENDERERS, Renderers, check_names
-from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, make_shards
+from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts, all_worlds, make_shards
 from spike4dgs.generators.rendering.mitsuba_variant import choose_device
-from spike4dgs.generators.worlds import WORLDS
 
 DEFAULTS = MakeBursts()
 
@@ -28,11 +27,12 @@ def make_msdi_data(
     bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
 
     Args:
-        worlds: Names of worlds; all, if none is named.
+        worlds: Names of worlds; if none is named, all of the benchmark and those for training only.
         out: Folder for the shards.
         variants: Training variants of each world.
     """
-    check_names("worlds", worlds, WORLDS)
+    known = all_worlds()
+    check_names("worlds", worlds, known)
     choose_device(renderers.device)
-    make_shards(out, worlds or WORLDS, variants, bursts, renderers.workers, renderers.scheduler)
+    make_shards(out, worlds or known, variants, bursts, renderers.workers, renderers.scheduler)
     return 0

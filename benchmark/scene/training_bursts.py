@@ -3,7 +3,8 @@
 `make-msdi-data` writes them and `train-msdi` reads them: one safetensors file for each variant of a world. In a file R
 rigs of V cameras view the scene, each at I instants. A burst is the radiance from REACH ticks before an instant to
 REACH after it; spikes are made of it anew at every use. Only pixels in which something moves, or its shadow, are stored
-for each instant:
+for each instant. Further rigs see the world at rest, as it is at one instant: nothing moves in them, and their light is
+the same at any time. Below, R includes them:
 
 | tensor | type and shape | what it is |
 |---|---|---|
@@ -44,6 +45,8 @@ Arrays = dict[str, NDArray[Any]]
 REACH = 21  # ticks to each side: a window of 41 around the instant, or the same played backwards, lies within
 
 _SCHEMA = "spike4dgs-bursts/1"
+# Of a rig at rest: no pixel is given, in three images of the burst.
+_NOTHING = (np.zeros(0, np.uint8), np.zeros((3, 0), np.float16), np.zeros(0, np.float16))
 _MOST_VALUES = 1 << 27  # radiances of a burst: 512 MB
 _MOST_VIEWS = 10_000  # of a rig, and rigs and instants of a file
 _FIX = "delete it and run `spike4dgs make-msdi-data` again"
@@ -64,6 +67,7 @@ class BurstFacts:
     spp: int  # samples per pixel
     radiance_gain: float  # spikes per tick of a pixel at radiance 1 (white)
     photons_per_spike: float  # of its shot noise
+    resting: int = 0  # further rigs, which see the world at rest at an instant
 
     @property
     def id(self) -> str:
@@ -99,17 +103,18 @@ class BurstFile:
 
     def __len__(self) -> int:
         """Return the number of bursts."""
-        return self.facts.rigs * self.facts.instants
+        return self.facts.rigs * self.facts.instants + self.facts.resting
 
     def read(self, number: int) -> Burst:
-        """Read the burst `number`, of all views. Raises UserError where the file is damaged."""
+        """Read the burst `number`, of all views, those at rest last. Raises UserError where the file is damaged."""
         f = self.facts
-        rig, instant = divmod(number, f.instants)
+        moves = number < f.rigs * f.instants
+        rig, instant = divmod(number, f.instants) if moves else (f.rigs + number - f.rigs * f.instants, 0)
         shape = (f.views, f.height, f.width)
         try:
             with safetensors.safe_open(self.path, framework="np") as file:
                 background, depth, w2c, K = (
-                    _part(file, name, rig, (f.rigs, *sides))
+                    _part(file, name, rig, (f.rigs + f.resting, *sides))
                     for name, sides in (
                         ("still", shape),
                         ("still_depth", shape),
@@ -117,11 +122,17 @@ class BurstFile:
                         ("K", (f.views, 3, 3)),
                     )
                 )
-                given, values, there = (file.get_tensor(f"{n}.{rig}.{instant}") for n in ("given", "values", "depth"))
+                if moves:
+                    parts = (file.get_tensor(f"{n}.{rig}.{instant}") for n in ("given", "values", "depth"))
+                    given, values, there = parts
+                else:
+                    given, values, there = _NOTHING
                 gain, dark = file.get_tensor("gain"), file.get_tensor("dark")
             if gain.shape != shape or dark.shape != shape or len(values) * math.prod(shape) > _MOST_VALUES:
                 raise ValueError(f"maps of shape {gain.shape} and {dark.shape}, radiance at {len(values)} ticks")
-            moving = np.unpackbits(given, count=math.prod(shape)).astype(bool).reshape(shape)
+            moving = np.zeros(shape, bool)
+            if moves:
+                moving = np.unpackbits(given, count=math.prod(shape)).astype(bool).reshape(shape)
             keys = np.repeat(background.astype(np.float32)[None], len(values), axis=0)
             keys[:, moving] = values
             depth = depth.astype(np.float32)
@@ -169,6 +180,7 @@ def _checked(facts: BurstFacts) -> BurstFacts:
     for count in (facts.views, facts.rigs, facts.instants):
         whole(count, 1, _MOST_VIEWS)
     whole(facts.spp, 1, 1 << 20)
+    whole(facts.resting, 0, _MOST_VIEWS)
     for value in (facts.variant, facts.seed):
         whole(value, 0, 2**63)
     for gain in (facts.radiance_gain, facts.photons_per_spike):
@@ -204,18 +216,23 @@ def write_bursts(path: Path, facts: BurstFacts, arrays: Mapping[str, NDArray[Any
         safetensors.numpy.save_file(plain, part, metadata={_SCHEMA: meta})
 
 
-def stack_bursts(rigs: Sequence[Sequence[Burst]], backgrounds: Sequence[tuple[Float32, Float32]]) -> Arrays:
+def stack_bursts(
+    rigs: Sequence[Sequence[Burst]], backgrounds: Sequence[tuple[Float32, Float32]], resting: Sequence[Burst] = ()
+) -> Arrays:
     """Return the arrays of a file from the bursts of each rig, and each rig's `still` and `still_depth` [V, H, W].
 
-    Where a burst is not `moving`, its keys and depth are not used. Gain and dark maps are the first burst's.
+    Where a burst is not `moving`, its keys and depth are not used. Gain and dark maps are the first burst's. The bursts
+    of `resting` are of further rigs, and nothing moves in them: their first images are used.
     """
     most = 100.0  # radiance far beyond what saturates a sensor, within half floats
     first = rigs[0][0]
+    still = [*backgrounds, *((burst.keys[0], burst.depth) for burst in resting)]
+    firsts = [*(bursts[0] for bursts in rigs), *resting]
     arrays: Arrays = {
-        "still": np.stack([np.minimum(radiance, most) for radiance, _ in backgrounds]).astype(np.float16),
-        "still_depth": np.stack([_half(depth) for _, depth in backgrounds]),
-        "w2c": np.stack([bursts[0].w2c for bursts in rigs]),
-        "K": np.stack([bursts[0].K for bursts in rigs]),
+        "still": np.stack([np.minimum(radiance, most) for radiance, _ in still]).astype(np.float16),
+        "still_depth": np.stack([_half(depth) for _, depth in still]),
+        "w2c": np.stack([burst.w2c for burst in firsts]),
+        "K": np.stack([burst.K for burst in firsts]),
         "gain": first.gain.astype(np.float16),
         "dark": first.dark.astype(np.float16),
     }

@@ -6,7 +6,7 @@ The format of the shards is in `benchmark.scene.bursts`. A shard is a function o
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,8 +29,9 @@ from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VA
 from spike4dgs.generators.profiles import RATE_HZ
 
 if TYPE_CHECKING:
+    from spike4dgs.benchmark.scene.cameras import Camera
     from spike4dgs.generators.msdi_data.rigs import BurstRenderer
-    from spike4dgs.generators.worlds import WorldScene
+    from spike4dgs.generators.worlds import World, WorldScene
 
 DURATION_S = 0.1  # of the clips that the instants are drawn from
 VIEWS = 9
@@ -45,6 +46,7 @@ class MakeBursts:
     Args:
         rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
         instants: Instants of each rig.
+        resting: Further rigs, of many kinds, that see the world at rest at an instant; hidden variants have half.
         width: Width of the images in pixels.
         height: Height of the images in pixels.
         spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.
@@ -53,6 +55,7 @@ class MakeBursts:
 
     rigs: int = 6
     instants: int = 3
+    resting: int = 12
     width: int = 104
     height: int = 64
     spp: int = 32
@@ -60,34 +63,43 @@ class MakeBursts:
 
     def facts(self, world: str, variant: int) -> BurstFacts:
         """Return the metadata of a shard. A hidden one needs fewer rigs: it is scored, not used for training."""
-        rigs = max(1, self.rigs // 2) if variant in HIDDEN_VARIANTS else self.rigs
+        hidden = variant in HIDDEN_VARIANTS
+        rigs, resting = (-(-count // 2) if hidden else count for count in (self.rigs, self.resting))
         size = self.width, self.height
         sampling = VIEWS, rigs, self.instants, self.spp
-        return BurstFacts(world, variant, self.seed, *size, *sampling, SENSOR.radiance_gain, SENSOR.photons_per_spike)
+        sensor = SENSOR.radiance_gain, SENSOR.photons_per_spike
+        return BurstFacts(world, variant, self.seed, *size, *sampling, *sensor, resting)
 
     def __call__(self, chunk: tuple[str, int]) -> tuple[BurstFacts, Arrays]:
         """Return the shard's facts and arrays."""
-        from spike4dgs.generators.worlds import WORLDS
+        from spike4dgs.generators.msdi_data.rigs import jittered_cameras
+        from spike4dgs.generators.msdi_data.wide_rigs import wide_cameras
 
         name, variant = chunk
         facts = self.facts(name, variant)
-        world = WORLDS[name].build(self.seed, variant, DURATION_S)
+        world = all_worlds()[name].build(self.seed, variant, DURATION_S)
         rng = np.random.default_rng([self.seed, variant, *f"{name} bursts".encode()])
         map_seed = int(rng.integers(1 << 31))
         rigs, backgrounds = [], []
         for _ in range(facts.rigs):
-            renderer = self._renderer(world, rng)
+            renderer = self._renderer(world, rng, jittered_cameras)
             rigs.append([renderer.burst(tick, map_seed) for tick in _instants(facts.instants, rng)])
             backgrounds.append((renderer.background, renderer.background_depth))
-        return facts, stack_bursts(rigs, backgrounds)
+        resting = [
+            self._renderer(world, rng, wide_cameras).at_rest(_instants(1, rng)[0], map_seed)
+            for _ in range(facts.resting)
+        ]
+        return facts, stack_bursts(rigs, backgrounds, resting)
 
-    def _renderer(self, world: WorldScene, rng: np.random.Generator) -> BurstRenderer:
+    def _renderer(
+        self, world: WorldScene, rng: np.random.Generator, draw: Callable[..., tuple[Camera, ...]]
+    ) -> BurstRenderer:
         """Return a renderer for a rig with a free view; each further attempt is closer to the world's own rig."""
-        from spike4dgs.generators.msdi_data.rigs import BurstRenderer, jittered_cameras
+        from spike4dgs.generators.msdi_data.rigs import BurstRenderer
 
         amount = 1.0
         while True:
-            cameras = jittered_cameras(world, self.width, self.height, rng, amount)
+            cameras = draw(world, self.width, self.height, rng, amount)
             renderer = BurstRenderer(world, cameras, seed=int(rng.integers(1 << 31)), spp=self.spp)
             away = float(np.linalg.norm(cameras[VIEWS // 2].center - np.array(world.rig.target)))
             near = np.quantile(renderer.background_depth, 0.02, axis=(1, 2), method="lower")
@@ -95,6 +107,14 @@ class MakeBursts:
             if amount < 0.1 or (near.min() > _NEAREST * away and seen.min() > _LEAST_SEEN):
                 return renderer
             amount *= 0.8
+
+
+def all_worlds() -> dict[str, World]:
+    """Return the worlds to train on: the benchmark's, and those that are for training only."""
+    from spike4dgs.generators.msdi_data.clutter import TRAINING_WORLDS
+    from spike4dgs.generators.worlds import WORLDS
+
+    return {**WORLDS, **TRAINING_WORLDS}
 
 
 def _instants(count: int, rng: np.random.Generator) -> list[int]:
@@ -111,7 +131,7 @@ def make_shards(
 
     Raises UserError where a shard was made with other settings, and for impossible numbers.
     """
-    if min(make.rigs, make.instants) < 1 or variants < 0 or min(make.width, make.height) < 16:
+    if min(make.rigs, make.instants) < 1 or min(variants, make.resting) < 0 or min(make.width, make.height) < 16:
         found = f"{variants} variants, {make.rigs} rigs, {make.instants} instants, {make.width}x{make.height}"
         raise problem("make-msdi-data", "counts from 1 up and at least 16x16 pixels", found, "correct them")
     if FIRST_TRAINING_VARIANT + variants > FIRST_SEASON_VARIANT:
@@ -120,7 +140,8 @@ def make_shards(
         raise problem("--variants", f"at most {most}", str(variants), fix)
     if make.spp < 1 or make.spp & (make.spp - 1):
         raise problem("--spp", "a power of two", str(make.spp), "give 16, 32, 64, ...")
-    numbers = [*HIDDEN_VARIANTS, *range(FIRST_TRAINING_VARIANT, FIRST_TRAINING_VARIANT + variants)]
+    learned = [*range(FIRST_TRAINING_VARIANT, FIRST_TRAINING_VARIANT + variants)]
+    numbers = [*learned[:1], *HIDDEN_VARIANTS, *learned[1:]]  # a training may begin before all are there
     names = list(dict.fromkeys(worlds))
     shards = [(world, variant) for variant in numbers for world in names]
     todo = [shard for shard in shards if not _is_done(out, make.facts(*shard))]
@@ -136,7 +157,7 @@ def _write_all(made: Iterator[tuple[BurstFacts, Arrays]], count: int, out: Path)
         write_bursts(path, facts, arrays)
         passed = time.perf_counter() - start
         left = passed / done * (count - done)
-        size = f"{facts.rigs * facts.instants} bursts, {path.stat().st_size / 1e6:.1f} MB"
+        size = f"{facts.rigs * facts.instants + facts.resting} bursts, {path.stat().st_size / 1e6:.1f} MB"
         print(f"{facts.id}: {size}, {done}/{count}, {passed:.0f} s, about {left:.0f} s left", flush=True)
 
 

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.arrays import Float32, Mask
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.training_bursts import REACH, Burst
@@ -129,6 +129,16 @@ class BurstRenderer(Visibility):
             moving = maximum_filter(moving, size=(1, 2 * missed + 1, 2 * missed + 1))
         keys = np.repeat(self.background[None], count, axis=0)
         self._trace_moving(keys, moving, now + np.linspace(-reach, reach, count))
+        return self._burst(keys, depth, moving, map_seed)
+
+    def at_rest(self, tick: int, map_seed: int) -> Burst:
+        """Return a burst of one image in which everything stays as it is at the start of `tick`."""
+        depth = self.depths(tick / RATE_HZ)  # sets the time
+        every = np.arange(int(np.prod(self.shape)))
+        image = self._radiance(every, self.spp, moving=True).reshape(1, *self.shape)
+        return self._burst(image, depth, np.zeros(self.shape, bool), map_seed)
+
+    def _burst(self, keys: Float32, depth: Float32, moving: Mask, map_seed: int) -> Burst:
         _, height, width = self.shape
         return Burst(
             keys=keys,

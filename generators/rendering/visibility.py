@@ -158,6 +158,8 @@ class Visibility:
             ways /= length[:, None]
             reach = length if source[3] else np.full(len(points), np.inf)
             free = self._tracer.cast_static(self._tracer.prepare(points, ways))[0] >= 0.999 * reach
+            if not free.any():  # no light falls on what is seen, and Mitsuba casts no empty list of rays
+                continue
             rays = self._tracer.prepare(points[free], ways[free])
             found.append(_Shadow(met[free], points[free], ways[free], reach[free], rays))
         return found

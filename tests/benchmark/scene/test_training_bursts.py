@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.training_bursts import open_bursts, open_folder, write_bursts
+from spike4dgs.benchmark.scene.training_bursts import open_bursts, open_folder, stack_bursts, write_bursts
 
 
 def test_bursts_survive_as_half_floats(tmp_path: Path) -> None:
@@ -24,6 +25,24 @@ def test_bursts_survive_as_half_floats(tmp_path: Path) -> None:
         for name in ("keys", "depth", "gain", "dark"):
             np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, err_msg=name)
             assert getattr(found, name).dtype == np.float32
+
+
+def test_rigs_at_rest_come_after_the_others(tmp_path: Path) -> None:
+    moving = open_bursts(write_toy_shard(tmp_path, 13))
+    bursts, background = [moving.read(0), moving.read(1)], (np.zeros((9, 24, 32)), np.ones((9, 24, 32)))
+    nothing = np.zeros_like(bursts[0].moving)
+    resting = replace(toy_burst(ToyWorld(width=32, height=24, seed=7), 0.4, count=3), moving=nothing)
+    path = tmp_path / "toy-20.safetensors"
+    write_bursts(path, replace(moving.facts, variant=20, resting=1), stack_bursts([bursts], [background], [resting]))
+    file = open_bursts(path)
+    assert len(file) == 3 and file.facts.resting == 1
+    np.testing.assert_array_equal(file.read(1).keys[:, bursts[1].moving], bursts[1].keys[:, bursts[1].moving])
+    found = file.read(2)
+    assert not found.moving.any()
+    for key in found.keys:
+        np.testing.assert_allclose(key, resting.keys[0], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(found.depth, resting.depth, rtol=1e-3)
+    np.testing.assert_array_equal(found.K, resting.K)
 
 
 def test_equal_bursts_give_equal_files(tmp_path: Path) -> None:

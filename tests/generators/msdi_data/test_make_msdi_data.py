@@ -49,7 +49,7 @@ def test_jittered_rigs_stay_near_the_worlds_own() -> None:
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Burst]:
     folder = tmp_path_factory.mktemp("bursts")
-    facts, arrays = MakeBursts(rigs=1, instants=1, width=32, height=20, spp=4, seed=0)(("turntable", 14))
+    facts, arrays = MakeBursts(rigs=1, instants=1, resting=2, width=32, height=20, spp=4, seed=0)(("turntable", 14))
     write_bursts(burst_path(folder, "turntable", 14), facts, arrays)
     file = open_folder(folder)[0]
     return folder, file.read(0)
@@ -67,6 +67,25 @@ def test_rendered_depth_agrees_between_views(rendered: tuple[Path, Burst]) -> No
         column, row = uv[inside].astype(int).T
         off.append(np.abs(burst.depth[0, row, column] / z[inside] - 1))
     assert np.median(np.concatenate(off)) < 0.02
+
+
+def test_rigs_at_rest_have_one_light_and_exact_depth(rendered: tuple[Path, Burst]) -> None:
+    (file,) = open_folder(rendered[0])
+    assert len(file) == 3
+    for number in (1, 2):
+        burst = file.read(number)
+        assert not burst.moving.any() and len(burst.keys) == 3
+        assert (burst.keys == burst.keys[0]).all() and 0.05 < burst.keys.mean() < 2
+        points = points_of(burst.depth, burst.K, burst.w2c)
+        off = []
+        for a, b in ((0, 1), (4, 5)):
+            K, w2c = burst.K[b], burst.w2c[b]
+            camera = Camera("c", 32, 20, K[0, 0], K[1, 1], K[0, 2], K[1, 2], w2c[:3, :3], w2c[:3, 3])
+            uv, z = camera.project(points[a].reshape(-1, 3).astype(np.float64))
+            inside = np.isfinite(z) & (uv > 0).all(1) & (uv < (32, 20)).all(1)
+            column, row = uv[inside].astype(int).T
+            off.append(np.abs(burst.depth[b, row, column] / z[inside] - 1))
+        assert np.median(np.concatenate(off)) < 0.03
 
 
 def test_only_moving_pixels_are_stored_twice_and_they_change(rendered: tuple[Path, Burst]) -> None:
@@ -90,7 +109,7 @@ def test_the_command_keeps_existing_shards(
     monkeypatch.setattr(MakeBursts, "__call__", fake)
     assert make_msdi_data(("car", "bird"), out=tmp_path, variants=1) == 0
     hidden = [(w, v) for v in HIDDEN_VARIANTS for w in ("car", "bird")]
-    assert made == [*hidden, ("car", 13), ("bird", 13)]
+    assert made == [("car", 13), ("bird", 13), *hidden]
     assert "8/8" in capsys.readouterr().out
     made.clear()
     burst_path(tmp_path, "car", 11).unlink()

@@ -1,0 +1,54 @@
+"""Training-only worlds: their motions against the laws that they follow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from spike4dgs.generators.msdi_data.clutter import TRAINING_WORLDS, texture
+from spike4dgs.generators.worlds import WORLDS, WorldScene
+
+STEP_S = 1e-3
+
+
+def poses(world: WorldScene, t_s: float) -> np.ndarray:
+    return np.stack(list(world.poses(t_s).values()))
+
+
+@pytest.fixture(scope="module", params=sorted(TRAINING_WORLDS))
+def world(request: pytest.FixtureRequest) -> WorldScene:
+    return TRAINING_WORLDS[request.param].build(0, 13, 0.1)
+
+
+def test_they_are_not_the_benchmarks() -> None:
+    assert not set(TRAINING_WORLDS) & set(WORLDS)
+
+
+def test_bodies_are_rigid_and_fall_as_they_should(world: WorldScene) -> None:
+    before, now, after = (poses(world, 0.05 + k * STEP_S) for k in (-1, 0, 1))
+    turns = now[:, :3, :3]
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
+    acceleration = (before - 2 * now + after)[:, :3, 3] / STEP_S**2
+    expected = (0, 0, -9.81) if world.name == "tumble" else (0, 0, 0)
+    np.testing.assert_allclose(acceleration, np.broadcast_to(expected, acceleration.shape), atol=1e-6)
+    # A constant spin: the turn from one step to the next is always the same one.
+    np.testing.assert_allclose(
+        after[:, :3, :3] @ turns.transpose(0, 2, 1), turns @ before[:, :3, :3].transpose(0, 2, 1), atol=1e-9
+    )
+    moved = np.linalg.norm((after - before)[:, :3, 3], axis=1)
+    assert (moved == 0).all() if world.name == "whirl" else (moved > 0).all()
+
+
+def test_a_variant_is_a_function_of_its_number(world: WorldScene) -> None:
+    build = TRAINING_WORLDS[world.name].build
+    same, other = build(0, 13, 0.1), build(0, 14, 0.1)
+    np.testing.assert_array_equal(same.moving_points(0.03), world.moving_points(0.03))
+    assert other.moving_points(0.03).shape != world.moving_points(0.03).shape or not np.allclose(
+        other.moving_points(0.03), world.moving_points(0.03)
+    )
+
+
+def test_textures_are_reflectances_that_differ() -> None:
+    images = [texture(64, np.random.default_rng(seed)) for seed in range(20)]
+    assert all(image.shape == (64, 64, 3) and np.isfinite(image).all() and image.min() >= 0 for image in images)
+    assert len({float(image.mean()) for image in images}) == 20
