@@ -9,7 +9,11 @@ from tyro.conf import OmitArgPrefixes
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.cli.options import COMPUTE, Compute, check_names
+from spike4dgs.method.matching.config import CONFIGS as MATCHERS
+from spike4dgs.method.matching.config import MatcherTraining
+from spike4dgs.method.matching.train import MatchTraining, run, training_key
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings
 from spike4dgs.method.msdi.train import Run, Training, checkpoint_key, start_from, training_shards
@@ -36,17 +40,20 @@ def train_msdi(
     Args:
         data: Folder of shards; those of the hidden variants are only scored.
         out: Folder for all output.
-        config: small, or paper (a GPU's work).
+        config: small, paper (a GPU's work), or bottleneck (the network that matches views: of the other options it
+            takes data, out, steps and seed, and a larger --steps goes on where the training ended).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
         steps: Steps.
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
         rate: Adam's learning rate, after the warm-up, of the layers that make points.
     """
-    check_names("--config", [config], CONFIGS)
+    check_names("--config", [config], (*CONFIGS, *MATCHERS))
     if steps < 1 or views < 2 or not rate > 0:
         found = f"{steps}, {views} and {rate}"
         raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
     learned, hidden = training_shards(data)
+    if config in MATCHERS:
+        return _train_matcher(learned, config, steps, compute.seed, out)
     settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     device = choose_device(compute.device, rasterizes=False)
     training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
@@ -56,4 +63,11 @@ def train_msdi(
     size = sum(p.numel() for p in training.network.parameters())
     print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
     Run(training, hidden, key, out).run()
+    return 0
+
+
+def _train_matcher(files: list[BurstFile], config: str, steps: int, seed: int, out: Path) -> int:
+    settings = MatcherTraining()
+    training = MatchTraining(files, MATCHERS[config], settings, seed)
+    run(training, steps, training_key(MATCHERS[config], settings, seed), out)
     return 0

@@ -28,7 +28,7 @@ ORDER = {
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
-    "schedule models checkpoint msdi images starts self_calibration trainer fit recipes viewing recordings",
+    "schedule models checkpoint msdi images matching starts self_calibration trainer fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",
     "leaderboard": "tracks entry truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error images recorder_runs recorder saved_models oracle_truth "

@@ -60,7 +60,10 @@ def make_spikes(pixels: Pixels, ticks: int, rng: np.random.Generator) -> NDArray
 
 
 def fire(pixels: Pixels, ticks: int, charge: Float32, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return the spikes for given charges [...] in [0, 1) before the window; only the shot noise is drawn."""
+    """Return the spikes for given charges [...] in [0, 1) before the window; only the shot noise is drawn.
+
+    Beyond the images light stays as it is in the first and the last: a window may be longer where nothing moves.
+    """
     sd, cutoff = pixels.photons**-0.5, SENSOR.noise_cutoff
     deviates = np.clip(rng.standard_normal(_DEVIATES, np.float32), -cutoff, cutoff) * np.float32(sd)
     starts = rng.integers(0, _DEVIATES, charge.size, np.uint16)
@@ -82,8 +85,8 @@ def _integrate(
     for p in range(n):
         level, number = np.float64(charge[p]), int(starts[p])
         for t in range(len(spikes)):
-            piece = (first + t) // spacing
-            u = (first + t + 0.5 - piece * spacing) / spacing
+            piece = min(max((first + t) // spacing, 0), count - 2)
+            u = min(max((first + t + 0.5 - piece * spacing) / spacing, 0.0), 1.0)
             rate = (1 - u) * rates[piece, p] + u * rates[piece + 1, p]
             level += _charge_of_tick(gain[p] * rate, dark[p], most)
             fired = level >= 1.0

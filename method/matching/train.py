@@ -1,0 +1,126 @@
+"""Train the matching network on bursts of `make-msdi-data`.
+
+The rate of learning does not depend on a last step, and the weights in use are a running mean: a training can go on at
+any time, for as long as it pays. All randomness comes from (seed, step): a killed run goes on with the bits of one that
+never stopped, on the same machine and shards.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.scene.training_bursts import BurstFile
+from spike4dgs.method.checkpoint import resume_training, save_training
+from spike4dgs.method.gaussians.optimizer import make_adam
+from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
+from spike4dgs.method.matching.data import draw
+from spike4dgs.method.matching.losses import MatchLosses, match_losses
+from spike4dgs.method.matching.network import Matcher
+from spike4dgs.method.msdi.records import Curve
+from spike4dgs.method.torch_state import one_torch_thread, seeded
+
+ROW_EVERY = 50  # steps between rows of the losses
+_SAVE_EVERY_S = 120.0
+
+
+class MatchTraining:
+    """A training in progress."""
+
+    def __init__(self, files: Sequence[BurstFile], config: MatcherConfig, settings: MatcherTraining, seed: int) -> None:
+        self.files, self.settings, self.seed = list(files), settings, seed
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            live = Matcher(config)
+        self.networks = nn.ModuleDict({"live": live, "mean": copy.deepcopy(live)})
+        self.adam = make_adam({"all": list(live.parameters())}, (0.9, 0.999))
+        self.step = 0
+
+    @property
+    def network(self) -> Matcher:
+        """The network of the running mean of the weights: the one to use."""
+        mean = self.networks["mean"]
+        assert isinstance(mean, Matcher)
+        return mean
+
+    def train_step(self) -> MatchLosses:
+        """Train for one step and return its losses."""
+        batch = draw(self.files, self.settings, np.random.default_rng([self.seed, self.step]))
+        live = self.networks["live"]
+        generator = seeded(self.seed, self.step)
+        features = live.extractor(batch.inputs)
+        losses = match_losses(live, features, batch.views, batch.pairs, self.settings.jitter, generator)  # type: ignore[arg-type]
+        self.adam.zero_grad(set_to_none=True)
+        losses.total.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(live.parameters(), 1.0)
+        for group in self.adam.param_groups:
+            group["lr"] = self.settings.learning_rate(self.step)
+        if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
+            self.adam.step()
+        self.step += 1
+        share = min(self.settings.average, self.step / (self.step + 9))  # the first steps are soon forgotten
+        with torch.no_grad():
+            for mean, parameter in zip(self.network.parameters(), live.parameters(), strict=True):
+                mean.lerp_(parameter, 1 - share)
+        return losses
+
+    def save(self, path: Path, key: str) -> None:
+        """Write everything needed to go on."""
+        save_training(path, self.step, self.networks, self.adam, key)
+
+    def resume(self, path: Path, key: str) -> None:
+        """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
+        self.step = resume_training(path, self.networks, self.adam, key)
+
+
+def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int) -> str:
+    """Return the hash that ties a checkpoint to its training; the number of steps is no part of it."""
+    return sha256_json([asdict(config), asdict(settings), seed])
+
+
+def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float = _SAVE_EVERY_S) -> None:
+    """Train up to a step in one thread, with checkpoint, losses and list of shards in the folder `out`."""
+    with one_torch_thread():
+        _run(training, steps, key, out, save_every_s)
+
+
+def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float) -> None:
+    checkpoint, losses = out / "checkpoint.safetensors", out / "losses.csv"
+    training.resume(checkpoint, key)
+    note_shards(out / "trained_on.json", training.files, fresh=training.step == 0)
+    curve = Curve(losses, training.step)
+    recent: list[MatchLosses] = []
+    saved = start = time.perf_counter()
+    first = training.step
+    while training.step < steps:
+        recent.append(training.train_step())
+        step, now = training.step, time.perf_counter()
+        if step % ROW_EVERY and step != steps:
+            continue
+        row = {name: float(np.mean([getattr(r, name) for r in recent])) for name in ("coarse", "found", "fine_px")}
+        recent = []
+        curve.add(step, row)
+        left = (now - start) / (step - first) * (steps - step)
+        shown = ", ".join(f"{name} {value:.3f}" for name, value in row.items())
+        print(f"step {step}/{steps}: {shown}; {now - start:.0f} s, about {left:.0f} s left", flush=True)
+        if now - saved > save_every_s or step == steps:
+            training.save(checkpoint, key)
+            curve.write()
+            saved = now
+
+
+def note_shards(path: Path, files: Sequence[BurstFile], *, fresh: bool) -> tuple[str, ...]:
+    """Return the training's shards as ID@SHA256, with those of its earlier starts; keep them in a file."""
+    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files}
+    if path.is_file() and not fresh:
+        names |= set(read_json(path, "what was trained on")["shards"])
+    write_json(path, {"shards": sorted(names)})
+    return tuple(sorted(names))

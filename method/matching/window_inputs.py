@@ -1,0 +1,54 @@
+"""What the matching network sees of a camera: `adaptive`'s image, its error bars, and a shorter and a longer window.
+
+Long windows serve low light, and where things move `adaptive` shortens them by itself. The network adds to the
+estimate that is already there, and knows how far to trust it.
+
+| channel | value |
+|---|---|
+| 0 | root of the rate over `adaptive`'s window, in means of the image, less 1 |
+| 1 | log2 of that window's ticks, over 8: a rate lies within one over so many ticks of the spikes' |
+| 2 | as 0, over the shortest window |
+| 3 | as 0, over the whole stream |
+
+The root makes shot noise alike in the dark and in the light; the mean takes out light and exposure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
+
+CHANNELS = 4
+_MOST = 4.0  # of a root, in roots of the mean: a hot pixel must not outshine everything
+_LEAST = 1e-4  # spikes per tick: the mean of an image that is dark throughout
+
+Maps = tuple[Float32, Float32]  # relative sensitivity and dark rate [H, W]
+
+
+def window_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None) -> Float32:
+    """Return the channels [4, H, W] at the start of `tick`; `sensor` None where it is unknown.
+
+    A pixel without sensitivity has rate 0.
+    """
+    settings = AdaptiveSettings()
+    levels = shared_levels(stream, tick, settings)
+    shortest = np.zeros_like(levels)
+    found = [rates(stream, tick, settings, which) for which in (levels, shortest)]
+    ticks = np.minimum(2 * half_windows(stream.n_ticks, settings)[levels], stream.n_ticks)
+    adaptive, short, length = (_upright(stream, image) for image in (*found, ticks.astype(np.float32)))
+    whole = stream.counts(0, min(stream.n_ticks, 65535)).astype(np.float32) / min(stream.n_ticks, 65535)
+    images = np.stack([adaptive, short, whole])
+    if sensor:
+        gain, dark = sensor
+        images = (images - dark) * np.where(gain > 0, 1 / np.where(gain > 0, gain, 1), 0)
+    images = np.maximum(images, 0)
+    roots = np.minimum(np.sqrt(images / max(float(images[2].mean()), _LEAST)), _MOST) - 1
+    return np.stack([roots[0], np.log2(length) / 8, roots[1], roots[2]]).astype(np.float32)
+
+
+def _upright(stream: SpikeStream, image: Float32) -> Float32:
+    image = image.reshape(stream.height, stream.width)
+    return image[::-1] if stream.rows_bottom_up else image
