@@ -20,6 +20,7 @@ from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.msdi.pose import solve_poses
+from spike4dgs.method.starts.matching import match_and_solve
 from spike4dgs.method.starts.msdi import DEFAULTS, infer, matched_poses
 from spike4dgs.method.starts.rig import rig, window_means
 from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
@@ -65,6 +66,7 @@ ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Any]] = {  #
     "dust3r": lambda scene, images, seed, known: estimate_dust3r(scene, images, seed, calibrated=known),
     "msdi": _msdi,
     "msdi-matched": _msdi_matched,
+    "matching": lambda scene, images, seed, known: match_and_solve(scene, seed, calibrated=known),
 }
 COLUMNS = {  # key of the row -> heading, format
     "registered": ("views", "{}"),
@@ -101,7 +103,7 @@ def poses(
     Args:
         scenes: Scene folders.
         initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
-            view, and what views match).
+            view, and what views match), matching (the matching network and geometry).
         images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
             calibrations, as in recipes with flat_field), or images of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.

@@ -1,7 +1,13 @@
-"""Matches of all pairs of views: by the network, or by SIFT features, which learn nothing."""
+"""Matches of all pairs of views: by the network, or by SIFT features, which learn nothing.
+
+The network finds partners that no classical feature finds in the noise of low light, to about a pixel. Where the images
+around a match are alike, Lucas and Kanade's alignment (OpenCV) then measures it to a third of a pixel, forth and back:
+where the two ways differ, the match is as uncertain as they do.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -9,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Mask, UInt8
 from spike4dgs.method.matching.losses import middle_of_cell
 from spike4dgs.method.matching.network import Features, Matcher, points_of_cells
 from spike4dgs.method.matching.tracks import Matches, PairMatches
@@ -19,12 +25,18 @@ _LEAST_ERROR, _MOST_ERROR = 0.05, 7.0  # px, expected
 _ENLARGE = 2  # of images 200 px wide, for SIFT: at their own size it finds few features
 _RATIO = 0.85  # of the distances to the best and the second best feature
 _SIFT_ERROR_PX = 0.5
+_COARSE_ERROR_PX = 1.0  # expected of a match that could not be aligned, at least
+_ALIGN_PX = 21  # side of the window that is aligned: 15 is as good at full light, and worse at a quarter
+_ALIGN_BLUR_PX = 0.7
+_ALIGN_REACH_PX = 4.0  # from the network's match: beyond it the alignment has lost its way
+_ALIGN_FLOOR_PX = 0.3  # error that is expected of the best alignment
+_ALIGN_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # rounds, px
 _ROOTS = (-1.0, 1.0)  # of `window_inputs`' channel 0: from black to four times the mean
 
 
 @torch.inference_mode()
 def learned_matches(network: Matcher, inputs: Float32) -> Matches:
-    """Return the network's matches from inputs [V, 4, H, W] of `window_inputs`."""
+    """Return the network's matches, aligned, from inputs [V, 4, H, W] of `window_inputs`."""
     device = next(network.parameters()).device
     seen = [network.extractor(torch.from_numpy(view[None]).to(device)) for view in inputs]
     features = Features(torch.cat([f.coarse for f in seen]), torch.cat([f.fine for f in seen]), seen[0].size)
@@ -34,7 +46,39 @@ def learned_matches(network: Matcher, inputs: Float32) -> Matches:
         a, b = mutual(logs, LEAST_PROBABILITY)
         found[i, j] = _refined(network, features, (i, j), a, b)
         found[j, i] = _refined(network, features, (j, i), b, a)
-    return found
+    images = [_gray(cv2.GaussianBlur(view[0], (0, 0), _ALIGN_BLUR_PX)) for view in inputs]
+    return {(i, j): aligned(images[i], images[j], m) for (i, j), m in found.items()}
+
+
+def aligned(first: UInt8, second: UInt8, matches: PairMatches) -> PairMatches:
+    """Return matches whose places in the second image [H, W] are those at which the images agree best.
+
+    A match that the alignment moves far, or not at all, stays as it is.
+    """
+    if not len(matches.point):
+        return matches
+    at, near = ((x - 0.5).astype(np.float32) for x in (matches.at, matches.uv))  # OpenCV: pixel centres at 0
+    there, went = _flow(first, second, at, near)
+    back, came = _flow(second, first, there, at)
+    good = went & came & (np.linalg.norm(there - near, axis=1) < _ALIGN_REACH_PX)
+    error = np.hypot(_ALIGN_FLOOR_PX, np.linalg.norm(back - at, axis=1))
+    uv = np.where(good[:, None], there.astype(np.float64) + 0.5, matches.uv)
+    return replace(matches, uv=uv, error=np.where(good, error, np.maximum(matches.error, _COARSE_ERROR_PX)))
+
+
+def _flow(first: UInt8, second: UInt8, at: Float32, near: Float32) -> tuple[Float32, Mask]:
+    """Return where points are in the second image, begun at `near`, and whether they were found."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        at,
+        near.copy(),
+        winSize=(_ALIGN_PX, _ALIGN_PX),
+        maxLevel=0,
+        criteria=_ALIGN_END,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(there, np.float32), found[:, 0] > 0
 
 
 def mutual(logs: Tensor, least: float) -> tuple[Tensor, Tensor]:
@@ -76,9 +120,12 @@ def sift_matches(images: Float32) -> Matches:
 
 
 def _shown(image: Float32) -> UInt8:
+    return np.asarray(cv2.resize(_gray(image), None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _gray(image: Float32) -> UInt8:
     low, high = _ROOTS
-    gray = np.asarray(np.clip((image - low) / (high - low), 0, 1) * 255, np.uint8)
-    return np.asarray(cv2.resize(gray, None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC), np.uint8)
+    return np.asarray(np.clip((image - low) / (high - low), 0, 1) * 255, np.uint8)
 
 
 def _nearest(a: Float32, b: Float32) -> tuple[np.ndarray, np.ndarray]:

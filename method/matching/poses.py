@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.arrays import Float64, Int64
 from spike4dgs.method.matching.adjust import Adjusted, Array, adjust
 from spike4dgs.method.matching.tracks import Matches, Tracks, make_tracks
 from spike4dgs.method.matching.two_views import averaged, normalized, relative_poses
@@ -25,13 +25,14 @@ class SolveSettings:
 
     reach_px: float = 1.5  # of a match to its epipolar line, and of a plane's points to their matches
     plane_px: float = 8.0  # of the plane's points, while nothing is known: a relief is no plane
-    points: int = 300  # of each anchor view in the last adjustment
+    points: int = 200  # of each anchor view in the last adjustment
     first_points: int = 60  # in the first ones, which choose where to begin
     focals: tuple[float, ...] = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0)  # in image widths, tried where it is unknown
     believed: float = 6.0  # expected errors from which a sight is left out of the last adjustment
 
 
 DEFAULTS = SolveSettings()
+CERTAIN = 3.0  # expected errors of a sight that counts for a point
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,12 @@ class Solved:
     tracks: Tracks
     adjusted: Adjusted
     began: str  # "pairs" or "plane"
+
+    def points_kept(self) -> Int64:
+        """Return the numbers of the tracks that two views or more see in front of them, within `CERTAIN` errors."""
+        t, w = self.tracks, self.adjusted.inverse_depth
+        good = np.bincount(t.track[self.adjusted.errors < CERTAIN], minlength=len(w))
+        return np.flatnonzero((good >= 2) & (w > 0))
 
     @property
     def w2c(self) -> Float64:

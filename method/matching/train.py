@@ -25,6 +25,7 @@ from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
 from spike4dgs.method.matching.data import draw
 from spike4dgs.method.matching.losses import MatchLosses, match_losses
 from spike4dgs.method.matching.network import Matcher
+from spike4dgs.method.matching.weights import WEIGHTS, MatcherCard
 from spike4dgs.method.msdi.records import Curve
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 
@@ -87,7 +88,7 @@ def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int) ->
 
 
 def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float = _SAVE_EVERY_S) -> None:
-    """Train up to a step in one thread, with checkpoint, losses and list of shards in the folder `out`."""
+    """Train up to a step in one thread, with checkpoint, weights, losses and list of shards in `out`."""
     with one_torch_thread():
         _run(training, steps, key, out, save_every_s)
 
@@ -95,7 +96,7 @@ def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: 
 def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float) -> None:
     checkpoint, losses = out / "checkpoint.safetensors", out / "losses.csv"
     training.resume(checkpoint, key)
-    note_shards(out / "trained_on.json", training.files, fresh=training.step == 0)
+    seen = note_shards(out / "trained_on.json", training.files, fresh=training.step == 0)
     curve = Curve(losses, training.step)
     recent: list[MatchLosses] = []
     saved = start = time.perf_counter()
@@ -113,6 +114,8 @@ def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s:
         print(f"step {step}/{steps}: {shown}; {now - start:.0f} s, about {left:.0f} s left", flush=True)
         if now - saved > save_every_s or step == steps:
             training.save(checkpoint, key)
+            config = training.network.config.name
+            WEIGHTS.save(out / "matcher.safetensors", training.network, MatcherCard(config, step, training.seed, seen))
             curve.write()
             saved = now
 
