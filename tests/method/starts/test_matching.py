@@ -1,0 +1,78 @@
+"""Poses and points from matches of the toy world: true matches give its cameras; weights decide which network runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.method.matching.config import TINY
+from spike4dgs.method.matching.network import Matcher, points_of_cells
+from spike4dgs.method.matching.poses import solve
+from spike4dgs.method.matching.tracks import Matches, PairMatches
+from spike4dgs.method.matching.truth import correspond
+from spike4dgs.method.matching.weights import VARIABLE, WEIGHTS, MatcherCard, load_matcher
+from spike4dgs.method.starts.matching import in_scene, match_and_solve, seen_inputs
+
+WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
+SCENE = WORLD.training
+
+
+def true_matches() -> Matches:
+    depth = [torch.from_numpy(np.asarray(WORLD.trace(c, 0.5)[1], np.float64)) for c in SCENE.cameras]
+    K, w2c = ([torch.from_numpy(getattr(c, name)) for c in SCENE.cameras] for name in ("K", "w2c"))
+    at = points_of_cells(15, 24).double()
+    found = {}
+    for i in range(len(depth)):
+        for j in range(len(depth)):
+            if i != j:
+                true = correspond(at, (depth[i], depth[j]), (K[i], K[j]), w2c[j] @ torch.linalg.inv(w2c[i]))
+                seen = true.seen.numpy()
+                uv = true.uv.numpy()[seen]
+                found[i, j] = PairMatches(np.flatnonzero(seen), at.numpy()[seen], uv, np.full(len(uv), 0.3))
+    return found
+
+
+def test_true_matches_give_the_cameras_and_the_points_of_the_scene() -> None:
+    solved = solve(true_matches(), np.stack([c.K for c in SCENE.cameras]))
+    assert solved is not None
+    found = in_scene(SCENE, solved, seen_inputs(SCENE))
+    errors = pose_errors(found.cameras, SCENE.cameras)
+    assert errors.rotation_deg.max() < 0.05 and errors.translation_m.max() < 0.03 * errors.array_m
+    assert len(found.points) > 300 and len(found.values) == len(found.points)
+    camera = SCENE.cameras[0]
+    uv, z = camera.project(found.points)
+    inside = (z > 0) & (uv > 0).all(axis=1) & (uv < (96, 61)).all(axis=1)
+    u, v = uv[inside].astype(int).T
+    truth = np.asarray(WORLD.trace(camera, 0.5)[1])[v, u]
+    assert np.median(np.abs(z[inside] / truth - 1)) < 0.01
+
+
+def test_inputs_are_those_of_all_views() -> None:
+    inputs = seen_inputs(SCENE)
+    assert inputs.shape == (len(SCENE.cameras), 4, 61, 96) and np.isfinite(inputs).all()
+    # The first channel is the image: its square is the radiance, up to a factor.
+    truth = np.asarray(WORLD.trace(SCENE.cameras[2], 0.5)[0])
+    assert np.corrcoef((inputs[2, 0] + 1).ravel() ** 2, truth.ravel())[0, 1] > 0.8
+
+
+def test_the_network_in_use_is_that_of_the_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    network = Matcher(TINY)
+    path = tmp_path / "matcher.safetensors"
+    WEIGHTS.save(path, network, MatcherCard(TINY.name, 3, 0, ("toy-13@0",)))
+    loaded = load_matcher(path, "cpu")
+    x = torch.randn(1, 4, 32, 40)
+    with torch.no_grad():
+        a, b = network.extractor(x), loaded.extractor(x)
+    torch.testing.assert_close(a.coarse, b.coarse, atol=5e-3, rtol=5e-3)
+    monkeypatch.setenv(VARIABLE, str(path))
+    match_and_solve(SCENE, 0, "cpu", calibrated=True)  # random weights: any answer, but no failure
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "absent.safetensors"))
+    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
+        match_and_solve(SCENE, 0, "cpu", calibrated=True)
