@@ -215,13 +215,18 @@ def _weights(network: str) -> Path:
         from spike4dgs.method.msdi.weights import WEIGHTS as msdi
 
         return msdi.check()
+    if network == "matching":
+        from spike4dgs.method.matching.weights import WEIGHTS as matching
+
+        return matching.check()
     from spike4dgs.baselines.images.spk2img.maker import WEIGHTS as spk2img
 
     return spk2img.check()
 
 
 # What finds the weights of a network, or raises UserError.
-NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for name in ("MSDI", "Spk2ImgNet", "DUSt3R")}
+_NETWORKS = ("MSDI", "matching", "Spk2ImgNet", "DUSt3R")
+NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for name in _NETWORKS}
 
 
 def _version(package: str) -> str | None:

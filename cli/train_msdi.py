@@ -13,7 +13,7 @@ from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.cli.options import COMPUTE, Compute, check_names
 from spike4dgs.method.matching.config import CONFIGS as MATCHERS
 from spike4dgs.method.matching.config import MatcherTraining
-from spike4dgs.method.matching.train import MatchTraining, run, training_key
+from spike4dgs.method.matching.training.train import MatchTraining, run, training_key
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import PUBLISHED, TrainingSettings
 from spike4dgs.method.msdi.train import Run, Training, checkpoint_key, start_from, training_shards

@@ -31,6 +31,7 @@ PAGES = {  # files outside docs/ that have a page on the site
     "CHANGELOG.md": "docs/changelog.md",
     "examples/README.md": "docs/external_methods.md",
     "method/msdi/README.md": "docs/methods/msdi_card.md",
+    "method/matching/README.md": "docs/methods/matching_card.md",
     "baselines/images/spk2img/README.md": "docs/methods/spk2img_card.md",
 }
 _INCLUDE = re.compile(r"^<!-- include (\S+)(?: (\w+))? -->$", re.MULTILINE)

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.arrays import Float32, Mask, UInt8
-from spike4dgs.method.matching.losses import middle_of_cell
-from spike4dgs.method.matching.network import Features, Matcher, points_of_cells
+from spike4dgs.method.matching.network import Features, Matcher, middle_of_cell, points_of_cells
 from spike4dgs.method.matching.tracks import Matches, PairMatches
 
 LEAST_PROBABILITY = 0.1  # that two cells are each other's best: below it most are wrong

@@ -146,6 +146,11 @@ def points_of_cells(rows: int, columns: int, device: torch.device | str = "cpu")
     return torch.stack([x, y], dim=-1).reshape(-1, 2) * float(COARSE) + POINT
 
 
+def middle_of_cell(uv: Tensor) -> Tensor:
+    """Return the middles [K, 2] of the coarse cells in which points lie, px."""
+    return ((uv / COARSE).floor() + 0.5) * COARSE
+
+
 class _Residual(nn.Module):
     """Two convolutions beside the identity; the second begins at a fraction, so that depth does not add up."""
 

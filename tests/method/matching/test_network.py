@@ -73,5 +73,5 @@ def test_matches_of_a_view_with_itself_are_where_they_are() -> None:
     assert set(matches) == {(0, 1), (1, 0)}
     m = matches[0, 1]
     assert len(m.point) > 100
-    assert np.abs(m.uv - m.at).max() < 8 and (m.error > 0).all()
+    assert np.abs(m.uv - m.at).max() < 12 and (m.error > 0).all()  # a cell, its neighbour, and the alignment's reach
     np.testing.assert_array_equal(m.at[0] % 4, [2.5, 2.5])

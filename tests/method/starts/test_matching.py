@@ -15,7 +15,7 @@ from spike4dgs.method.matching.config import TINY
 from spike4dgs.method.matching.network import Matcher, points_of_cells
 from spike4dgs.method.matching.poses import solve
 from spike4dgs.method.matching.tracks import Matches, PairMatches
-from spike4dgs.method.matching.truth import correspond
+from spike4dgs.method.matching.training.truth import correspond
 from spike4dgs.method.matching.weights import VARIABLE, WEIGHTS, MatcherCard, load_matcher
 from spike4dgs.method.starts.matching import in_scene, match_and_solve, seen_inputs
 

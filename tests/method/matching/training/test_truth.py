@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from toy_world import ToyWorld
 
 from spike4dgs.method.matching.network import points_of_cells
-from spike4dgs.method.matching.truth import correspond
+from spike4dgs.method.matching.training.truth import correspond
 
 K = torch.tensor([[70.0, 0, 32], [0, 70.0, 24], [0, 0, 1]], dtype=torch.float64)
 

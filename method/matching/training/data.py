@@ -19,7 +19,7 @@ from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.training_bursts import REACH, Burst, BurstFile
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.matching.config import MatcherTraining
-from spike4dgs.method.matching.losses import Views
+from spike4dgs.method.matching.training.losses import Views
 from spike4dgs.method.matching.window_inputs import window_inputs
 from spike4dgs.method.msdi.training_data import Pixels, chosen, make_spikes, varied
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spike4dgs.method.matching.network import COARSE, FINE, Features, Matcher, points_of_cells
-from spike4dgs.method.matching.truth import correspond
+from spike4dgs.method.matching.network import COARSE, FINE, Features, Matcher, middle_of_cell, points_of_cells
+from spike4dgs.method.matching.training.truth import correspond
 
 MOST_POINTS = 2048  # matches of a step that are refined: more take longer and teach the same
 _LEAST_LOG, _MOST_LOG = -3.0, 2.0  # of the expected error in px: 0.05 to 7
@@ -77,11 +77,6 @@ def match_losses(
     total = nll.mean() + fine[reachable].mean()
     px = torch.linalg.vector_norm(refined.uv - end, dim=1)[reachable].median()
     return MatchLosses(total, nll.mean().item(), torch.cat(right).float().mean().item(), px.item())
-
-
-def middle_of_cell(uv: Tensor) -> Tensor:
-    """Return the middles [K, 2] of the coarse cells in which points lie, px."""
-    return ((uv / COARSE).floor() + 0.5) * COARSE
 
 
 def _steps(count: int, share: float, generator: torch.Generator) -> Tensor:

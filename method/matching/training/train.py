@@ -22,9 +22,9 @@ from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
 from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
-from spike4dgs.method.matching.data import draw
-from spike4dgs.method.matching.losses import MatchLosses, match_losses
 from spike4dgs.method.matching.network import Matcher
+from spike4dgs.method.matching.training.data import draw
+from spike4dgs.method.matching.training.losses import MatchLosses, match_losses
 from spike4dgs.method.matching.weights import WEIGHTS, MatcherCard
 from spike4dgs.method.msdi.records import Curve
 from spike4dgs.method.torch_state import one_torch_thread, seeded

@@ -15,8 +15,8 @@ from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.checkpoint import load_checkpoint
 from spike4dgs.method.matching.config import TINY, MatcherTraining
-from spike4dgs.method.matching.data import at_light, draw, drawn, record, seen_by_network
-from spike4dgs.method.matching.train import MatchTraining, run, training_key
+from spike4dgs.method.matching.training.data import at_light, draw, drawn, record, seen_by_network
+from spike4dgs.method.matching.training.train import MatchTraining, run, training_key
 from spike4dgs.method.matching.window_inputs import window_inputs
 
 SETTINGS = MatcherTraining(samples=1, views=2, warm_up=5, hold=100)

@@ -1,0 +1,1 @@
+"""Training of the matching network on exact correspondences."""
