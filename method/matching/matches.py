@@ -1,12 +1,13 @@
 """Matches of all pairs of views: by the network, or by SIFT features, which learn nothing.
 
 The network finds partners that no classical feature finds in the noise of low light, to about a pixel. Where the images
-around a match are alike, Lucas and Kanade's alignment (OpenCV) then measures it to a third of a pixel, forth and back:
-where the two ways differ, the match is as uncertain as they do.
+around a match are alike, Lucas and Kanade's alignment (OpenCV) then measures it to a third of a pixel. Its error is
+expected from noise and slopes, and from the way back: where that ends elsewhere, the match is as uncertain.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -25,10 +26,13 @@ _ENLARGE = 2  # of images 200 px wide, for SIFT: at their own size it finds few 
 _RATIO = 0.85  # of the distances to the best and the second best feature
 _SIFT_ERROR_PX = 0.5
 _COARSE_ERROR_PX = 1.0  # expected of a match that could not be aligned, at least
-_ALIGN_PX = 21  # side of the window that is aligned: 15 is as good at full light, and worse at a quarter
+# Sides of the windows that are aligned. A point takes the smallest in which noise leaves less than `_ALIGN_NOISE_PX`:
+# in a larger one the views' perspectives differ, and the error is the same for all points around.
+_ALIGN_PX = (7, 11, 21)
+_ALIGN_NOISE_PX = 0.2
 _ALIGN_BLUR_PX = 0.7
 _ALIGN_REACH_PX = 4.0  # from the network's match: beyond it the alignment has lost its way
-_ALIGN_FLOOR_PX = 0.3  # error that is expected of the best alignment
+_ALIGN_FLOOR_PX = 0.2  # error that is expected of the best alignment
 _ALIGN_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # rounds, px
 _ROOTS = (-1.0, 1.0)  # of `window_inputs`' channel 0: from black to four times the mean
 
@@ -45,11 +49,11 @@ def learned_matches(network: Matcher, inputs: Float32) -> Matches:
         a, b = mutual(logs, LEAST_PROBABILITY)
         found[i, j] = _refined(network, features, (i, j), a, b)
         found[j, i] = _refined(network, features, (j, i), b, a)
-    images = [_gray(cv2.GaussianBlur(view[0], (0, 0), _ALIGN_BLUR_PX)) for view in inputs]
+    images = [cv2.GaussianBlur(view[0], (0, 0), _ALIGN_BLUR_PX) for view in inputs]
     return {(i, j): aligned(images[i], images[j], m) for (i, j), m in found.items()}
 
 
-def aligned(first: UInt8, second: UInt8, matches: PairMatches) -> PairMatches:
+def aligned(first: Float32, second: Float32, matches: PairMatches) -> PairMatches:
     """Return matches whose places in the second image [H, W] are those at which the images agree best.
 
     A match that the alignment moves far, or not at all, stays as it is.
@@ -57,22 +61,48 @@ def aligned(first: UInt8, second: UInt8, matches: PairMatches) -> PairMatches:
     if not len(matches.point):
         return matches
     at, near = ((x - 0.5).astype(np.float32) for x in (matches.at, matches.uv))  # OpenCV: pixel centres at 0
-    there, went = _flow(first, second, at, near)
-    back, came = _flow(second, first, there, at)
-    good = went & came & (np.linalg.norm(there - near, axis=1) < _ALIGN_REACH_PX)
-    error = np.hypot(_ALIGN_FLOOR_PX, np.linalg.norm(back - at, axis=1))
+    a, b = _gray(first), _gray(second)
+    there, back = near.copy(), np.full_like(at, np.inf)
+    noise = np.stack([_noise_px(first, at, side) for side in _ALIGN_PX])  # [windows, M]
+    fine = noise < _ALIGN_NOISE_PX
+    choice = np.where(fine.any(axis=0), fine.argmax(axis=0), len(_ALIGN_PX) - 1)
+    found = np.zeros(len(at), bool)
+    for k, side in enumerate(_ALIGN_PX):
+        mine = choice == k
+        if mine.any():
+            there[mine], went = _flow(a, b, at[mine], near[mine], side)
+            back[mine], came = _flow(b, a, there[mine], at[mine], side)
+            found[mine] = went & came
+    good = found & (np.linalg.norm(there - near, axis=1) < _ALIGN_REACH_PX)
+    off = np.where(good, np.linalg.norm(back - at, axis=1), 0)
+    error = np.sqrt(_ALIGN_FLOOR_PX**2 + off**2 + noise[choice, np.arange(len(at))] ** 2)
     uv = np.where(good[:, None], there.astype(np.float64) + 0.5, matches.uv)
-    return replace(matches, uv=uv, error=np.where(good, error, np.maximum(matches.error, _COARSE_ERROR_PX)))
+    kept = np.maximum(matches.error, _COARSE_ERROR_PX)
+    return replace(matches, uv=uv, error=np.where(good, np.clip(error, _LEAST_ERROR, _MOST_ERROR), kept))
 
 
-def _flow(first: UInt8, second: UInt8, at: Float32, near: Float32) -> tuple[Float32, Mask]:
+def _noise_px(image: Float32, at: Float32, side: int) -> Float32:
+    """Return the errors [M] that noise leaves in an alignment of windows of `side` px, along their worst direction.
+
+    It is the noise of two images over the root of the window's least sum of squared slopes. The noise is Immerkaer's
+    estimate (1996), from an operator that no plane and no straight edge passes.
+    """
+    operator = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
+    noise = math.sqrt(math.pi / 2) / 6 * float(np.abs(cv2.filter2D(image, cv2.CV_32F, operator)).mean())
+    slopes = cv2.cornerMinEigenVal(image, side, ksize=3) * (side / 2) ** 2  # OpenCV scales by 4 / side^2
+    column, row = np.rint(at).astype(np.int64).T
+    least = slopes[row.clip(0, len(image) - 1), column.clip(0, image.shape[1] - 1)]
+    return np.asarray(math.sqrt(2) * noise / np.sqrt(np.maximum(least, 1e-9)), np.float32)
+
+
+def _flow(first: UInt8, second: UInt8, at: Float32, near: Float32, side: int) -> tuple[Float32, Mask]:
     """Return where points are in the second image, begun at `near`, and whether they were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         first,
         second,
         at,
         near.copy(),
-        winSize=(_ALIGN_PX, _ALIGN_PX),
+        winSize=(side, side),
         maxLevel=0,
         criteria=_ALIGN_END,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

@@ -18,16 +18,16 @@ def test_alignment_finds_a_shift_to_a_tenth_of_a_pixel() -> None:
     moved = (3.3, -1.7)  # right, down
     first = texture()
     second = shift(first, moved[::-1], order=3, mode="nearest")
-    a, b = (np.asarray(np.clip((x + 1) / 2, 0, 1) * 255, np.uint8) for x in (first, second))
+    a, b = first, np.asarray(second, np.float32)
     rng = np.random.default_rng(1)
     at = rng.uniform(25, 75, (60, 2))
     near = at + moved + rng.uniform(-1.5, 1.5, at.shape)
     found = aligned(a, b, PairMatches(np.arange(60), at, near, np.full(60, 1.2)))
     off = np.linalg.norm(found.uv - at - moved, axis=1)
     assert np.median(off) < 0.1 and np.quantile(off, 0.9) < 0.3
-    assert (found.error < 0.5).mean() > 0.9
+    assert (found.error < 0.5).mean() > 0.8
     # Without texture nothing can be aligned: the match stays, and is uncertain.
-    flat = np.full_like(a, 128)
+    flat = np.zeros_like(a)
     kept = aligned(flat, flat, PairMatches(np.arange(60), at, near, np.full(60, 0.2)))
     np.testing.assert_allclose(kept.uv, near, atol=1e-3)
     assert (kept.error >= 0.3).all()
