@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
@@ -21,7 +21,7 @@ from spike4dgs.benchmark.scene.scene import SCHEMA
 from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_text
 from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, TARGET_EVERY, TRACKS, Job
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, TARGET_EVERY, TRACKS, Job
 from spike4dgs.generators.render_tasks import cameras_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
 from spike4dgs.generators.scene_check import check_scenes, find_references
@@ -47,6 +47,8 @@ class SceneSettings:
         adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
         sub_ticks: Render instants inside a tick where the motion in one tick is too large.
         whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
+        rendering: paths traces whole paths (release 1); split traces direct light and takes soft light from smoothed
+            maps: a tenth of the noise, denser keys. It needs Mitsuba's LLVM or CUDA variant.
         physics: What differs from ideal cameras and lamps.
     """
 
@@ -60,6 +62,7 @@ class SceneSettings:
     adaptive_keys: bool = True
     sub_ticks: bool = True
     whole_frames: bool = False
+    rendering: Literal["paths", "split"] = "paths"
     physics: PhysicsOptions = NO_OPTIONS
 
     def job(self, world: str) -> Job:
@@ -73,7 +76,7 @@ class SceneSettings:
         if self.seed < 0 or self.variant < 0:
             found = f"{self.seed}, {self.variant}"
             raise problem("--seed and --variant", "numbers from 0 up", found, "correct them")
-        profile = PROFILES[self.profile]
+        profile = (PROFILES if self.rendering == "paths" else SPLIT_PROFILES)[self.profile]
         length = profile.seconds if self.seconds is None else self.seconds
         ticks = length * RATE_HZ if length <= _MOST_SECONDS else -1.0
         if not ticks >= 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
@@ -143,10 +146,10 @@ def make_dataset(
             console.print(f"{job.id}: complete and undamaged, kept: {out / job.id}{note}", markup=False)
     if todo:
         chosen = pick_variant()  # fails here, before anything is written, if it cannot render
-        for job in (job for job in todo if job.physics.lens or job.physics.psf_px):
+        for job in (job for job in todo if job.physics.lens or job.physics.psf_px or job.profile.soft):
             if chosen.startswith("scalar"):
                 fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
-                raise problem("--lens and --psf-px", "Mitsuba's LLVM or CUDA variant", chosen, fix)
+                raise problem("--lens, --psf-px and --rendering split", "Mitsuba's LLVM or CUDA variant", chosen, fix)
             for camera in cameras_of(job):
                 check_lens(camera, "--lens")
     with executor(workers, scheduler) as run:

@@ -2,28 +2,35 @@
 
 A task object is sent to its worker once and is then called for one chunk of ticks after another; it keeps what it has
 loaded (the world, Mitsuba's scene) between calls. It neither reads nor writes files, so a worker on another machine
-needs no common file system.
+needs no common file system. `render_static` runs those of the background and keeps what is done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
+from itertools import groupby
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.physics import from_settings, true_cameras
-from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
+from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, SoftSampling
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
-from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
+from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
+from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 _POINTS_PER_VIEW = 250  # of the sparse model
+_PIXELS = 1 << 14  # of a range of the background, or more: a second of work or longer
+_MOST_PARTS = 32
+Watch = Callable[[str, Iterable[Any], int], Iterator[Any]]
 
 
 def recorded_job(source: Mapping[str, Any]) -> Job | None:
@@ -39,12 +46,17 @@ def recorded_job(source: Mapping[str, Any]) -> Job | None:
         source["variant"],
         int(source["seed"]),
         source["profile"],
-        Profile(**{**source["sampling"], "views": tuple(source["sampling"]["views"])}),
+        _recorded_profile(source["sampling"]),
         source["seconds"],
         adaptive=source.get("adaptive_keys", True),
         physics=from_settings(source.get("physics", {})),
         **{name: source[name] for name in same if name in source},
     )
+
+
+def _recorded_profile(sampling: Mapping[str, Any]) -> Profile:
+    soft = {name: SoftSampling(**sampling[name]) for name in ("soft", "target_soft") if name in sampling}
+    return Profile(**{**sampling, **soft, "views": tuple(sampling["views"])})
 
 
 @lru_cache(maxsize=1)
@@ -85,77 +97,42 @@ class _Task:
         self.__dict__.update(state)
 
 
-class StaticParts(NamedTuple):
-    """Images and points that are rendered once for a scene."""
+@dataclass(frozen=True, eq=False)
+class RenderSoft(_Task):
+    """Renders soft light of the background for streams or ground truth. Called with (first, end) of flat pixels."""
 
-    views: StaticViews
-    target_first: NDArray[np.float32]  # [C, H, W, 3], the static background with the noise of ground truth
-    points: NDArray[np.float64]  # [N, 3] on static surfaces, for the sparse model
+    truth: bool
 
-
-class StaticPart(NamedTuple):
-    """A part of `StaticParts`: samples of the background, or some pixels with the noise of ground truth."""
-
-    rgb: NDArray[np.float32]  # [C, H, W, 3] or [K, 3]
-    points: NDArray[np.float64] | None  # of the first part
+    def __call__(self, part: tuple[int, int]) -> tuple[NDArray[np.float32], ...]:
+        """Return points, normals and soft light of the pixels; see `split_render.SplitRenderer.soft_at`."""
+        renderer: Any = renderer_of(self.job, cameras_of(self.job), truth=self.truth)
+        return renderer.soft_at(np.arange(*part))  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, eq=False)
 class RenderStatic(_Task):
-    """Renders the static background, in parts of as many paths each; called with the number of one."""
+    """Renders the background for streams or ground truth. Called with (first, end) of flat pixels."""
 
-    @property
-    def parts(self) -> range:
-        """The numbers of all parts: those of the background come first."""
-        return range(self._backgrounds + self._truths)
-
-    def join(self, parts: Iterable[StaticPart]) -> StaticParts:
-        """Return the static parts of the scene from all parts, in order."""
-        first, points, truth = None, None, []
-        for number, part in enumerate(parts):
-            if first is None:
-                first, points, total = part.rgb, part.points, part.rgb.astype(np.float64)
-            elif number < self._backgrounds:
-                total += part.rgb
-            else:
-                truth.append(part.rgb)
-        assert first is not None and points is not None  # there is a part of the background
-        background = (total / self._backgrounds).astype(np.float32)
-        return StaticParts(StaticViews(background, first), np.concatenate(truth).reshape(first.shape), points)
-
-    @property
-    def _backgrounds(self) -> int:
-        return self.job.profile.background_spp // self.job.profile.spp
-
-    @property
-    def _truths(self) -> int:
-        return max(1, self.job.profile.target_spp // self.job.profile.spp)
+    truth: bool
+    background: bool  # False: only the rendering with the random numbers of keys
+    soft: SoftStatic | None
 
     @cached_property
     def _renderer(self) -> MultiViewRenderer:
-        p = self.job.profile
-        return MultiViewRenderer(
-            world_of(self.job),
-            cameras_of(self.job),
-            seed=self.job.render_seed,
-            spp=p.spp,
-            background_spp=p.background_spp,
-            psf_px=self.job.physics.psf_px,
-        )
+        return renderer_of(self.job, cameras_of(self.job), truth=self.truth, soft_static=self.soft)
 
-    @cached_property
-    def _truth(self) -> MultiViewRenderer:
-        return _target_renderer(self.job, cameras_of(self.job), None)
+    def __call__(self, part: tuple[int, int]) -> tuple[NDArray[np.float32], ...]:
+        """Return the pixels [K, 3] of the images of `StaticViews`."""
+        return self._renderer.static_at(np.arange(*part), self.background)
 
-    def __call__(self, number: int) -> StaticPart:
-        """Return one part."""
-        if number < self._backgrounds:
-            points = _surface_points(self._renderer) if number == 0 else None
-            return StaticPart(self._renderer.background_sample(number), points)
-        pixels = np.arange(int(np.prod(self._truth.shape)))
-        return StaticPart(
-            self._truth.static_pixels(np.array_split(pixels, self._truths)[number - self._backgrounds]), None
-        )
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints(_Task):
+    """Finds points on static surfaces; the argument of the call is ignored."""
+
+    def __call__(self, part: object) -> NDArray[np.float64]:
+        """Return the points [N, 3] for the sparse model."""
+        return _surface_points(renderer_of(self.job, cameras_of(self.job), truth=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,21 +143,20 @@ class RenderKeys(_Task):
 
     @cached_property
     def _renderer(self) -> MultiViewRenderer:
-        p, job = self.job.profile, self.job
-        return MultiViewRenderer(
-            world_of(job),
-            cameras_of(job),
-            seed=job.render_seed,
-            spp=p.spp,
-            background_spp=p.background_spp,
-            static=self.static,
-            whole_frames=job.whole_frames,
-            psf_px=job.physics.psf_px,
-        )
+        return renderer_of(self.job, cameras_of(self.job), truth=False, static=self.static)
 
     def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
         """Return the keys of `ticks`."""
         return [(tick, self._renderer.key_arrays(tick, plan_of(self.job))) for tick in ticks]
+
+
+def key_chunks(job: Job, ticks: Sequence[int]) -> list[list[int]]:
+    """Return runs of ticks that share work: with maps of soft light, those of at least two intervals between maps."""
+    if job.profile.soft is None:
+        return chunked(ticks)
+    interval = anchor_s(world_of(job), cameras_of(job), job.profile.soft.anchor_px) * RATE_HZ
+    length = interval * max(2, int(job.n_ticks / interval) // 8)
+    return [list(run) for _, run in groupby(ticks, lambda tick: int(tick / length))]
 
 
 class Truth(NamedTuple):
@@ -199,16 +175,17 @@ class Truth(NamedTuple):
 class RenderTargets(_Task):
     """Renders ground truth. Called with ticks; returns it for the held-out camera, at sparse ticks for all cameras."""
 
-    static: StaticViews  # its first part has the noise of ground truth
+    static: StaticViews  # with the noise of ground truth
 
     @cached_property
     def _every_view(self) -> MultiViewRenderer:
-        return _target_renderer(self.job, cameras_of(self.job), self.static)
+        return renderer_of(self.job, cameras_of(self.job), truth=True, static=self.static)
 
     @cached_property
     def _held_out(self) -> MultiViewRenderer:
         view = held_out_view(self.job)
-        return _target_renderer(self.job, cameras_of(self.job)[view : view + 1], self.static.views([view]))
+        views = cameras_of(self.job)[view : view + 1]
+        return renderer_of(self.job, views, truth=True, static=self.static.views([view]))
 
     def __call__(self, ticks: Sequence[int]) -> list[Truth]:
         """Return the ground truth of `ticks`."""
@@ -222,20 +199,29 @@ class RenderTargets(_Task):
         return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 
-def _target_renderer(job: Job, views: Sequence[Camera], static: StaticViews | None) -> MultiViewRenderer:
-    """Return a renderer with other random numbers than the keys', so that streams and truth do not share noise."""
+def renderer_of(
+    job: Job, views: Sequence[Camera], *, truth: bool, seed: int | None = None, **others: Any
+) -> MultiViewRenderer:
+    """Return the renderer of streams or of ground truth, which have no random number in common.
+
+    `seed` is another seed than the job's; `others` go to the renderer.
+    """
     p = job.profile
-    background_spp = max(p.background_spp, p.target_spp)
-    return MultiViewRenderer(
-        world_of(job),
-        views,
-        seed=job.render_seed + 1,
-        spp=p.target_spp,
-        background_spp=background_spp,
-        color=True,
-        static=static,
-        psf_px=job.physics.psf_px,
-    )
+    own = {
+        "seed": job.render_seed + truth if seed is None else seed,
+        "spp": p.target_spp if truth else p.spp,
+        "background_spp": max(p.background_spp, p.target_spp) if truth else p.background_spp,
+        "color": truth,
+        "whole_frames": job.whole_frames and not truth,
+        "psf_px": job.physics.psf_px,
+    }
+    if (soft := p.target_soft if truth else p.soft) is None:
+        return MultiViewRenderer(
+            world_of(job), views, **{k: v for k, v in (own | others).items() if k != "soft_static"}
+        )
+    from spike4dgs.generators.rendering.split_render import SplitRenderer  # it needs compiled kernels
+
+    return SplitRenderer(world_of(job), views, soft=soft, **(own | others))
 
 
 def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:
@@ -249,3 +235,60 @@ def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:
         uv = np.stack([u[keep], v[keep]], axis=1) + 0.5
         found.append(camera.unproject(uv, depth[v, u][keep].astype(np.float64)))
     return np.concatenate(found)
+
+
+class StaticParts(NamedTuple):
+    """Images and points that are rendered once for a scene."""
+
+    views: StaticViews
+    truth: StaticViews  # with the noise of ground truth; its background is the same one where paths are whole
+    points: NDArray[np.float64]  # [N, 3] on static surfaces, for the sparse model
+
+
+def unseen(stage: str, steps: Iterable[Any], total: int) -> Iterator[Any]:
+    """Return the steps; show nothing."""
+    return iter(steps)
+
+
+def render_static(job: Job, folder: Path, run: Run = here, watch: Watch = unseen) -> StaticParts:
+    """Return the static parts of a scene; `folder` keeps what is done, and a killed call resumes from it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    views = _views(job, False, None, folder, run, watch)
+    truth = _views(job, True, views, folder, run, watch)
+    (points,) = run(SurfacePoints(job), [None])
+    return StaticParts(views, truth, points)
+
+
+def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: Run, watch: Watch) -> StaticViews:
+    """Return the static views of streams or of ground truth; paths are whole: with the background of `other`."""
+    cameras, p = cameras_of(job), job.profile
+    shape = len(cameras), p.height, p.width
+    n = int(np.prod(shape))
+    bounds = np.linspace(0, n, min(max(n // _PIXELS, 2), _MOST_PARTS) + 1).astype(int).tolist()
+    ranges = list(zip(bounds[:-1], bounds[1:], strict=True))
+
+    def rendered(task: Any, stage: str) -> list[tuple[Any, ...]]:
+        """Return the arrays of all ranges."""
+        files = [folder / f"{stage}-{k:02d}.npz" for k in range(len(ranges))]
+        missing = [k for k, file in enumerate(files) if not file.is_file()]
+
+        def steps() -> Iterator[int]:
+            for k, arrays in zip(missing, run(task, [ranges[k] for k in missing]), strict=True):
+                write_arrays(files[k], {f"{number}": a for number, a in enumerate(arrays)})
+                yield k
+
+        if missing:
+            for _ in watch(stage, steps(), len(missing)):
+                pass
+        return [tuple(read_arrays(file).values()) for file in files]
+
+    which = "background of the truth" if truth else "background"
+    sampling, soft = (p.target_soft if truth else p.soft), None
+    if sampling is not None:
+        from spike4dgs.generators.rendering.split_render import join_soft
+
+        soft = join_soft(rendered(RenderSoft(job, truth), f"soft {which}"), cameras, sampling.sigma_px)
+    own = other is None or soft is not None
+    found = rendered(RenderStatic(job, truth, own, soft), which)
+    images = [np.concatenate(parts).reshape(*shape, 3) for parts in zip(*found, strict=True)]
+    return StaticViews(*images, soft=soft) if own else StaticViews(other.background, *images)  # type: ignore[union-attr]

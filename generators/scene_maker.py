@@ -163,18 +163,22 @@ class Maker:
         path = self._work / "targets.npz"  # written last
         if self.store.has_static and path.is_file():
             return
-        task = render_tasks.RenderStatic(self.job)
-        static = task.join(self.watch("background", self.run(task, task.parts), len(task.parts)))
+        static = render_tasks.render_static(self.job, self._work / "background", self.run, self.watch)
         self.store.set_static(static.views)
-        write_arrays(path, {"first": static.target_first, "points": static.points})
+        truth = static.truth.arrays()
+        if static.truth.background is static.views.background:
+            del truth["background"]
+        write_arrays(path, {**truth, "points": static.points})
 
     def _render_keys(self) -> None:
         missing = self.store.missing(self.plan)
         if not missing:
             return
 
+        chunks = render_tasks.key_chunks(self.job, missing)
+
         def keys() -> Iterator[int]:
-            for chunk in self.run(render_tasks.RenderKeys(self.job, self.store.static()), chunked(missing)):
+            for chunk in self.run(render_tasks.RenderKeys(self.job, self.store.static()), chunks):
                 for tick, arrays in chunk:
                     self.store.put(tick, arrays)
                     yield tick
@@ -186,7 +190,8 @@ class Maker:
         missing = {t for t in self.targets if not mask_file(self._scene, t).is_file()}
         if not missing:
             return
-        static = StaticViews(self.store.static().background, read_arrays(self._work / "targets.npz", "first")["first"])
+        arrays = {"background": self.store.static().background, **read_arrays(self._work / "targets.npz")}
+        static = StaticViews.from_arrays(arrays)
         light_range = lru_cache(maxsize=None)(lambda view: self.store.range(view, self.plan))
 
         def truths() -> Iterator[Target]:

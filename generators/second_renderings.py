@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.generators.profiles import RATE_HZ
-from spike4dgs.generators.render_tasks import cameras_of, held_out_view, recorded_job, world_of
-from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.render_tasks import cameras_of, held_out_view, recorded_job, renderer_of
 
 _SEEDS = (1_000_003, 2_000_003)  # added to a scene's seed; its own files use the next few after it
 
@@ -24,20 +23,12 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     job = recorded_job(scene.meta["source"])
     if job is None:
         return None
-    profile = job.profile
     camera = cameras_of(job)[held_out_view(job)]
     if not (targets := [t for t in scene.targets if t.camera == camera.id]):
         return None
     target, images = targets[len(targets) // 2], []
     print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
     for seed in _SEEDS:
-        renderer = MultiViewRenderer(
-            world_of(job),
-            [camera],
-            seed=job.seed + seed,
-            spp=profile.target_spp,
-            background_spp=profile.target_spp,
-            psf_px=job.physics.psf_px,
-        )
+        renderer = renderer_of(job, [camera], truth=True, seed=job.seed + seed, color=False, whole_frames=True)
         images.append(renderer.crn_frames(target.tick / RATE_HZ)[0] * np.float32(job.light_at(target.tick)))
     return target, images[0], images[1]

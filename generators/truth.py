@@ -5,11 +5,14 @@
 At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with four times the samples of
 a key; they are compared with the interpolated radiance of that instant. Some ground-truth frames are compared with
 renderings of four times their samples. The noise of the reference counts as error too.
+
+Noise alone is known from two further renderings A and B with other random numbers: of an image I, the mean of
+(I - A)(I - B) is the variance of its noise, without bias and without theirs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +22,8 @@ from scipy.ndimage import binary_dilation, binary_opening
 
 from spike4dgs.benchmark.scene.images import gray, read_exr, read_mask, write_exr, write_geometry, write_mask
 from spike4dgs.benchmark.scene.scene import Target
-from spike4dgs.generators.profiles import RATE_HZ, Job
-from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, world_of
+from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
+from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, renderer_of, world_of
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
@@ -72,7 +75,8 @@ def moving_region(
     return np.asarray(grown | binary_opening(lit, np.ones((2, 2))))
 
 
-_TICKS, _VIEWS, _FRAMES = 4, 3, 3
+_TICKS, _VIEWS, _FRAMES, _PAIRS = 4, 3, 3, 3
+_SEEDS = (3_000_017, 5_000_011)  # added to a scene's seed: far from those of its own files
 _MORE = 4  # times the samples of a key or of ground truth
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker
 
@@ -109,7 +113,78 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
         "samples": {"ticks": _MORE * p.spp, "ground_truth": _MORE * p.target_spp},
         "ticks": {"total": _total(seen), "each": seen},
         "ground_truth": {"total": _total(frames), "each": frames},
+        "noise": noise(job, store, plan, scene),
     }
+
+
+def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, dict[str, float | None]]:
+    """Return the noise of the held-out camera's radiance ("streams") and ground truth ("truth"): PSNR in dB, ceilings.
+
+    Over the whole image ("whole_db"), the moving region ("moving_db") and the moving objects' pixels ("object_db"), at
+    pairs of times 1 ms apart; "correlation_moving" is the noise's correlation between them. "truth_against_paths" is
+    the same difference to renderings of whole paths, with all that maps of soft light change.
+    """
+    view = held_out_view(job)
+    camera = cameras_of(job)[view]
+    first = job.target_ticks[:: max(1, len(job.target_ticks) // _PAIRS)][:_PAIRS]
+    pairs = [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in job.target_ticks]
+    ticks = sorted({t for pair in pairs for t in pair})
+    alone = {"truth": True, "color": False, "whole_frames": True}
+    own = [renderer_of(job, [camera], seed=job.seed + seed, **alone) for seed in _SEEDS]
+    masks = {t: own[0].object_masks(t / RATE_HZ)[0] for t in ticks}
+    seen = {t: store.radiance(view, plan, t) for t in ticks}
+    light = {t: np.float32(job.light_at(t)) for t in ticks}
+    truths = {t: read_exr(scene / f"images/{Target(camera.id, t).name}.exr") / light[t] for t in ticks}
+    moving = {t: read_mask(mask_file(scene, Target(camera.id, t))) for t in ticks}
+    others = {t: [r.crn_frames(t / RATE_HZ)[0] for r in own] for t in ticks}
+    found = {
+        "streams": _noise(seen, others, moving, masks) | _correlation(seen, others, moving, pairs),
+        "truth": _noise(truths, others, moving, masks) | _correlation(truths, others, moving, pairs),
+    }
+    if job.profile.soft is not None:
+        spp = job.profile.target_spp
+        paths = [
+            MultiViewRenderer(
+                world_of(job), [camera], seed=job.seed + s, spp=spp, background_spp=spp, psf_px=job.physics.psf_px
+            )
+            for s in _SEEDS
+        ]
+        some = ticks[: 1 + len(ticks) // 2]
+        whole = {t: [r.crn_frames(t / RATE_HZ)[0] for r in paths] for t in some}
+        found["truth_against_paths"] = _noise({t: truths[t] for t in some}, whole, moving, masks)
+    return found
+
+
+Images = Mapping[int, NDArray[np.float32]]  # by tick, [H, W]
+Pairs = Mapping[int, Sequence[NDArray[np.float32]]]
+
+
+def _noise(
+    images: Images, others: Pairs, moving: Mapping[int, Any], masks: Mapping[int, Any]
+) -> dict[str, float | None]:
+    """Return the noise of images in dB, from two further renderings each; None where none is seen."""
+    found: dict[str, float | None] = {}
+    for name, regions in (("whole", None), ("moving", moving), ("object", masks)):
+        squares = []
+        for t, image in images.items():
+            i, a, b = (np.clip(x.astype(np.float64), 0, 1) for x in (image, *others[t]))
+            squares.append(((i - a) * (i - b))[regions[t] if regions else ...].ravel())
+        variance = float(np.concatenate(squares).mean()) if sum(map(len, squares)) else 0.0
+        found[f"{name}_db"] = round(-10 * float(np.log10(variance)), 3) if variance > 0 else None
+    return found
+
+
+def _correlation(
+    images: Images, others: Pairs, moving: Mapping[int, Any], pairs: Sequence[tuple[int, int]]
+) -> dict[str, float | None]:
+    """Return the correlation of the noise of pairs of images where both move."""
+    common = power = 0.0
+    for s, t in pairs:
+        both = moving[s] & moving[t]
+        (sa, sb), (ta, tb) = ([(images[k] - x)[both].astype(np.float64) for x in others[k]] for k in (s, t))
+        common += float(np.sum(sa * tb + sb * ta)) / 2  # of renderings with different random numbers
+        power += float(np.sum(sa * sb + ta * tb)) / 2
+    return {"correlation_moving": round(common / power, 4) if power > 0 else None}
 
 
 def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArray[np.bool_]) -> dict[str, float]:

@@ -57,7 +57,7 @@ class KeyStore:
     def static(self) -> StaticViews:
         """Return the static background. Raises UserError where the file is missing or damaged."""
         if self._loaded is None:
-            self._loaded = StaticViews.from_arrays(read_arrays(self._static_path, "background", "first"))
+            self._loaded = StaticViews.from_arrays(read_arrays(self._static_path))
         return self._loaded
 
     @property
@@ -208,10 +208,10 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """Read some arrays of such a file. Raises UserError where the file is missing or damaged."""
+    """Read some arrays of such a file, or all. Raises UserError where the file is missing or damaged."""
     try:
         with open(path, "rb") as f, np.load(f) as data:
-            return {name: data[name] for name in names}
+            return {name: data[name] for name in names or data.files}
     except FileNotFoundError:
         raise problem(path, "a key frame", "no such file", "run the same command again") from None
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as e:

@@ -59,6 +59,25 @@ class MitsubaScene:
         """Mitsuba's names of the shapes of `movers`."""
         return [f"moving_{name}" for name in self._batches]
 
+    def first_faces(self) -> dict[str, int]:
+        """Return the position in `moving_faces` of each moving shape's first face, by its name in `mover_ids`."""
+        counts = [len(batch.merged.faces) for batch in self._batches.values()]
+        return dict(zip(self.mover_ids, np.cumsum([0, *counts]).tolist(), strict=False))
+
+    @property
+    def moving_faces(self) -> np.ndarray:
+        """The faces [M, 3] int64 of all moving shapes, numbers of `moving_vertices`."""
+        meshes = [batch.merged for batch in self._batches.values()]
+        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        faces = [mesh.faces + start for mesh, start in zip(meshes, first, strict=False)]
+        return np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
+
+    def moving_vertices(self, t_s: float) -> np.ndarray:
+        """Return the vertices [V, 3] float32 of all moving shapes at a time."""
+        turns = self._turns(t_s)
+        positions = [batch.at(t_s, turns)[0].reshape(-1, 3) for batch in self._batches.values()]
+        return np.concatenate(positions) if positions else np.zeros((0, 3), np.float32)
+
     def hits(self, distance: np.ndarray, shape: np.ndarray, face: np.ndarray, uv: np.ndarray) -> Hits:
         """Return hits from the index in `mover_ids` of the shape that each ray meets (-1: none), and its face there."""
         numbers = np.full(len(shape), -1, np.int32)
@@ -71,8 +90,7 @@ class MitsubaScene:
         """Move the moving surfaces of `full` and `movers` to their positions at `t_s` seconds."""
         if t_s == self._time_s:
             return
-        poses = self._world.poses(t_s)
-        turns = np.array([poses[name][:3] for name in self._world.instances]).reshape(-1, 3, 4)
+        turns = self._turns(t_s)
         moved = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
         for parameters in self._parameters:
             for name, (positions, _) in moved.items():
@@ -84,6 +102,11 @@ class MitsubaScene:
                     parameters[f"{name}.vertex_normals"] = normals
             parameters.update()
         self._time_s = t_s
+
+    def _turns(self, t_s: float) -> np.ndarray:
+        """Return the poses [instances, 3, 4] at a time."""
+        poses = self._world.poses(t_s)
+        return np.array([poses[name][:3] for name in self._world.instances]).reshape(-1, 3, 4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ their noise from key to key, and a list of pixels traced alone equals the same p
 Traced pixels that see only the shadow of a moving surface get the background plus the *difference* of two such
 renderings: the low noise of the background remains, and there is no step at the edge of the traced region.
 
-This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area, after the optics'
-blur where there is one), or denoise.
+This module does not: blur motion (a key is an instant), filter (a pixel is the box mean of its area, after
+the optics' blur where there is one), or denoise; `split_render` has less noise.
 """
 
 from __future__ import annotations
@@ -41,29 +41,49 @@ MAX_DEPTH = 4  # camera, surface, two bounces
 
 
 @dataclass(frozen=True, eq=False)
+class SoftStatic:
+    """Soft light in the views without moving objects, float32; see `split_render`.
+
+    Attributes:
+        points, normals: [C, H, W, 3], the surface points at the centres of the pixels; normals are 0 without a surface.
+        first: [C, H, W, 6], soft light with the random numbers of keys: matte over the albedo, gloss.
+        smooth: the same, smoothed.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    first: np.ndarray
+    smooth: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class StaticViews:
     """The views without moving objects, linear RGB [C, H, W, 3] float32.
 
     Attributes:
         background: at full quality.
         first: the same with the random numbers, and therefore the noise, of keys.
+        soft: of a `split_render.SplitRenderer`.
     """
 
     background: np.ndarray
     first: np.ndarray
+    soft: SoftStatic | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays for a file or another process."""
-        return {"background": self.background, "first": self.first}
+        soft = {f"soft_{name}": array for name, array in vars(self.soft).items()} if self.soft else {}
+        return {"background": self.background, "first": self.first, **soft}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> StaticViews:
         """Return the views from the result of `arrays`."""
-        return StaticViews(arrays["background"], arrays["first"])
+        soft = {name.removeprefix("soft_"): a for name, a in arrays.items() if name.startswith("soft_")}
+        return StaticViews(arrays["background"], arrays["first"], SoftStatic(**soft) if soft else None)
 
     def views(self, chosen: Sequence[int]) -> StaticViews:
         """Return a selection of the views."""
-        return StaticViews(self.background[list(chosen)], self.first[list(chosen)])
+        return self.from_arrays({name: array[list(chosen)] for name, array in self.arrays().items()})
 
 
 class MultiViewRenderer(Visibility):
@@ -109,35 +129,34 @@ class MultiViewRenderer(Visibility):
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise problem("cameras", "one resolution for all", "several or none", "render them apart")
         scene = mitsuba_scene(world)
-        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed, psf_px))
+        super().__init__(world, cameras, scene)
+        self._tracer = self._make_tracer(seed, psf_px)
         self.spp, self.background_spp, self.color, self.whole_frames = spp, background_spp, color, whole_frames
         self._seed = seed
-        self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, self._anchor_s())
+        self._soft_light = SoftLight(self.shape, self._gray_at, super().traced, anchor_s(world, cameras, MOTION_PX))
         if static is not None:
             self.static = static
+
+    def _make_tracer(self, seed: int, psf_px: float) -> Any:
+        return make_tracer(self._scene, self.cameras, seed, psf_px)
 
     # ------------------------------------------------------------ images
 
     @cached_property
     def static(self) -> StaticViews:
         """The views without moving objects."""
-        first = self.background_sample(0)
+        return StaticViews(*(a.reshape(*self.shape, 3) for a in self.static_at(np.arange(int(np.prod(self.shape))))))
+
+    def static_at(self, pixels: np.ndarray, background: bool = True) -> tuple[np.ndarray, ...]:
+        """Return the parts `background` and `first` of `static` [K, 3] at flat pixels, or the latter alone."""
+        first = self._rgb_at(pixels, self.spp, 0, None)
+        if not background:
+            return (first,)
         total = first.astype(np.float64)
         parts = self.background_spp // self.spp
         for stream in range(1, parts):
-            total += self.background_sample(stream)
-        return StaticViews((total / parts).astype(np.float32), first)
-
-    def background_sample(self, stream: int) -> np.ndarray:
-        """Return the views without moving objects by `spp` samples, linear RGB [C, H, W, 3].
-
-        Stream 0 has the random numbers of keys; `static.background` is the mean of several.
-        """
-        return self._whole(self.spp, stream, None)
-
-    def static_pixels(self, where: np.ndarray) -> np.ndarray:
-        """Return the flat pixels `where` of `background_sample(0)`, [K, 3]."""
-        return self._rgb_at(where, self.spp, 0, None)
+            total += self._rgb_at(pixels, self.spp, stream, None)
+        return (total / parts).astype(np.float32), first
 
     @cached_property
     def background(self) -> np.ndarray:
@@ -257,10 +276,11 @@ class MultiViewRenderer(Visibility):
             arrays[f"{values_name}{v}"] = values[bounds[v] : bounds[v + 1]].astype(np.float32)
         return arrays
 
-    def _anchor_s(self) -> float:
-        """Return the time between the anchors of soft light."""
-        speed = max_image_speed(self.world, self.cameras, self.world.duration_s, samples=5)
-        return MOTION_PX / speed if speed > 0 else max(self.world.duration_s, 1e-3)
+
+def anchor_s(world: WorldScene, cameras: Sequence[Camera], motion_px: float) -> float:
+    """Return the time between anchors of soft light, in which no image point moves farther."""
+    speed = max_image_speed(world, cameras, world.duration_s, samples=5)
+    return motion_px / speed if speed > 0 else max(world.duration_s, 1e-3)
 
 
 def make_tracer(scene: Any, cameras: Sequence[Camera], seed: int, psf_px: float = 0.0) -> Any:

@@ -45,10 +45,12 @@ class _Snapshot(NamedTuple):
 class Visibility:
     """Geometry of all `cameras` (one resolution) at any time; arrays are [C, H, W]."""
 
-    def __init__(self, world: WorldScene, cameras: Sequence[Camera], scene: MitsubaScene, tracer: Any) -> None:
+    _tracer: Any  # set by the subclass
+
+    def __init__(self, world: WorldScene, cameras: Sequence[Camera], scene: MitsubaScene) -> None:
         self.world, self.cameras = world, tuple(cameras)
         self.shape = (len(cameras), cameras[0].height, cameras[0].width)
-        self._scene, self._tracer = scene, tracer
+        self._scene = scene
         self._last: tuple[float, _Snapshot] | None = None
 
     def object_masks(self, t_s: float) -> np.ndarray:

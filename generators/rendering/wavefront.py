@@ -18,7 +18,7 @@ from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
 
 _LENS_STEPS = 6  # of Newton's method: enough for float32 where a lens moves a pixel by a fifth of the image
 _QUANTILES = 4096  # of a blurred pixel's footprint: its variance is right to 1e-3
-_LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
+LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
 
 
 def footprint_quantiles(psf_px: float) -> np.ndarray:
@@ -130,13 +130,22 @@ class WavefrontTracer:
 
         A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
         """
-        per_launch = max(_LANES // spp, 1)
+        per_launch = max(LANES // spp, 1)
         parts = [
             self._launch(pixels[k : k + per_launch], spp, stream, moving) for k in range(0, len(pixels), per_launch)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
 
     def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
+        _, sampler, ray = self._camera_samples(pixels, spp, stream)
+        scene = self._scene.full if moving else self._scene.empty
+        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
+        return self._means(radiance, spp)
+
+    def _camera_samples(
+        self, pixels: np.ndarray, spp: int, stream: int | np.ndarray, centre: bool = False
+    ) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
+        """Return view [K spp], sampler and ray of each sample; `centre`: all rays through the middle of their pixel."""
         listed = mi.UInt32(np.ascontiguousarray(pixels, np.uint32))
         lane = dr.arange(mi.UInt32, len(pixels) * spp)
         shift = spp.bit_length() - 1
@@ -146,17 +155,25 @@ class WavefrontTracer:
         inside = pixel - view * area
         row = inside // self._width
         column = inside - row * self._width
-        salt = dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
+        salt = self._salt(stream, spp, lane >> shift)
         key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self._keys, view))) + salt)
         sampler = PixelSampler(key, index, spp)
-        offset = sampler.next_2d()
-        if self._footprint is not None:
+        offset = mi.Point2f(0.5) if centre else sampler.next_2d()
+        if self._footprint is not None and not centre:
             offset = mi.Point2f(self._blurred(offset.x), self._blurred(offset.y))
-        ray = self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
-        scene = self._scene.full if moving else self._scene.empty
-        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
-        dr.eval(radiance)  # the path kernel writes one colour per sample; the reductions below read it
-        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in radiance], 1) / np.float32(spp)
+        return view, sampler, self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
+
+    def _salt(self, stream: int | np.ndarray, spp: int, number: mi.UInt32) -> mi.UInt32:
+        """Return the salt of each sample; `number` is the position of its pixel in the list."""
+        if isinstance(stream, int):
+            return dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
+        salts = (self._seed * 0x2545F491 + stream.astype(np.uint64) * 0x9E3779B1 + spp) & 0xFFFFFFFF
+        return dr.gather(mi.UInt32, mi.UInt32(salts.astype(np.uint32)), number)
+
+    def _means(self, values: mi.Color3f, spp: int) -> np.ndarray:
+        """Return the means [K, 3] float32 of each pixel's samples."""
+        dr.eval(values)  # the path kernel writes one colour per sample; the reductions below read it
+        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in values], 1) / np.float32(spp)
 
     def _blurred(self, u: mi.Float) -> mi.Float:
         """Return the place in a blurred pixel, px from its left or upper edge, of numbers in [0, 1): one each way."""

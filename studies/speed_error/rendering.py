@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.images import gray
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, Job
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, Job, SoftSampling
 from spike4dgs.generators.render_tasks import (
     RenderKeys,
-    RenderStatic,
     StaticParts,
     cameras_of,
     held_out_view,
     plan_of,
+    render_static,
     world_of,
 )
 from spike4dgs.generators.rendering.image_motion import KeyPlan
@@ -110,8 +110,8 @@ def saved(job: Job) -> Series:
     for name, changed in settings(job).items():
         spp = changed.profile.spp
         if spp not in static:
-            task = RenderStatic(changed)
-            static[spp] = task.join(map(task, task.parts))
+            with tempfile.TemporaryDirectory() as folder:
+                static[spp] = render_static(changed, Path(folder))
         values = measure(changed, static[spp], ticks, truth, moving)
         points.append(Point(name, values, "chosen" if changed is job else ""))
     name = f"{job.world}, {p.width}x{p.height}, {job.seconds * 1e3:g} ms, {len(p.views)} view{'s' * (len(p.views) > 1)}"
@@ -223,3 +223,69 @@ def soft_light(request: Request) -> Iterator[Series]:
                 values[key] = float(100 * abs(off[where].mean()) / exact[where].mean()) if where.any() else None
             points.append(Point(name, values, role))  # type: ignore[arg-type]
         yield Series(f"{world}, {p.width}x{p.height}, {soft.mean():.0%} of the pixels softly lit", tuple(points))
+
+
+@measurement(
+    "split-light",
+    GROUP,
+    "Rendering: direct light and maps of soft light",
+    (
+        *TIMES,
+        Column("noise", "noise where it moves, dB"),
+        Column("object", "noise on moving objects, dB"),
+        Column("paths", "difference to whole paths where it moves, dB"),
+    ),
+    ("noise", "object"),
+    least="quick",
+)
+def split_light(request: Request) -> Iterator[Series]:
+    """Direct light is traced; light that comes over more surfaces or from the sky is looked up in a smoothed map.
+
+    Whole paths with 16 times the samples.
+
+    Nearly all the noise of a path is soft light, and that is smooth on every surface once it is divided by the albedo.
+    The time is that of a whole image, with the maps around it at hand.
+
+    tests/studies/speed_error/test_rendering.py
+    """
+    for world in OF_SIZE[request.size]:
+        yield split_series(_job(request, world), request.pick(1, 3, 5))
+
+
+def split_series(job: Job, repeats: int) -> Series:
+    """Return the time and the noise of each way to render an image of a job's held-out view."""
+    from spike4dgs.generators.rendering.split_render import SplitRenderer
+
+    t_s, view, world = (job.n_ticks // 2 + 0.25) / RATE_HZ, held_out_view(job), world_of(job)
+    camera, split = cameras_of(job)[view : view + 1], SPLIT_PROFILES[job.profile_name]
+    ways = {
+        f"paths, {job.profile.spp} samples": (job.profile.spp, None, ""),
+        f"paths, {16 * job.profile.spp} samples": (16 * job.profile.spp, None, "exact"),
+        f"maps, {split.spp} samples": (split.spp, split.soft, "chosen"),
+        f"maps, {split.target_spp} samples": (split.target_spp, split.target_soft, ""),
+    }
+
+    def image(spp: int, soft: SoftSampling | None, seed: int) -> Callable[[], NDArray[np.float32]]:
+        numbers = {"seed": job.seed + seed, "spp": spp, "background_spp": spp}
+        renderer = (
+            SplitRenderer(world, camera, soft=soft, **numbers) if soft else MultiViewRenderer(world, camera, **numbers)
+        )
+        return lambda: renderer.crn_frames(t_s)[0]
+
+    calls = [[image(spp, soft, seed) for seed in (2, 3)] for spp, soft, _ in ways.values()]
+    times = by_turns_ms([pair[0] for pair in calls], repeats)
+    images = [[call() for call in pair] for pair in calls]
+    geometry = MultiViewRenderer(world, camera, seed=0, spp=1, background_spp=1)
+    moving, on_object = geometry.traced(t_s)[0], geometry.object_masks(t_s)[0]
+    points = []
+    for (name, (_, _, role)), (a, b), (best, median) in zip(ways.items(), images, times, strict=True):
+        values = {"ms": best, "median_ms": median}
+        values |= {key: _decibels((a - b)[m] ** 2 / 2) for key, m in (("noise", moving), ("object", on_object))}
+        off = (a - images[1][0]) * (b - images[1][1])  # the noise of all four is independent
+        points.append(Point(name, {**values, "paths": None if role == "exact" else _decibels(off[moving])}, role))
+    return Series(f"{job.world}, {job.profile.width}x{job.profile.height}, {moving.mean():.0%} moving", tuple(points))
+
+
+def _decibels(squares: NDArray[Any]) -> float | None:
+    mean = float(np.mean(squares, dtype=np.float64))
+    return -10 * float(np.log10(mean)) if mean > 0 else None

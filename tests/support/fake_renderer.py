@@ -42,11 +42,9 @@ class FakeRenderer:
         ]
         self.static = static or StaticViews(*np.repeat(np.stack(noise)[None, ..., None], 2, 0).repeat(3, -1))
 
-    def background_sample(self, stream):
-        return self.static.background
-
-    def static_pixels(self, where):
-        return self.static.background.reshape(-1, 3)[where]
+    def static_at(self, pixels, background=True):
+        image = self.static.background.reshape(-1, 3)[pixels]
+        return (image, image) if background else (image,)
 
     def object_masks(self, t_s):
         x = np.arange(self.shape[2]) - 10 - 5000 * t_s

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.studies.kit.measurement import Request
-from spike4dgs.studies.speed_error.rendering import soft_light
+from spike4dgs.studies.speed_error.rendering import soft_light, split_light
 
 
 @pytest.mark.slow
@@ -13,3 +14,16 @@ def test_light_as_a_ratio_is_nearer_to_the_traced_light_than_none() -> None:
         exact, chosen, without = series.points
         assert [p.role for p in series.points] == ["exact", "chosen", ""] and exact.values["all"] == 0
         assert chosen.values["soft"] < without.values["soft"], series.name
+
+
+@pytest.mark.slow
+def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light() -> None:
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("maps need a variant that compiles kernels")
+    request = Request("quick", 0, "cpu", lambda: pytest.fail("no scene is needed"))
+    for series in split_light.run(request):
+        paths, exact, maps, truth = series.points
+        assert [p.role for p in series.points] == ["", "exact", "chosen", ""] and exact.values["paths"] is None
+        for key in ("noise", "object"):
+            assert paths.values[key] + 6 < maps.values[key] < truth.values[key], series.name
+        assert min(maps.values["paths"], truth.values["paths"]) > 36

@@ -1,0 +1,172 @@
+"""The paths of `wavefront` in two parts: direct light, and soft light from other surfaces and from the sky.
+
+Radiance at a surface point is the sum of
+
+- *direct* light: what the point emits, and the sampled lamps' light by next event. Two rays, and nearly free of noise;
+- *soft* light: the paths that continue from samples of the matte lobe and of a coat's gloss. They hold nearly all of
+  the noise and of the time, and what they give is smooth on every surface, matte light once it is divided by the
+  albedo. It comes from a `SoftMap`, which the caller fills for some times and smooths. Samples that find no like
+  surface there trace one path, and so do those on metal, whose reflections are sharp and strong.
+
+Lamps count once: soft light of maps leaves out lamps that `direct` samples; on metal both have weights (multiple
+importance sampling, squared densities). But for `most_light`, the sum equals `WavefrontTracer.trace` in the mean; tests
+compare both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
+from spike4dgs.generators.rendering.soft_map import LEAST_WEIGHT, SoftMap, SoftMaps, SoftPoints
+from spike4dgs.generators.rendering.wavefront import LANES, WavefrontTracer
+
+_LEAST_ALBEDO = 1e-3
+# Radiance of a soft path, at most: some four times that of white paper in the sun. Rarely a path finds a caustic, the
+# sun in somebody's varnish, which is twenty times as bright; smoothed, it would be a spot of several pixels.
+_MOST_LIGHT = 4.0
+Streams = int | np.ndarray  # of all pixels, or of each [K]
+
+
+class SplitTracer(WavefrontTracer):
+    """Traces both parts; a pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone."""
+
+    def __init__(
+        self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int, psf_px: float = 0.0
+    ) -> None:
+        super().__init__(scene, cameras, seed, max_depth, psf_px)
+        self._rest = mi.load_dict({"type": "path", "max_depth": max_depth - 1})
+        self._has_lamp = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.empty.emitters())
+        self._all, self._matte, self._glossy = mi.BSDFContext(), mi.BSDFContext(), mi.BSDFContext()
+        self._matte.type_mask, self._glossy.type_mask = mi.BSDFFlags.Diffuse, mi.BSDFFlags.Glossy
+        self._maps = SoftMaps(scene, cameras)
+        self.most_light = _MOST_LIGHT
+
+    # ------------------------------------------------------------ the parts
+
+    def split(
+        self, pixels: np.ndarray, spp: int, stream: Streams, moving: bool, maps: Sequence[tuple[float, SoftMap]]
+    ) -> np.ndarray:
+        """Return the linear RGB radiance [K, 3] float32, with soft light of `maps` (weight, map), blended."""
+        parts = [np.zeros((0, 3), np.float32)]
+        for some, streams in self._launches(pixels, spp, stream):
+            view, sampler, ray = self._camera_samples(some, spp, streams)
+            parts.append(self._means(self._radiance(view, sampler, ray, moving, maps), spp))
+        return np.concatenate(parts)
+
+    def soft(self, pixels: np.ndarray, spp: int, gloss_spp: int, stream: Streams, moving: bool) -> SoftPoints:
+        """Return the surface points that the centres of `pixels` see, and their soft light: the means of paths."""
+        parts = [SoftPoints(*(np.zeros((0, 3), np.float32) for _ in range(4)))]
+        for some, streams in self._launches(pixels, spp, stream):
+            points, normals, matte, shiny = self._soft(some, spp, streams, moving, gloss=False)
+            gloss, which = np.zeros_like(matte), np.flatnonzero(shiny)
+            if len(which):
+                own = streams if isinstance(streams, int) else streams[which]
+                gloss[which] = self._soft(some[which], gloss_spp, own, moving, gloss=True)[2]
+            parts.append(SoftPoints(points, normals, matte, gloss))
+        return SoftPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    # ------------------------------------------------------------ internals
+
+    def _launches(self, pixels: np.ndarray, spp: int, stream: Streams) -> Iterator[tuple[np.ndarray, Streams]]:
+        per_launch = max(LANES // spp, 1)
+        for k in range(0, len(pixels), per_launch):
+            yield pixels[k : k + per_launch], stream if isinstance(stream, int) else stream[k : k + per_launch]
+
+    def _soft(
+        self, pixels: np.ndarray, spp: int, stream: Streams, moving: bool, *, gloss: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return points, normals, soft light of one lobe [K, 3] each, and which have a coat [K]."""
+        _, sampler, ray = self._camera_samples(pixels, spp, stream, centre=True)
+        scene = self._scene.full if moving else self._scene.empty
+        si = scene.ray_intersect(ray)
+        bsdf = si.bsdf(ray)
+        matte, coated, _ = _lobes(si, bsdf)
+        if gloss:
+            light = self._scattered(scene, si, bsdf, self._glossy, sampler, coated)
+        else:
+            light = self._scattered(scene, si, bsdf, self._matte, sampler, matte)
+            light /= dr.maximum(bsdf.eval_diffuse_reflectance(si, matte), _LEAST_ALBEDO)
+        first = dr.arange(mi.UInt32, len(pixels)) * spp  # all samples of a pixel see one point
+        points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
+        shiny = dr.select(coated, mi.UInt32(1), 0)
+        dr.eval(points, normals, shiny, light)
+        found = [np.array(dr.gather(type(a), a, first)) for a in (points, normals, shiny)]
+        return (*(np.asarray(a, np.float32).T for a in found[:2]), self._means(light, spp), found[2] > 0)
+
+    def _radiance(
+        self,
+        view: mi.UInt32,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        moving: bool,
+        maps: Sequence[tuple[float, SoftMap]],
+    ) -> mi.Color3f:
+        """Return the radiance of each sample."""
+        scene = self._scene.full if moving else self._scene.empty
+        hit = scene.ray_intersect_preliminary(ray)
+        si = hit.compute_surface_interaction(ray)
+        bsdf = si.bsdf(ray)
+        matte, coated, metal = _lobes(si, bsdf)
+        light = si.emitter(scene).eval(si) + self._sampled_light(scene, si, bsdf, metal, sampler)
+        places = [self._maps.place(view, si, hit, share, known, moving, matte) for share, known in maps]
+        on_albedo, gloss, weight = self._maps.looked_up(view, places, matte)
+        known_here = matte & (weight > LEAST_WEIGHT)
+        albedo = bsdf.eval_diffuse_reflectance(si, matte)
+        light += dr.select(known_here, (albedo * on_albedo + dr.select(coated, gloss, 0)) / weight, 0)
+        traced = si.is_valid() & ~known_here
+        return light + self._scattered(scene, si, bsdf, self._all, sampler, traced, metal)
+
+    def _sampled_light(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, metal: mi.Bool, sampler: mi.Sampler
+    ) -> mi.Color3f:
+        """Return the light of sampled lamps that a surface reflects; on metal its share of it."""
+        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, si.is_valid())
+        lit = si.is_valid() & (ds.pdf != 0)
+        value, density = bsdf.eval_pdf(self._all, si, si.to_local(ds.d), lit)
+        share = dr.select(ds.delta | ~metal, 1, _balance(ds.pdf, density))
+        return dr.select(lit, value * share * weight, 0)
+
+    def _scattered(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        lobe: mi.BSDFContext,
+        sampler: mi.Sampler,
+        active: mi.Bool,
+        metal: mi.Bool | None = None,
+    ) -> mi.Color3f:
+        """Return the light of the path that continues from one sample of a lobe, without what `direct` has of lamps."""
+        bs, weight = bsdf.sample(lobe, si, sampler.next_1d(), sampler.next_2d(), active)
+        active = active & (bs.pdf > 0)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        light, _, _ = self._rest.sample(scene, sampler, mi.RayDifferential3f(ray), None, active)
+        if self._has_lamp:
+            met = scene.ray_intersect(ray, active)
+            emitter = met.emitter(scene)
+            lamp = active & met.is_valid() & (emitter != None)  # noqa: E711 (an array of pointers)
+            kept = mi.Float(0)
+            if metal is not None:
+                ds = mi.DirectionSample3f(scene, met, si)
+                kept = dr.select(metal, _balance(bs.pdf, scene.pdf_emitter_direction(si, ds, lamp & metal)), 0)
+            light -= dr.select(lamp, emitter.eval(met, lamp) * (1 - kept), 0)
+        return dr.select(active, weight * dr.minimum(light, self.most_light), 0)
+
+
+def _lobes(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool, mi.Bool]:
+    """Return which surfaces are matte, which of these have a glossy coat, and which are metal."""
+    matte = si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+    glossy = si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+    return matte, matte & glossy, ~matte & glossy
+
+
+def _balance(own: mi.Float, other: mi.Float) -> mi.Float:
+    """Return the weight of a sample by multiple importance sampling with squared densities."""
+    own, other = own * own, other * other
+    return dr.select(own > 0, own / (own + other), 0)

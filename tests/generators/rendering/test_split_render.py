@@ -1,0 +1,98 @@
+"""Key frames of split light: the same light as whole paths, with less noise that no pixel keeps."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.scene.images import gray
+from spike4dgs.generators.profiles import SPLIT_PROFILES
+from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
+from spike4dgs.generators.rendering.split_render import SplitRenderer
+from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.worlds import WORLDS, WorldScene
+
+WIDTH, HEIGHT, SPP, T_S = 64, 40, 32, 0.0113
+SOFT = SPLIT_PROFILES["tiny"].soft
+
+
+def renderer(world: WorldScene, views: tuple[int, ...] = (1, 4), seed: int = 0, **others) -> SplitRenderer:
+    rig = cameras(world, WIDTH, HEIGHT, views)
+    return SplitRenderer(world, rig, seed=seed, spp=SPP, background_spp=2 * SPP, **{"soft": SOFT, **others})
+
+
+# the sun, coats and chrome; a lamp, coats and brass
+@pytest.fixture(scope="module", params=[pytest.param("motor", marks=pytest.mark.slow), "turntable"])
+def r(request) -> Iterator[SplitRenderer]:
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("split light needs a variant that compiles kernels")
+    yield renderer(WORLDS[request.param].build(0, 10, 0.02))
+    gc.collect()
+
+
+def radiances(r: SplitRenderer, where: np.ndarray, spp: int, streams: range, maps: bool | None) -> np.ndarray:
+    """Return renderings [streams, K]: whole paths (maps None), split without maps, or with them."""
+    found = []
+    known = r._maps_at(T_S) if maps else []
+    r._scene.set_time(T_S)
+    for stream in streams:
+        if maps is None:
+            found.append(gray(r._tracer.trace(where, spp, stream, True)))
+        else:
+            found.append(gray(r._tracer.split(where, spp, stream, True, known)))
+    return np.stack(found).astype(np.float64)
+
+
+def test_parts_are_the_path_in_the_mean(r, monkeypatch):
+    """Without maps every sample traces its own soft path: an unbiased twin of `trace`."""
+    where = np.flatnonzero(r.traced(T_S))
+    monkeypatch.setattr(r._tracer, "most_light", 1e30)
+    whole, parts = (radiances(r, where, 64, streams, maps) for streams, maps in ((range(8), None), (range(8), False)))
+    difference = parts.mean(0) - whole.mean(0)
+    error = np.sqrt(np.mean(parts.var(0) + whole.var(0)) / 7 / len(where))
+    assert abs(difference.mean()) < 4 * error + 1e-4
+    blocks = difference[: len(where) // 16 * 16].reshape(-1, 16).mean(1)
+    assert np.abs(blocks).mean() < 0.01 * whole.mean(), "nowhere is a light left out or counted twice"
+
+
+def test_maps_take_the_noise_and_leave_the_light(r):
+    where = np.flatnonzero(r.object_masks(T_S))
+    paths, split = (radiances(r, where, SPP, range(4), maps) for maps in (None, True))
+    exact = radiances(r, where, 256, range(10, 14), None)
+    assert split.var(0).mean() < 0.4 * paths.var(0).mean()  # chrome is traced
+    assert np.median(split.var(0)) < 0.25 * np.median(paths.var(0))
+    a, b = exact[::2].mean(0), exact[1::2].mean(0)
+    square = np.mean((split.mean(0) - a) * (split.mean(0) - b))  # the references' noise is independent
+    assert square < 0.011**2, "39 dB where a pixel is as wide as a wheel"
+    assert abs(np.mean(split.mean(0) - (a + b) / 2)) < 0.01 * exact.mean()
+
+
+def test_noise_is_new_at_each_key_where_objects_move_and_none_elsewhere(r):
+    other = renderer(r.world, seed=5)
+    times = (T_S, T_S + 1e-3)
+    inside = r.object_masks(times[0]) & r.object_masks(times[1])
+    first, second = ((r.keys(t) - other.keys(t)).astype(np.float64)[inside] for t in times)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.25
+    assert np.array_equal(r.keys(T_S)[~r.changed(T_S)], r.background[~r.changed(T_S)])
+
+
+def test_a_key_depends_on_the_seed_and_the_time_alone(r):
+    r.keys(0.001)  # earlier renderings have no influence
+    again = renderer(r.world, static=r.static)  # as another process has it
+    plan = KeyPlan(400, 20_000, 0.25, (20, 10))
+    arrays, others = (k.key_arrays(210, plan) for k in (again, r))
+    assert arrays.keys() == others.keys() and all(np.array_equal(arrays[k], others[k]) for k in arrays)
+    assert not np.array_equal(renderer(r.world, seed=1).key_arrays(210, plan)["values1"], arrays["values1"])
+
+
+def test_background_and_truth_of_a_view_do_not_depend_on_other_views(r):
+    exact = replace(SOFT, anchor_px=0.0)
+    alone, together = (renderer(r.world, views, soft=exact) for views in ((4,), (1, 4)))
+    mask = alone.object_masks(T_S)[0]
+    assert alone.background[0].tobytes() == together.background[1].tobytes()
+    assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
