@@ -68,29 +68,33 @@ def _spinning(rng: np.random.Generator, path: Path) -> Path:
 def texture(size: int, rng: np.random.Generator) -> np.ndarray:
     """Return a random image [size, size, 3] of reflectance."""
     shape = (size, size)
-    a, b = rng.uniform(0.03, 0.85, (2, 3))
+    a, b = rng.uniform(0.03, 0.85, (2, 3)).tolist()
     kind = int(rng.integers(6))
     if kind == 0:
         return mix(fractal(shape, rng, size / rng.uniform(2, 16), 2, rng.uniform(0.5, 0.9)), a, b)
     if kind == 1:
         stone = rng.integers(size // 32 + 2, size // 4, 2)
         return paving(
-            shape, rng, (int(stone[0]), int(stone[1])), a, b, rng.uniform(0.02, 0.7, 3), rng.uniform(0.1, 0.4)
+            shape, rng, (int(stone[0]), int(stone[1])), a, b, rng.uniform(0.02, 0.7, 3).tolist(), rng.uniform(0.1, 0.4)
         )
     if kind == 2:
-        return cloth(shape, rng, [a, b, rng.uniform(0.03, 0.85, 3)], int(rng.integers(size // 40 + 2, size // 5)))
+        return cloth(
+            shape, rng, [a, b, rng.uniform(0.03, 0.85, 3).tolist()], int(rng.integers(size // 40 + 2, size // 5))
+        )
     if kind == 3:
         return wood(shape, rng, int(rng.integers(2, 9)))
     if kind == 4:
         spots = fractal(shape, rng, size / rng.uniform(6, 30), 2, 0.4) > rng.uniform(0.35, 0.65)
         return mix(spots.astype(np.float32), a, b) * (0.85 + 0.3 * fractal(shape, rng, 16, 1))[..., None]
-    return _drawing(mix(fractal(shape, rng, size / 3, 4), a, 0.7 * a + 0.3 * b), size, rng)
+    return _drawing(
+        mix(fractal(shape, rng, size / 3, 4), a, [0.7 * x + 0.3 * y for x, y in zip(a, b, strict=True)]), size, rng
+    )
 
 
 def _drawing(paper: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
     canvas = Canvas(paper, size)
     for _ in range(int(rng.integers(6, 30))):
-        colour, (x, y) = rng.uniform(0.02, 0.9, 3), rng.uniform(0, 1, 2)
+        colour, (x, y) = rng.uniform(0.02, 0.9, 3).tolist(), rng.uniform(0, 1, 2).tolist()
         kind, reach = int(rng.integers(3)), rng.uniform(0.03, 0.2)
         if kind == 0:
             angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 7))))
@@ -104,20 +108,20 @@ def _drawing(paper: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarr
 
 def _shape(rng: np.random.Generator) -> Mesh:
     """Return a random body about its origin, of largest extent about 1; texture coordinates in 0..1."""
-    kind, sizes = int(rng.integers(6)), rng.uniform(0.25, 1.0, 3)
+    kind, sizes = int(rng.integers(6)), rng.uniform(0.25, 1.0, 3).tolist()
     if kind == 0:
         return box(sizes)
     if kind == 1:
-        return ellipsoid(sizes / 2, segments=20)
+        return ellipsoid([x / 2 for x in sizes], segments=20)
     if kind == 2:  # a card
         return quad((0, 0, 0), (sizes[0], 0, 0), (0, 0, sizes[1]))
     if kind == 3:  # a vase
         heights = np.linspace(-0.5, 0.5, 9)
         return revolve(np.stack([np.maximum(rng.uniform(0.1, 0.5, 9), 0.12), heights], 1), 20)
     if kind == 4:  # a bent rod
-        return tube(np.cumsum(rng.normal(0, 0.25, (6, 3)), axis=0), rng.uniform(0.04, 0.15), 10)
+        return tube(np.cumsum(rng.normal(0, 0.25, (6, 3)), axis=0).tolist(), rng.uniform(0.04, 0.15), 10)
     turned = rotation("x", rng.uniform(0, 3)) @ rotation("z", rng.uniform(0, 3))
-    return merge([box(sizes), box(rng.uniform(0.2, 0.8, 3)).moved(turned)])
+    return merge([box(sizes), box(rng.uniform(0.2, 0.8, 3).tolist()).moved(turned)])
 
 
 def _pictured(mesh: Mesh, cell: int) -> Mesh:

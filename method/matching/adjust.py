@@ -143,7 +143,7 @@ def depths(array: Array, tracks: Tracks, weights: Float64) -> Float64:
 
 
 def _per_track(tracks: Tracks, values: Float64) -> Float64:
-    return np.bincount(tracks.track, weights=values, minlength=len(tracks.anchor))
+    return np.asarray(np.bincount(tracks.track, weights=values, minlength=len(tracks.anchor)), np.float64)
 
 
 def _positive(x: Float64) -> Float64:

@@ -120,7 +120,8 @@ def mutual(logs: Tensor, least: float) -> tuple[Tensor, Tensor]:
 
 
 def _refined(network: Matcher, features: Features, pair: tuple[int, int], a: Tensor, b: Tensor) -> PairMatches:
-    points = points_of_cells(*features.coarse.shape[2:], device=features.coarse.device)
+    rows, columns = features.coarse.shape[2:]
+    points = points_of_cells(rows, columns, device=features.coarse.device)
     at, near = points[a], middle_of_cell(points[b])
     views = torch.full_like(a, pair[0]), torch.full_like(a, pair[1])
     refined = network.refined(features.fine, features.fine, at, near, views)

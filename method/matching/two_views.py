@@ -48,7 +48,8 @@ def relative_pose(a: Float64, b: Float64, focal: float, reach_px: float) -> Rela
     if E is None or E.shape != (3, 3):
         return None
     inliers, R, t, *_ = cv2.recoverPose(E, a, b, K, distanceThresh=_FARTHEST, mask=mask)
-    return Relative(R, t[:, 0], int(inliers)) if inliers >= LEAST_MATCHES else None
+    turn, way = (np.asarray(x, np.float64) for x in (R, t[:, 0]))
+    return Relative(turn, way, int(inliers)) if inliers >= LEAST_MATCHES else None
 
 
 def relative_poses(matches: Matches, K: Float64, reach_px: float) -> dict[tuple[int, int], Relative]:

@@ -56,9 +56,10 @@ class MatchTraining:
         """Train for one step and return its losses."""
         batch = draw(self.files, self.settings, np.random.default_rng([self.seed, self.step]))
         live = self.networks["live"]
+        assert isinstance(live, Matcher)
         generator = seeded(self.seed, self.step)
         features = live.extractor(batch.inputs)
-        losses = match_losses(live, features, batch.views, batch.pairs, self.settings.jitter, generator)  # type: ignore[arg-type]
+        losses = match_losses(live, features, batch.views, batch.pairs, self.settings.jitter, generator)
         self.adam.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(live.parameters(), 1.0)
