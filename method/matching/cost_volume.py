@@ -2,7 +2,7 @@
 
 Each cell of a reference view is taken to every inverse depth w and seen by every other view; its score there is the
 mean cosine between its fine feature and theirs, from the matching network. The best plane, refined by a parabola, gives
-the depth; the share of the softmax around it is the confidence.
+the depth, and its score the confidence.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ from torch.nn import functional
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.method.matching.adjust import Array
 from spike4dgs.method.matching.network import FINE
-
-_SHARPNESS = 2.0  # of the softmax over planes, per standard deviation of a cell's scores
-_AROUND = 1  # planes to each side of the best that count for the confidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +72,6 @@ def _best(scores: Float32, planes: Float64, size: tuple[int, int]) -> CellDepths
     curvature = left - 2 * middle + right
     shift = np.where(curvature < -1e-9, 0.5 * (left - right) / np.minimum(curvature, -1e-9), 0.0).clip(-0.5, 0.5)
     place = np.where(inner == best, inner + shift, best)
-    spread = np.maximum(filled.std(axis=0), 1e-9)
-    weights = np.exp(np.minimum(_SHARPNESS * (filled - filled.max(axis=0)) / spread, 0))
-    near = np.abs(np.arange(len(planes))[:, None] - best) <= _AROUND
-    confidence = np.where(seen, (weights * near).sum(axis=0) / weights.sum(axis=0), 0)
+    confidence = np.where(seen, filled.max(axis=0).clip(0, 1), 0)
     inverse = planes[0] + place * (planes[1] - planes[0])
     return CellDepths(inverse.reshape(size).astype(np.float32), confidence.reshape(size).astype(np.float32))
