@@ -29,7 +29,7 @@ _COARSE_ERROR_PX = 1.0  # expected of a match that could not be aligned, at leas
 # Sides of the windows that are aligned. A point takes the smallest in which noise leaves less than `_ALIGN_NOISE_PX`:
 # in a larger one the views' perspectives differ, and the error is the same for all points around.
 _ALIGN_PX = (7, 11, 21)
-_ALIGN_NOISE_PX = 0.2
+_ALIGN_NOISE_PX = 0.5
 _ALIGN_BLUR_PX = 0.7
 _ALIGN_REACH_PX = 4.0  # from the network's match: beyond it the alignment has lost its way
 _ALIGN_FLOOR_PX = 0.2  # error that is expected of the best alignment
@@ -49,8 +49,7 @@ def learned_matches(network: Matcher, inputs: Float32) -> Matches:
         a, b = mutual(logs, LEAST_PROBABILITY)
         found[i, j] = _refined(network, features, (i, j), a, b)
         found[j, i] = _refined(network, features, (j, i), b, a)
-    images = [cv2.GaussianBlur(view[0], (0, 0), _ALIGN_BLUR_PX) for view in inputs]
-    return {(i, j): aligned(images[i], images[j], m) for (i, j), m in found.items()}
+    return {(i, j): aligned(inputs[i, 0], inputs[j, 0], m) for (i, j), m in found.items()}
 
 
 def aligned(first: Float32, second: Float32, matches: PairMatches) -> PairMatches:
@@ -61,9 +60,10 @@ def aligned(first: Float32, second: Float32, matches: PairMatches) -> PairMatche
     if not len(matches.point):
         return matches
     at, near = ((x - 0.5).astype(np.float32) for x in (matches.at, matches.uv))  # OpenCV: pixel centres at 0
-    a, b = _gray(first), _gray(second)
+    blurred = [cv2.GaussianBlur(image, (0, 0), _ALIGN_BLUR_PX) for image in (first, second)]
+    a, b = (_gray(np.asarray(image, np.float32)) for image in blurred)
     there, back = near.copy(), np.full_like(at, np.inf)
-    noise = np.stack([_noise_px(first, at, side) for side in _ALIGN_PX])  # [windows, M]
+    noise = _noise(first) * np.stack([_error_of_noise(blurred[0], at, side) for side in _ALIGN_PX])  # [windows, M]
     fine = noise < _ALIGN_NOISE_PX
     choice = np.where(fine.any(axis=0), fine.argmax(axis=0), len(_ALIGN_PX) - 1)
     found = np.zeros(len(at), bool)
@@ -81,18 +81,21 @@ def aligned(first: Float32, second: Float32, matches: PairMatches) -> PairMatche
     return replace(matches, uv=uv, error=np.where(good, np.clip(error, _LEAST_ERROR, _MOST_ERROR), kept))
 
 
-def _noise_px(image: Float32, at: Float32, side: int) -> Float32:
-    """Return the errors [M] that noise leaves in an alignment of windows of `side` px, along their worst direction.
-
-    It is the noise of two images over the root of the window's least sum of squared slopes. The noise is Immerkaer's
-    estimate (1996), from an operator that no plane and no straight edge passes.
-    """
+def _noise(image: Float32) -> float:
+    """Return Immerkaer's estimate (1996) of the noise, by an operator that no plane and no straight edge passes."""
     operator = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-    noise = math.sqrt(math.pi / 2) / 6 * float(np.abs(cv2.filter2D(image, cv2.CV_32F, operator)).mean())
+    return math.sqrt(math.pi / 2) / 6 * float(np.abs(cv2.filter2D(image, cv2.CV_32F, operator)).mean())
+
+
+def _error_of_noise(image: cv2.typing.MatLike, at: Float32, side: int) -> Float32:
+    """Return the errors [M] px that noise of 1 leaves in an alignment of windows of `side` px.
+
+    It is the noise of two images over the root of the window's least sum of squared slopes: along the worst direction.
+    """
     slopes = cv2.cornerMinEigenVal(image, side, ksize=3) * (side / 2) ** 2  # OpenCV scales by 4 / side^2
     column, row = np.rint(at).astype(np.int64).T
     least = slopes[row.clip(0, len(image) - 1), column.clip(0, image.shape[1] - 1)]
-    return np.asarray(math.sqrt(2) * noise / np.sqrt(np.maximum(least, 1e-9)), np.float32)
+    return np.asarray(math.sqrt(2) / np.sqrt(np.maximum(least, 1e-9)), np.float32)
 
 
 def _flow(first: UInt8, second: UInt8, at: Float32, near: Float32, side: int) -> tuple[Float32, Mask]:
