@@ -29,7 +29,7 @@ _COARSE_ERROR_PX = 1.0  # expected of a match that could not be aligned, at leas
 # Sides of the windows that are aligned. A point takes the smallest in which noise leaves less than `_ALIGN_NOISE_PX`:
 # in a larger one the views' perspectives differ, and the error is the same for all points around.
 _ALIGN_PX = (7, 11, 21)
-_ALIGN_NOISE_PX = 0.5
+_ALIGN_NOISE_PX = 0.8
 _ALIGN_BLUR_PX = 0.7
 _ALIGN_REACH_PX = 4.0  # from the network's match: beyond it the alignment has lost its way
 _ALIGN_FLOOR_PX = 0.2  # error that is expected of the best alignment
