@@ -41,7 +41,7 @@ def methods(name: Positional[str | None] = None) -> int:
         if found.package != package:
             package = found.package
             table.add_row(Text(package, style="italic"))
-        table.add_row(Text(f" {shown}"), *(_part(found.value, part) for part in _PARTS))
+        table.add_row(Text(shown), *(_part(found.value, part) for part in _PARTS))
     console.print(table)
     console.print("`spike4dgs methods NAME` describes one and lists its settings", markup=False)
     return 0

@@ -46,9 +46,11 @@ _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt
 
 def check_folder(leaderboard: Path) -> None:
     """Raise UserError unless a folder is a leaderboard, or new, or empty; an empty path is the working folder."""
-    if any((leaderboard / name).exists() for name in (*FOLDERS, BOARD)):
+    # Listed once: another submitter may be making the leaderboard, and writes the ledger first.
+    names = {path.name for path in leaderboard.iterdir()} if leaderboard.is_dir() else set()
+    if names & {*FOLDERS, BOARD, LEDGER}:
         return
-    empty = not leaderboard.exists() or leaderboard.is_dir() and all(p.name[0] == "." for p in leaderboard.iterdir())
+    empty = all(name.startswith(".") for name in names) and (leaderboard.is_dir() or not leaderboard.exists())
     if leaderboard == Path() or not empty:
         found = "the working folder" if leaderboard == Path() else "something else"
         raise problem("--leaderboard", f"a leaderboard or a new folder at {leaderboard}", found, "name another folder")

@@ -13,7 +13,7 @@ import builtins, importlib, io, os, pathlib, sys
 system = sys.argv[1]
 # Libraries look at the system while they load; ours are loaded after it has changed.
 import distributed, drjit, fsspec, jsonschema, matplotlib.pyplot, mitsuba, mujoco, numba, psutil, pycolmap, rich.console
-import safetensors.torch, scipy.optimize, scipy.spatial, skimage.metrics, torch, tyro, usb.core, yaml, filelock
+import safetensors.torch, scipy.optimize, scipy.spatial, skimage.metrics, torch, tyro, usb.core, usb1, yaml, filelock
 import concurrent.futures.process, multiprocessing.popen_fork, multiprocessing.popen_spawn_posix, platformdirs
 import numba.cuda.nvvmutils
 
@@ -46,7 +46,7 @@ for room in ("benchmark", "method", "baselines", "generators", "leaderboard", "s
     for path in sorted((root / room).rglob("*.py")):
         name = ".".join(("spike4dgs", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
         # Mitsuba's variant comes first there; `__main__` runs.
-        if not name.endswith(("rendering.wavefront", "__main__")):
+        if not name.endswith(("rendering.wavefront", "rendering.soft_map", "rendering.split_tracer", "__main__")):
             importlib.import_module(name)
 
 import numpy as np

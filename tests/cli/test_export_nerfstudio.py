@@ -172,7 +172,7 @@ def test_cameras_that_do_not_fit_the_layout_are_refused(
     [
         (
             {"images": "video"},
-            "--images: expected one of tfp, tfi, tfstp, spk2img, adaptive, intervals, msdi, found 'video'",
+            f"--images: expected one of {', '.join(IMAGES)}, found 'video'",
         ),
         ({"every": 1}, "--every: expected 2 ticks or more, found 1"),
         ({"split": "left"}, "expected a split among center, found 'left'"),

@@ -143,6 +143,16 @@ def test_a_ledger_line_without_its_entry_is_what_a_kill_leaves(done: Path, monke
     assert read(entry_of(done, "tfp+4dgs"))["record"] == entry["record"]
 
 
+def test_a_ledger_alone_is_a_leaderboard_that_was_being_made(done: Path, tmp_path: Path) -> None:
+    (tmp_path / "board").mkdir()
+    (tmp_path / "board/LEDGER").write_text("")
+    assert submit(done / "out/results/rough.json", leaderboard=tmp_path / "board") == 0
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").write_text("")
+    with pytest.raises(UserError, match="expected a leaderboard or a new folder"):
+        submit(done / "out/results/rough.json", leaderboard=tmp_path / "other")
+
+
 @pytest.mark.slow
 def test_submitters_at_once_and_killed_lose_nothing(done: Path, tmp_path: Path) -> None:
     results = make_results(done / "out/results/rough.json", tmp_path / "results", 8)

@@ -21,6 +21,7 @@ from splat_scenes import HARD, HEIGHT, WIDTH, random_splats, views
 
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.cuda.background import make_layer, render_over
+from spike4dgs.method.splat.types import CUSTOMARY
 
 SCALE = 0.22  # of the image: 22 x 15 pixels are two tiles
 
@@ -77,7 +78,7 @@ def behind_and_over() -> None:
             one = Views(v.w2c[[1]], v.K[[1]], v.width, v.height)
             out = render(Splats(*(torch.cat(p) for p in pairs)), one, backend="cuda")
         else:
-            out = render_over(make_layer(behind, v), Splats(*leaves), [1])
+            out = render_over(make_layer(behind, v, CUSTOMARY), Splats(*leaves), [1])
         g = torch.Generator().manual_seed(1)
         (out.image * torch.randn(out.image.shape, generator=g)).sum().backward()
         assert out.means2d.grad is not None

@@ -121,8 +121,7 @@ def pretend_device() -> Iterator[str]:
         patch.setattr(torch, "autocast", lambda *args, **options: nullcontext())
         patch.setattr(optimizer, "_get_fused_kernels_supported_devices", lambda: [*devices(), DEVICE])
         patch.setattr(render, "launch", _fill)
-        patch.setattr(render, "_kernels", lambda channels: ("forward", "backward"))
-        patch.setattr(render, "_sum_kernel", lambda: "sum")
+        patch.setattr(render, "_kernels", lambda channels: ("forward", "backward", "sum"))
         patch.setattr(render, "simulated", lambda: True)
         patch.setattr(model_file, "WITHOUT_MEMORY", torch.device("cpu"))  # that device's name stands for ours here
         yield DEVICE
