@@ -96,7 +96,9 @@ def ranking_table(board: Board, metric: str) -> Table:
     scores = image_scores(board, metric)
     comparison = compare_rows(scores, metric)
     m = METRICS[metric]
-    table = Table(title=f"{board.name}: {board.title}", box=None, title_justify="left")
+    table = Table(
+        title=f"{board.name}: {board.title}", box=None, title_justify="left", padding=(0, 0, 0, 1), pad_edge=False
+    )
     table.caption = f"rank: simultaneous {LEVEL:.0%} intervals; methods that cannot be told apart tie"
     for title in (
         "rank",
@@ -105,7 +107,11 @@ def ranking_table(board: Board, metric: str) -> Table:
         "ties with",
         *(t for t, _ in COSTS.values()),
     ):
-        table.add_column(title, justify="left" if title in ("method", "ties with") else "right")
+        left = title in ("method", "ties with")
+        # Names are never cut; units break into a second line.
+        table.add_column(
+            title.replace(", ", "\n"), justify="left" if left else "right", no_wrap=title == "method", overflow="fold"
+        )
     numbers = list(scores.values)
     if comparison is not None:
         for k in np.argsort(-comparison.means if m.higher_is_better else comparison.means, kind="stable"):

@@ -291,4 +291,7 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
     own = other is None or soft is not None
     found = rendered(RenderStatic(job, truth, own, soft), which)
     images = [np.concatenate(parts).reshape(*shape, 3) for parts in zip(*found, strict=True)]
-    return StaticViews(*images, soft=soft) if own else StaticViews(other.background, *images)  # type: ignore[union-attr]
+    if other is None or own:
+        background, first = images
+        return StaticViews(background, first, soft)
+    return StaticViews(other.background, images[0])

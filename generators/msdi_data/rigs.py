@@ -102,7 +102,8 @@ class BurstRenderer(Visibility):
 
     def __init__(self, world: WorldScene, cameras: Sequence[Camera], *, seed: int, spp: int) -> None:
         scene = mitsuba_scene(world)
-        super().__init__(world, cameras, scene, make_tracer(scene, cameras, seed))
+        super().__init__(world, cameras, scene)
+        self._tracer = make_tracer(scene, cameras, seed)
         self.spp = spp
 
     @cached_property

@@ -145,7 +145,8 @@ class MultiViewRenderer(Visibility):
     @cached_property
     def static(self) -> StaticViews:
         """The views without moving objects."""
-        return StaticViews(*(a.reshape(*self.shape, 3) for a in self.static_at(np.arange(int(np.prod(self.shape))))))
+        background, first = self.static_at(np.arange(int(np.prod(self.shape))))
+        return StaticViews(background.reshape(*self.shape, 3), first.reshape(*self.shape, 3))
 
     def static_at(self, pixels: np.ndarray, background: bool = True) -> tuple[np.ndarray, ...]:
         """Return the parts `background` and `first` of `static` [K, 3] at flat pixels, or the latter alone."""

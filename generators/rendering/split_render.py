@@ -46,8 +46,8 @@ class SplitRenderer(MultiViewRenderer):
         self.soft = soft
         self._maps: dict[float | None, Any] = {}
         known = others.get("static")
-        if soft_static is not None or known is not None:
-            self.soft_static = soft_static if known is None else known.soft
+        if (given := soft_static if known is None else known.soft) is not None:
+            self.soft_static = given
         self._anchor_s = anchor_s(self.world, self.cameras, soft.anchor_px) if soft.anchor_px else 0.0
 
     def _make_tracer(self, seed: int, psf_px: float) -> Any:

@@ -96,8 +96,8 @@ class SplitTracer(WavefrontTracer):
         points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
         shiny = dr.select(coated, mi.UInt32(1), 0)
         dr.eval(points, normals, shiny, light)
-        found = [np.array(dr.gather(type(a), a, first)) for a in (points, normals, shiny)]
-        return (*(np.asarray(a, np.float32).T for a in found[:2]), self._means(light, spp), found[2] > 0)
+        at, normal, coat = (np.array(dr.gather(type(a), a, first)) for a in (points, normals, shiny))
+        return np.asarray(at, np.float32).T, np.asarray(normal, np.float32).T, self._means(light, spp), coat > 0
 
     def _radiance(
         self,

@@ -33,7 +33,7 @@ from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
 from spike4dgs.generators.truth import errors
-from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Series, measurement
+from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Role, Series, measurement
 from spike4dgs.studies.kit.timing import by_turns_ms
 from spike4dgs.studies.speed_error.keys import GROUP, OF_SIZE
 
@@ -258,7 +258,7 @@ def split_series(job: Job, repeats: int) -> Series:
 
     t_s, view, world = (job.n_ticks // 2 + 0.25) / RATE_HZ, held_out_view(job), world_of(job)
     camera, split = cameras_of(job)[view : view + 1], SPLIT_PROFILES[job.profile_name]
-    ways = {
+    ways: dict[str, tuple[int, SoftSampling | None, Role]] = {
         f"paths, {job.profile.spp} samples": (job.profile.spp, None, ""),
         f"paths, {16 * job.profile.spp} samples": (16 * job.profile.spp, None, "exact"),
         f"maps, {split.spp} samples": (split.spp, split.soft, "chosen"),
@@ -266,10 +266,8 @@ def split_series(job: Job, repeats: int) -> Series:
     }
 
     def image(spp: int, soft: SoftSampling | None, seed: int) -> Callable[[], NDArray[np.float32]]:
-        numbers = {"seed": job.seed + seed, "spp": spp, "background_spp": spp}
-        renderer = (
-            SplitRenderer(world, camera, soft=soft, **numbers) if soft else MultiViewRenderer(world, camera, **numbers)
-        )
+        make = MultiViewRenderer if soft is None else partial(SplitRenderer, soft=soft)
+        renderer = make(world, camera, seed=job.seed + seed, spp=spp, background_spp=spp)
         return lambda: renderer.crn_frames(t_s)[0]
 
     calls = [[image(spp, soft, seed) for seed in (2, 3)] for spp, soft, _ in ways.values()]
@@ -279,7 +277,7 @@ def split_series(job: Job, repeats: int) -> Series:
     moving, on_object = geometry.traced(t_s)[0], geometry.object_masks(t_s)[0]
     points = []
     for (name, (_, _, role)), (a, b), (best, median) in zip(ways.items(), images, times, strict=True):
-        values = {"ms": best, "median_ms": median}
+        values: dict[str, float | None] = {"ms": best, "median_ms": median}
         values |= {key: _decibels((a - b)[m] ** 2 / 2) for key, m in (("noise", moving), ("object", on_object))}
         off = (a - images[1][0]) * (b - images[1][1])  # the noise of all four is independent
         points.append(Point(name, {**values, "paths": None if role == "exact" else _decibels(off[moving])}, role))
