@@ -140,8 +140,6 @@ class MultiViewRenderer(Visibility):
     def _make_tracer(self, seed: int, psf_px: float) -> Any:
         return make_tracer(self._scene, self.cameras, seed, psf_px)
 
-    # ------------------------------------------------------------ images
-
     @cached_property
     def static(self) -> StaticViews:
         """The views without moving objects."""

@@ -27,9 +27,10 @@ assert (bits.unpack(pack(spikes), 8, 4, True) == 1).all()
 
 @pytest.fixture
 def install(tmp_path: Path) -> Path:
-    """A copy of the room `benchmark` without compiled files, as an install of its own."""
+    """A copy of the package with the room `benchmark` alone, without compiled files, as an install of its own."""
     source = Path(spike4dgs.benchmark.__file__).parent
     shutil.copytree(source, tmp_path / "first/spike4dgs/benchmark", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(str(spike4dgs.__file__), tmp_path / "first/spike4dgs/__init__.py")
     return tmp_path / "first"
 
 

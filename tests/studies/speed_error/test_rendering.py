@@ -20,7 +20,7 @@ def test_light_as_a_ratio_is_nearer_to_the_traced_light_than_none() -> None:
 def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light() -> None:
     if load_mitsuba().variant().startswith("scalar"):
         pytest.skip("maps need a variant that compiles kernels")
-    request = Request("quick", 0, "cpu", lambda: pytest.fail("no scene is needed"))
+    request = Request("quick", 0, lambda: pytest.fail("no scene is needed"))
     for series in split_light.run(request):
         paths, exact, maps, truth = series.points
         assert [p.role for p in series.points] == ["", "exact", "chosen", ""] and exact.values["paths"] is None
