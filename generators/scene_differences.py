@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.release.fingerprint import same_facts
 from spike4dgs.benchmark.scene.cameras import camera_facts
 from spike4dgs.benchmark.scene.images import Geometry, read_geometry
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
@@ -37,7 +38,7 @@ def differing_facts(made: Scene, reference: Scene) -> list[str]:
     found = [
         f"{name}: {_how(own.get(name), other.get(name))}"
         for name in sorted(own.keys() | other.keys())
-        if not _same(own.get(name), other.get(name))
+        if not same_facts(own.get(name), other.get(name), _ROUNDING)
     ]
     return found or [*_sensors(made, reference), *_geometry(made, reference)]
 
@@ -53,16 +54,6 @@ def _facts(scene: Scene) -> dict[str, Any]:
     names = "rate_hz", "n_ticks", "radiance_gain", "width", "height", "sensor", "gaps", "default_split", "calibration"
     facts = {name: meta.get(name) for name in names}
     return {**facts, **cameras, **targets, **{f"split {name}": split for name, split in meta["splits"].items()}}
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
-    if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_same, a, b))
-    if isinstance(a, float) and isinstance(b, float | int):
-        return abs(a - b) <= _ROUNDING * max(1.0, abs(a))
-    return bool(a == b)
 
 
 def _how(own: Any, other: Any) -> str:

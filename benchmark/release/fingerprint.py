@@ -191,17 +191,18 @@ def _facts(scene: Scene) -> dict[str, Any]:
 
 def _other_facts(own: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[str]:
     for name in sorted(own.keys() | other.keys()):
-        if not _same(own.get(name), other.get(name)):
+        if not same_facts(own.get(name), other.get(name), _ROUNDING):
             yield f"another {name}"
 
 
-def _same(a: Any, b: Any) -> bool:
+def same_facts(a: Any, b: Any, rounding: float) -> bool:
+    """Return whether two JSON values are equal but for a relative difference of their fractional numbers."""
     if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+        return a.keys() == b.keys() and all(same_facts(a[key], b[key], rounding) for key in a)
     if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_same, a, b))
-    if isinstance(a, float | int) and isinstance(b, float | int):
-        return abs(a - b) <= _ROUNDING * max(1.0, abs(a))
+        return len(a) == len(b) and all(same_facts(x, y, rounding) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float) and isinstance(b, float | int):
+        return abs(a - b) <= rounding * max(1.0, abs(a))
     return bool(a == b)
 
 
