@@ -36,6 +36,7 @@ from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
+from spike4dgs.leaderboard.entry import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
 
 
@@ -198,7 +199,8 @@ def _run(
             console.print(line, highlight=False, markup=False)
         out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
         cluster = (fits.workers, fits.scheduler)
-        settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster, fits.refit)
+        typical_s = typical_fit_seconds()
+        settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster, fits.refit, typical_s)
         runs.append(run_split(opened, methods, settings, console, fits.columns))
     return runs
 

@@ -190,6 +190,16 @@ def read_entries(leaderboard: Path, *folders: str) -> tuple[dict[str, Entry], di
     return entries, refused
 
 
+def typical_fit_seconds() -> dict[str, float]:
+    """Return the mean seconds of a fit by method in the shipped entries. Their machines differ: ratios count."""
+    times: dict[str, list[float]] = {}
+    for path in entry_paths(SHIPPED, PUBLIC):
+        record = read_json(SHIPPED / path, "an entry")["record"]
+        known = [cell["fit_seconds"] for cell in record["scenes"].values() if cell["fit_seconds"] is not None]
+        times.setdefault(record["method"]["name"], []).extend(known)
+    return {method: sum(known) / len(known) for method, known in times.items() if known}
+
+
 def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, Any], replace: bool) -> Entry:
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 

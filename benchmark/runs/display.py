@@ -26,11 +26,15 @@ class RunDisplay:
     """Progress on the console: bars with an estimate on a terminal or in a notebook, lines with one elsewhere.
 
     `kinds` names what the cells' times go by, in their order, such as the methods: those that are fitted here one
-    after another. Without it all cells count alike.
+    after another. Without it all cells count alike. `typical_s` holds seconds of some kinds on other machines: their
+    ratios tell what a kind that was not met takes next to those that were.
     """
 
-    def __init__(self, console: Console, cells: int, kinds: Sequence[str] = ()) -> None:
+    def __init__(
+        self, console: Console, cells: int, kinds: Sequence[str] = (), typical_s: Mapping[str, float] | None = None
+    ) -> None:
         self._console, self._cells, self._kinds, self._done = console, cells, kinds, 0
+        self._typical_s = typical_s or {}
         self._start = time.perf_counter()
         self._times: dict[str, list[float]] = {}  # of the cells in which something was fitted, by kind
         self._cell: tuple[float, Pace] | None = None  # of the one that is being fitted: since when
@@ -50,21 +54,32 @@ class RunDisplay:
 
     def left(self) -> float | None:
         """Return the seconds left: of each cell those of earlier ones of its kind, or of all; None where none ended."""
-        now, begun = time.perf_counter(), self._done + (self._cell is not None)
-        times, of_cell = self._times, 0.0
+        begun = self._done + (self._cell is not None)
+        means = {kind: sum(known) / len(known) for kind, known in self._times.items()}
+        of_cell = 0.0
         if self._cell:
             since, pace = self._cell
-            if (left := pace.left()) is None:
+            if (of_stage := pace.left()) is None:
                 return None
-            of_cell = left
-            if not times:
-                times = {"": [now - since + left]}
-        if not times:
-            return (now - self._start) / self._done * (self._cells - self._done) if self._done else None
-        means = {kind: sum(known) / len(known) for kind, known in times.items()}
-        every = sum(means.values()) / len(means)
-        kinds = self._kinds[begun:] or [""] * (self._cells - begun)
-        return of_cell + sum(means.get(kind, every) for kind in kinds)
+            elapsed, kind = time.perf_counter() - since, self._kind(self._done)
+            of_cell = max(of_stage, means.setdefault(kind, elapsed + of_stage) - elapsed)
+        kinds = [self._kind(k) for k in range(begun, self._cells)]
+        if not means and not any(kind in self._typical_s for kind in kinds):
+            return (time.perf_counter() - self._start) / self._done * len(kinds) if self._done else None
+        return of_cell + sum(self._seconds(kind, means) for kind in kinds)
+
+    def _kind(self, cell: int) -> str:
+        return self._kinds[cell] if self._kinds else ""
+
+    def _seconds(self, kind: str, means: Mapping[str, float]) -> float:
+        """Return the seconds of a cell of a kind, from those of the kinds that were met."""
+        if kind in means:
+            return means[kind]
+        met = [k for k in means if k in self._typical_s]
+        typical = sum(self._typical_s[k] for k in met)
+        pace = sum(means[k] for k in met) / typical if typical else 1.0
+        of_other = sum(means.values()) / len(means) if means else 0.0
+        return self._typical_s[kind] * pace if kind in self._typical_s else of_other
 
     @contextmanager
     def cell(self, title: str, notes: Sequence[str] = ()) -> Iterator[ShownCell]:
@@ -90,8 +105,7 @@ class RunDisplay:
             note(text)
         yield ShownCell(progress, note)
         if self._cell:
-            kind = self._kinds[self._done] if self._kinds else ""
-            self._times.setdefault(kind, []).append(time.perf_counter() - since)
+            self._times.setdefault(self._kind(self._done), []).append(time.perf_counter() - since)
             self._cell = None
         self._done += 1
         self._bars.remove_task(task)

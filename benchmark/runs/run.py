@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import uuid4
 
@@ -58,6 +58,7 @@ class Settings:
     workers: int = 1
     scheduler: str | None = None
     refit: bool = False  # also where predictions are there
+    typical_s: Mapping[str, float] = field(default_factory=dict)  # of fits by method, somewhere: their ratios count
 
     def folder(self, seed: int) -> Path:
         """Return the folder that keeps what comes of a seed."""
@@ -145,7 +146,7 @@ def run_matrix(
     records: dict[int, list[Record]] = {}
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(console, len(jobs), [files.job.method.name for files in jobs]) as display,
+        RunDisplay(console, len(jobs), [files.job.method.name for files in jobs], settings.typical_s) as display,
     ):
         for k, cells in _run_cells(jobs, settings, selection, display):
             found[k] = cells

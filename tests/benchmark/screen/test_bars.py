@@ -47,11 +47,11 @@ def test_a_step_that_lasts_lets_the_estimate_count_down() -> None:
     assert pace.left() == 7.0
 
 
-def run_cells(monkeypatch, cells: list[tuple[str, float, bool]]) -> list[float | None]:
+def run_cells(monkeypatch, cells: list[tuple[str, float, bool]], typical_s=None) -> list[float | None]:
     """Run cells of (method, seconds, fitted); return the estimates after each but the last."""
     clock, estimates = Clock(), []
     monkeypatch.setattr(display.time, "perf_counter", clock)
-    shown = RunDisplay(Console(file=io.StringIO()), len(cells), [method for method, *_ in cells])
+    shown = RunDisplay(Console(file=io.StringIO()), len(cells), [method for method, *_ in cells], typical_s)
     with shown:
         for method, seconds, fitted in cells:
             with shown.cell(f"{method} on a scene") as cell:
@@ -71,6 +71,31 @@ def test_cells_left_take_as_long_as_those_of_their_method(monkeypatch) -> None:
         ("slow", 90.0, True),
     ]
     assert run_cells(monkeypatch, cells) == [8.0, 182.0, 180.0, 90.0]
+
+
+def test_cells_of_other_methods_take_what_their_typical_seconds_say(monkeypatch) -> None:
+    typical_s = {"none": 0.0, "quick": 10.0, "slow": 60.0}
+    cells = [("none", 0.0, False), ("quick", 20.0, True), ("slow", 100.0, True), ("slow", 100.0, True)]
+    after_none, after_quick, after_slow = run_cells(monkeypatch, cells, typical_s)
+    assert after_none == 10.0 + 60.0 + 60.0  # nothing was measured
+    assert after_quick == 2 * (60.0 + 60.0)  # this machine takes twice as long
+    assert after_slow == 100.0  # as the one before
+    cells = [("quick", 20.0, True), ("unknown", 30.0, True), ("slow", 100.0, True)]
+    assert run_cells(monkeypatch, cells, typical_s) == [20.0 + 120.0, 120.0]
+
+
+def test_a_cell_of_a_known_method_does_not_end_with_its_stage(monkeypatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr(display.time, "perf_counter", clock)
+    with RunDisplay(Console(file=io.StringIO()), 2, ["a", "a"]) as shown:
+        with shown.cell("first") as cell:
+            cell.progress(0, 1, "images")
+            clock.now += 50.0
+        with shown.cell("second") as cell:
+            for done in range(1, 3):
+                clock.now += 1.0
+                cell.progress(done, 4, "images")
+            assert shown.left() == 48.0  # two steps of a stage are left, and the rest of the fit
 
 
 def test_what_is_kept_makes_no_estimate_shorter(monkeypatch) -> None:
