@@ -41,8 +41,8 @@ def make_dataset(
         check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
             they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
             world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.
-        track: Make the scenes of a track of release 2, which has its profile, variants and camera: small, dev-small or
-            ideal; of all worlds if none is named.
+        track: Make the scenes of a track of release 2, which has its profile, variants and camera: small, dev-small,
+            ideal or paper; of all worlds if none is named.
     """
     from spike4dgs.generators.worlds import WORLDS  # it loads other packages' worlds
 

@@ -111,7 +111,8 @@ def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> li
         raise problem("--track", "a track, which has its own profile, variants and camera", "settings too", fix)
     t = TRACKS[track]
     physics = replace(settings.physics, camera=t.camera)
-    every = [replace(settings, profile=t.profile, variant=variant, physics=physics) for variant in t.variants]
+    own = {"profile": t.profile, "rendering": "split", "physics": physics}
+    every = [replace(settings, variant=variant, **own) for variant in t.variants]
     return [one.job(world) for world in worlds for one in every]
 
 
@@ -133,9 +134,6 @@ def make_dataset(
     differs by more than noise.
     """
     console = Console(highlight=False, soft_wrap=True)
-    if audit and any(p.lens or p.psf_px or p.flicker for p in (job.physics for job in jobs)):
-        fix = "audit the scene of --camera ideal, whose rendering is the same"
-        raise problem("--audit", "pinholes in steady light, as Mitsuba's own sensor", "a lens, blur or flicker", fix)
     for variant in {job.variant: None for job in jobs if is_reserved(job.variant)}:
         console.print(f"variant {variant} is kept for hidden seasons: train nothing on it, and enter no scores of it")
     references = find_references(check, [job.id for job in jobs]) if check else {}

@@ -67,7 +67,10 @@ PROFILES: dict[str, Profile] = Table(
 
 @dataclass(frozen=True)
 class Track:
-    """The scenes of a track of release 2: these variants of every world, at a profile, by a camera of `CAMERAS`."""
+    """The scenes of a track of release 2: these variants of every world, at a profile, by a camera of `CAMERAS`.
+
+    Their light is split: see `SPLIT_PROFILES`.
+    """
 
     profile: str
     variants: tuple[int, ...]
@@ -78,6 +81,7 @@ TRACKS = {
     "small": Track("small", PUBLIC_VARIANTS, REALISTIC),  # the main one: 27 scenes
     "dev-small": Track("small", DEVELOPMENT_VARIANTS, REALISTIC),  # for tuning: 18 scenes that no score of a track has
     "ideal": Track("small", (PUBLIC_VARIANT,), IDEAL),  # the camera of release 1
+    "paper": Track("paper", (PUBLIC_VARIANT,), IDEAL),  # the size of the paper's scenes
 }
 
 # Noise of moving objects, from pairs of renderings (van-10-small / turntable-10-small): 47.4 / 45.8 dB with 32 samples

@@ -4,7 +4,8 @@
 
 At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with four times the samples of
 a key; they are compared with the interpolated radiance of that instant. Some ground-truth frames are compared with
-renderings of four times their samples. The noise of the reference counts as error too.
+renderings of four times their samples. The noise of the reference counts as error too. Where cameras have a lens or a
+blur, which that loop does not know, ours traces every pixel.
 
 Noise alone is known from two further renderings A and B with other random numbers: of an image I, the mean of
 (I - A)(I - B) is the variance of its noise, without bias and without theirs.
@@ -95,18 +96,20 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     p = job.profile
     chosen = [cameras_of(job)[v] for v in views]
     some = MultiViewRenderer(world_of(job), chosen, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
+    rendered = _reference(job, some, _MORE * p.spp)
     seen = []
     for tick in ticks:
-        truth, moving = some.reference_frames(tick / RATE_HZ, _MORE * p.spp), some.traced(tick / RATE_HZ)
+        truth, moving = rendered(tick / RATE_HZ), some.traced(tick / RATE_HZ)
         for view, image, mask in zip(views, truth, moving, strict=True):
             found = errors(store.radiance(view, plan, tick), image, mask)
             seen.append({"tick": tick, "camera": cameras_of(job)[view].id, "is_key": tick in plan.ticks} | found)
     camera = cameras_of(job)[held_out]
     one = MultiViewRenderer(world_of(job), [camera], seed=job.seed + 3, spp=p.spp, background_spp=p.spp)
+    rendered = _reference(job, one, _MORE * p.target_spp)
     frames = []
     for tick in job.target_ticks[:: max(1, len(job.target_ticks) // _FRAMES)][:_FRAMES]:
         target = Target(camera.id, tick)
-        truth = one.reference_frames(tick / RATE_HZ, _MORE * p.target_spp)[0]
+        truth = rendered(tick / RATE_HZ)[0] * np.float32(job.light_at(tick))
         image, mask = read_exr(scene / f"images/{target.name}.exr"), read_mask(mask_file(scene, target))
         frames.append({"tick": tick, "camera": camera.id} | errors(image, truth, mask))
     return {
@@ -115,6 +118,25 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
         "ground_truth": {"total": _total(frames), "each": frames},
         "noise": noise(job, store, plan, scene),
     }
+
+
+def _reference(job: Job, renderer: MultiViewRenderer, spp: int) -> Callable[[float], NDArray[np.float32]]:
+    """Return what renders the views of `renderer` whole at a time, with `spp` whole paths a pixel.
+
+    By Mitsuba's own loop for pinholes. It knows neither our lenses nor our blur: there every pixel is traced by ours.
+    """
+    if not any(c.distortion for c in renderer.cameras) and not job.physics.psf_px:
+        return lambda t_s: renderer.reference_frames(t_s, spp)
+    whole = MultiViewRenderer(
+        world_of(job),
+        renderer.cameras,
+        seed=job.seed + _SEEDS[0],
+        spp=spp,
+        background_spp=spp,
+        psf_px=job.physics.psf_px,
+        whole_frames=True,
+    )
+    return whole.crn_frames
 
 
 def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, dict[str, float | None]]:

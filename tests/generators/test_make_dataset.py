@@ -181,7 +181,6 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
         ("car", {"variant": -1}, "--seed and --variant"),
         ("car", {"physics": PhysicsOptions(lens=(0.1,) * 6)}, "--lens: expected at most 5 numbers: k1, k2, p1, p2, k3"),
         ("car", {"physics": PhysicsOptions(lens=(float("nan"),))}, "--lens"),
-        ("car", {"physics": PhysicsOptions(lens=(-0.1,)), "audit": True}, "--audit: expected pinholes in steady light"),
         ("car", {"physics": PhysicsOptions(lens=(-9.0,))}, "whose model holds up to the image's corners"),
         (
             "car",
@@ -224,8 +223,11 @@ def test_a_track_has_its_variants_of_every_world_and_its_camera(tmp_path):
     assert len(ids["small"]) == 27 and ids["small"][:3] == [f"jaywalk-{v}-small-realistic" for v in (0, 3, 4)]
     assert len(ids["dev-small"]) == 18 and not set(ids["small"]) & set(ids["dev-small"])
     assert ids["ideal"] == [f"{world}-0-small" for world in worlds]  # as in release 1
+    assert ids["paper"] == [f"{world}-0-paper" for world in worlds]
+    jobs = [job for name in TRACKS for job in track_jobs(name, worlds, SceneSettings())]
+    assert all(job.profile.soft and job.profile.target_soft for job in jobs)  # rendered by --rendering split
     for settings, track, words in (
-        (SceneSettings(), "large", "--track: expected one of small, dev-small, ideal"),
+        (SceneSettings(), "large", "--track: expected one of small, dev-small, ideal, paper"),
         (SceneSettings(variant=1), "small", "its own profile, variants and camera"),
     ):
         with pytest.raises(UserError, match=words):
