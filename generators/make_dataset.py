@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -151,21 +152,22 @@ def make_dataset(
             for camera in cameras_of(job):
                 check_lens(camera, "--lens")
     with executor(workers, scheduler) as run:
+        making = partial(_make, run=run, in_process=workers == 1 and scheduler is None, console=console)
         for number, job in enumerate(todo, start=1):
-            _make(job, out, run, audit, console, f" ({number} of {len(todo)})" if len(todo) > 1 else "")
+            making(job, out, with_audit=audit, which=f" ({number} of {len(todo)})" if len(todo) > 1 else "")
 
         def make(job: Job, folder: Path) -> None:
             if not _is_done(job, folder, False):
-                _make(job, folder, run, False, console, ", other noise")
+                making(job, folder, with_audit=False, which=", other noise")
 
         return check_scenes(jobs, out, references, make) if check else 0
 
 
-def _make(job: Job, out: Path, run: Run, with_audit: bool, console: Any, which: str) -> None:
+def _make(job: Job, out: Path, *, run: Run, in_process: bool, console: Any, with_audit: bool, which: str) -> None:
     """Make one scene and its report."""
     start = time.perf_counter()
     with _stages(console, job.id + which) as watch:
-        maker = Maker(job, out, watch, run, with_audit)
+        maker = Maker(job, out, watch, run, with_audit, in_process)
         folder = maker.make()
     total = time.perf_counter() - start
     report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}

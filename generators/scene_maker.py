@@ -65,6 +65,7 @@ class Maker:
     watch: Watch[Any]
     run: Run = here
     with_audit: bool = False
+    in_process: bool = True  # what `run` does: then each key is stored and shown as it is done
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of each stage in this process
     audit: dict[str, Any] | None = None  # the report of `audit`
 
@@ -175,7 +176,7 @@ class Maker:
         if not missing:
             return
 
-        chunks = render_tasks.key_chunks(self.job, missing)
+        chunks = [[tick] for tick in missing] if self.in_process else render_tasks.key_chunks(self.job, missing)
 
         def keys() -> Iterator[int]:
             for chunk in self.run(render_tasks.RenderKeys(self.job, self.store.static()), chunks):
@@ -195,7 +196,7 @@ class Maker:
         light_range = lru_cache(maxsize=None)(lambda view: self.store.range(view, self.plan))
 
         def truths() -> Iterator[Target]:
-            ticks = chunked(sorted({t.tick for t in missing}), 2)
+            ticks = chunked(sorted({t.tick for t in missing}), 1 if self.in_process else 2)
             for chunk in self.run(render_tasks.RenderTargets(self.job, static), ticks):
                 for truth in chunk:
                     target, ground = Target(self.cameras[truth.view].id, truth.tick), self.store.background[truth.view]
