@@ -24,7 +24,7 @@ class SoftSampling:
         spp: paths of the matte lobe for each pixel of a map.
         gloss_spp: paths of a coat's gloss, which reflects a few percent.
         sigma_px: of the Gaussian weights with which a map is smoothed over each surface.
-        anchor_px: motion of the fastest point between two maps; 0: each image has a map of its own time.
+        anchor_px: motion of the fastest point between two maps.
     """
 
     spp: int
@@ -100,14 +100,14 @@ SPLIT_PROFILES: dict[str, Profile] = {
         128,
         0.5,
         40,
-        SoftSampling(32, 8, 0.8, 4),
-        SoftSampling(64, 16, 0.8, 0),
+        SoftSampling(32, 8, 0.5, 4),
+        SoftSampling(64, 16, 0.5, 4),
     ),
     "small": Profile(
-        _ALL, 200, 125, 0.02, 64, 64, 256, 0.25, 100, SoftSampling(64, 16, 0.8, 4), SoftSampling(128, 32, 0.8, 0)
+        _ALL, 200, 125, 0.02, 64, 64, 256, 0.25, 100, SoftSampling(64, 16, 0.5, 4), SoftSampling(128, 32, 0.5, 4)
     ),
     "paper": Profile(
-        _ALL, 400, 250, 0.1, 64, 64, 256, 0.25, 400, SoftSampling(32, 8, 1.2, 8), SoftSampling(64, 16, 1.2, 0)
+        _ALL, 400, 250, 0.1, 64, 64, 256, 0.25, 400, SoftSampling(32, 8, 0.8, 8), SoftSampling(64, 16, 0.8, 8)
     ),
 }
 

@@ -221,7 +221,8 @@ def renderer_of(
         )
     from spike4dgs.generators.rendering.split_render import SplitRenderer  # it needs compiled kernels
 
-    return SplitRenderer(world_of(job), views, soft=soft, **(own | others))
+    anchors_s = anchor_s(world_of(job), cameras_of(job), soft.anchor_px)
+    return SplitRenderer(world_of(job), views, soft=soft, anchors_s=anchors_s, **(own | others))
 
 
 def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:

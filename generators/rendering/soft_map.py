@@ -7,7 +7,7 @@ the pixels around it there. Those count that see a like surface: a similar norma
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +17,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.like_surfaces import LIKE_COSINE, LIKE_PX
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
 
-LEAST_WEIGHT = 0.02  # of like surfaces around a sample, of at most 1; below it the search goes on
-_NEAR_COSINE, _NEAR_PX = 0.5, 1.5  # the bounds of `like_surfaces` within two pixels, where none is like
+LEAST_WEIGHT = 0.02  # of like surfaces around a sample, of at most 1; below it a sample traces its path
 
 
 class SoftMap(NamedTuple):
@@ -85,10 +84,7 @@ class SoftMaps:
         return Place(dr.opaque(mi.Float, share), known, point, normal, *self._project(view, point))
 
     def looked_up(self, view: mi.UInt32, places: Sequence[Place], active: mi.Bool) -> Light:
-        """Return the weighted sums around each sample: bilinear, over like surfaces.
-
-        Where none is like, those of all pixels within two that are less like.
-        """
+        """Return the weighted sums around each sample: bilinear, over like surfaces."""
         light = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
         for place in places:
             column, row = dr.floor(place.u), dr.floor(place.v)
@@ -97,22 +93,8 @@ class SoftMaps:
                     w = (place.u - column if right else 1 + column - place.u) * (
                         place.v - row if down else 1 + row - place.v
                     )
-                    light = self._added(
-                        light, place, view, column + right, row + down, w, (LIKE_COSINE, LIKE_PX), active
-                    )
-        lost = active & (light[2] <= LEAST_WEIGHT)
-
-        def search(k: mi.UInt32, *light: Any) -> tuple[Any, ...]:
-            for place in places:
-                x, y = dr.floor(place.u) + mi.Float(k & 3) - 1, dr.floor(place.v) + mi.Float(k >> 2) - 1
-                w = dr.rcp(0.25 + dr.square(x - place.u) + dr.square(y - place.v))
-                light = self._added(light, place, view, x, y, w, (_NEAR_COSINE, _NEAR_PX), lost)
-            return k + 1, *light
-
-        if not places:
-            return light
-        _, *light = dr.while_loop((mi.UInt32(0), *light), lambda k, *_: lost & (k < 16), search)
-        return tuple(light)  # type: ignore[return-value]
+                    light = self._added(light, place, view, column + right, row + down, w, active)
+        return light
 
     def _added(
         self,
@@ -122,17 +104,16 @@ class SoftMaps:
         column: mi.Float,
         row: mi.Float,
         w: mi.Float,
-        bounds: tuple[float, float],
         active: mi.Bool,
     ) -> Light:
-        """Return the sums with a map's light in one pixel, where it sees a surface that is like within the bounds."""
+        """Return the sums with a map's light in one pixel, where it sees a like surface."""
         x, y = mi.Int32(column), mi.Int32(row)
         inside = active & (x >= 0) & (y >= 0) & (x < self._width) & (y < self._height)
         at = (view * self._height + mi.UInt32(y)) * self._width + mi.UInt32(x)
         plane = dr.gather(mi.Vector4f, place.known.planes, at, inside)
         normal = mi.Vector3f(plane.x, plane.y, plane.z)
-        like = inside & (dr.dot(normal, place.normal) > bounds[0])
-        like &= dr.abs(dr.dot(normal, place.point) - plane.w) < bounds[1] * place.width
+        like = inside & (dr.dot(normal, place.normal) > LIKE_COSINE)
+        like &= dr.abs(dr.dot(normal, place.point) - plane.w) < LIKE_PX * place.width
         w = dr.select(like, w * place.share, 0)
         matte, gloss = (dr.gather(mi.Vector4f, a, at, inside) for a in (place.known.matte, place.known.gloss))
         return (

@@ -1,13 +1,15 @@
 """Key frames by `split_tracer`: soft light comes from maps, which noise does not outlive.
 
 Soft light over the albedo is smooth on every surface and changes slowly with it. `soft` paths find it at the centres of
-pixels, at anchor times (in ground truth: at its own time), and it is averaged over like surfaces around each pixel. A
+pixels, at anchor times, and it is averaged over like surfaces around each pixel. A
 key carries each of its samples along the exact motion of its surface to the anchors before and after, and blends what
 their maps have there.
 
 Random numbers. A key's samples near moving objects have numbers that no other key has: their noise is independent in
 time. Elsewhere they have the same numbers at all times, and what counts is the difference that they see to the
 background. Soft light on moving surfaces has numbers of its anchor, so its noise travels with the surface.
+
+Streams and ground truth have the same anchor times: what carrying and blending change is the same light in both.
 
 This module does not: smooth across edges of surfaces, smooth direct light or gloss, or reuse a sample of streams in
 ground truth.
@@ -37,10 +39,20 @@ _KEYS, _MAPS = 1 << 20, 1 << 28  # first of the streams of keys and of maps; tho
 class SplitRenderer(MultiViewRenderer):
     """A `MultiViewRenderer` whose pixels are the sum of direct light, gloss and soft light from maps."""
 
-    def __init__(self, *args: Any, soft: SoftSampling, soft_static: SoftStatic | None = None, **others: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        soft: SoftSampling,
+        anchors_s: float | None = None,
+        soft_static: SoftStatic | None = None,
+        **others: Any,
+    ) -> None:
         """Load the world; see `MultiViewRenderer`. `spp` and `background_spp` are the samples of direct light.
 
-        `soft_static` is that of a renderer with the same arguments, where `static` is not given.
+        Args:
+            soft: samples of soft light.
+            anchors_s: seconds between maps, as for a rig of which these cameras are a part; if None, by their motion.
+            soft_static: that of a renderer with the same arguments, where `static` is not given.
         """
         super().__init__(*args, **others)
         self.soft = soft
@@ -48,7 +60,7 @@ class SplitRenderer(MultiViewRenderer):
         known = others.get("static")
         if (given := soft_static if known is None else known.soft) is not None:
             self.soft_static = given
-        self._anchor_s = anchor_s(self.world, self.cameras, soft.anchor_px) if soft.anchor_px else 0.0
+        self._anchor_s = anchors_s or anchor_s(self.world, self.cameras, soft.anchor_px)
 
     def _make_tracer(self, seed: int, psf_px: float) -> Any:
         from spike4dgs.generators.rendering.split_tracer import SplitTracer
@@ -96,8 +108,8 @@ class SplitRenderer(MultiViewRenderer):
 
     def _maps_at(self, t_s: float | None) -> list[tuple[float, Any]]:
         """Return the maps to blend at a time, and their weights."""
-        if t_s is None or not self._anchor_s:
-            return [(1.0, self._map(t_s))]
+        if t_s is None:
+            return [(1.0, self._map(None))]
         first = int(np.floor(t_s / self._anchor_s))
         late = float(np.clip(t_s / self._anchor_s - first, 0.01, 0.99))  # what one anchor hides is in the other's map
         return [(1 - late, self._map(first * self._anchor_s)), (late, self._map((first + 1) * self._anchor_s))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,10 +64,10 @@ def test_maps_take_the_noise_and_leave_the_light(r):
     paths, split = (radiances(r, where, SPP, range(4), maps) for maps in (None, True))
     exact = radiances(r, where, 256, range(10, 14), None)
     assert split.var(0).mean() < 0.4 * paths.var(0).mean()  # chrome is traced
-    assert np.median(split.var(0)) < 0.25 * np.median(paths.var(0))
+    assert np.median(split.var(0)) < 0.4 * np.median(paths.var(0))  # so is what finds no like surface
     a, b = exact[::2].mean(0), exact[1::2].mean(0)
     square = np.mean((split.mean(0) - a) * (split.mean(0) - b))  # the references' noise is independent
-    assert square < 0.011**2, "39 dB where a pixel is as wide as a wheel"
+    assert square < 0.009**2, "41 dB where a pixel is as wide as a wheel"
     assert abs(np.mean(split.mean(0) - (a + b) / 2)) < 0.01 * exact.mean()
 
 
@@ -91,8 +90,7 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r):
 
 
 def test_background_and_truth_of_a_view_do_not_depend_on_other_views(r):
-    exact = replace(SOFT, anchor_px=0.0)
-    alone, together = (renderer(r.world, views, soft=exact) for views in ((4,), (1, 4)))
+    alone, together = (renderer(r.world, views, anchors_s=1e-3) for views in ((4,), (1, 4)))
     mask = alone.object_masks(T_S)[0]
     assert alone.background[0].tobytes() == together.background[1].tobytes()
     assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
