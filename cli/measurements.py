@@ -20,6 +20,11 @@ MEASUREMENTS: dict[str, Command] = {
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
         "report oracle-ladder data/car-0-small --out runs/oracle",
     ),
+    "report scene-noise": Command(
+        "spike4dgs.cli.studies:scene_noise",
+        "tabulate the rendering noise of audited scenes, and the ceilings of their scores",
+        "report scene-noise data --out runs/noise",
+    ),
     "spike-agreement": Command(
         "spike4dgs.cli.studies:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
