@@ -20,6 +20,7 @@ from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.light import Light, light_of
 from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
@@ -49,6 +50,7 @@ class FitJob:
     settings: Mapping[str, Any]  # by part, step counts scaled by the budget
     request: FitRequest
     key: str
+    light: Light | None = None  # what changes in the whole scene's light, which the images leave out
 
 
 @dataclass(frozen=True)
@@ -160,10 +162,11 @@ class RecipeMethod(Shown):
         """Fit from given cameras and points."""
         request.progress(0, 1, "images")
         maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
-        images = make_training_images(scene, start.cameras, maker, settings["images"], request.device)
+        light = light_of(scene) if maker.knows_light else None
+        images = make_training_images(scene, start.cameras, maker, settings["images"], request.device, light)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
         extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
-        return self.algorithm.fit(FitJob(scene, start, images, extent, settings, request, key))
+        return self.algorithm.fit(FitJob(scene, start, images, extent, settings, request, key, light))
 
     def _for(self, request: FitRequest) -> dict[str, Settings]:
         """Return the settings with the step counts of a request's budget."""
@@ -249,6 +252,7 @@ def fit_gaussians(
         cameras=with_lenses(job.scene, trainer.poses.cameras(start.cameras)),
         pixel_filter=settings.pixel_filter,
         estimates=trainer.supervision.estimates(),
+        light=None if job.light is None else torch.tensor(job.light.factors, dtype=torch.float32),
     )
 
 

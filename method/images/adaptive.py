@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Float64, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -56,28 +56,40 @@ def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDAr
     return np.asarray(s.shortest * s.growth ** np.arange(steps + 1), np.float64)
 
 
-def adaptive_image(stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None) -> Float32:
-    """Return spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window."""
+def adaptive_image(
+    stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None, light: Float64 | None = None
+) -> Float32:
+    """Return spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window.
+
+    `light` [n_ticks] is what `images.light.Light.gathered` has of it; None: it is steady.
+    """
     s = settings or AdaptiveSettings()
-    image = rates(stream, tick, s, shared_levels(stream, tick, s)).reshape(stream.height, stream.width)
+    levels = shared_levels(stream, tick, s, light)
+    image = rates(stream, tick, s, levels, light).reshape(stream.height, stream.width)
     return image[::-1] if stream.rows_bottom_up else image
 
 
-def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8) -> Float32:
+def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8, light: Float64 | None = None) -> Float32:
     """Return spikes per tick [H * W] over the windows of `shared_levels`, in the stored order of pixels."""
     spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     image = np.empty(len(levels), np.float32)
-    arguments = (spikes.ticks, spikes.starts, tick, halves, stream.n_ticks, levels, image)
+    arguments = (spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), levels, image)
     in_threads(_estimate, len(levels), *arguments, small=len(levels) < 1 << 12)
     return image
 
 
-def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings) -> UInt8:
+def gathered(stream: SpikeStream, light: Float64 | None) -> Float64:
+    """Return the light gathered up to the middle of each tick [n_ticks]; of steady light where `light` is None."""
+    return np.arange(stream.n_ticks) + 0.5 if light is None else light
+
+
+def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None = None) -> UInt8:
     """Return the window that each pixel takes [H * W], an index into `half_windows`, in the stored order of pixels."""
     spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     pixels = stream.height * stream.width
     level = np.empty(pixels, np.uint8)
-    in_threads(_choose, pixels, spikes.ticks, spikes.starts, tick, halves, level, small=pixels < 1 << 12)
+    arguments = (spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), level)
+    in_threads(_choose, pixels, *arguments, small=pixels < 1 << 12)
     square = np.ones((s.shared_px, s.shared_px), np.uint8)
     return np.asarray(cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1), np.uint8)
 
@@ -95,6 +107,7 @@ def _choose(
     starts: NDArray[np.int64],
     tick: int,
     halves: NDArray[np.float64],
+    light: NDArray[np.float64],
     level: UInt8,
     start: int,
     stop: int,
@@ -112,8 +125,8 @@ def _choose(
                 j += 1
             if j - i < 1:
                 continue
-            length = times[j] - times[i]
-            low, high = max(low, (j - i) / (length + 1)), min(high, (j - i) / (length - 1))
+            length = light[times[j]] - light[times[i]]
+            low, high = max(low, (j - i) / (length + 1)), min(high, (j - i) / (length - 1) if length > 1 else np.inf)
             if low > high:
                 level[p] = s - 1
                 break
@@ -125,7 +138,7 @@ def _estimate(
     starts: NDArray[np.int64],
     tick: int,
     halves: NDArray[np.float64],
-    n_ticks: int,
+    light: NDArray[np.float64],
     level: UInt8,
     image: Float32,
     start: int,
@@ -134,7 +147,7 @@ def _estimate(
     """Set each pixel's rate over its window, or over the next longer one that has two spikes."""
     for p in range(start, stop):
         times = ticks[starts[p] : starts[p + 1]]
-        image[p] = np.float32(len(times) / n_ticks)
+        image[p] = np.float32(len(times) / len(light))
         if len(times) < 2:
             continue
         before, after = _around(times, tick)
@@ -142,7 +155,7 @@ def _estimate(
             i = min(before, np.searchsorted(times, tick - halves[s]))
             j = max(after, np.searchsorted(times, tick + halves[s]) - 1)
             if j - i >= 1:
-                image[p] = np.float32((j - i) / (times[j] - times[i]))
+                image[p] = np.float32((j - i) / (light[times[j]] - light[times[i]]))
                 break
 
 
@@ -153,6 +166,7 @@ ADAPTIVE = ImageMaker(
     source="this project; the rule is that of Goldenshluger and Nemirovski: On spatially adaptive estimation of "
     "nonparametric regression, Math. Methods Stat. 6, 1997",
     rate=adaptive_image,
+    knows_light=True,
     settings=AdaptiveSettings(),
     label="from the longest windows of constant light",
 )

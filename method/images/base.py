@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.screen.shown import Shown
@@ -68,6 +69,7 @@ class ImageMaker(Shown):
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
     rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
+    knows_light: bool = False  # `rate` and `rate_over` take `light`, see `images.light`; else they take it as steady
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
     label: str | None = None  # in descriptions of recipes, after "images"; None: the name
 
@@ -83,6 +85,13 @@ class ImageMaker(Shown):
     def on(self, device: str) -> ImageMaker:
         """Return the same maker with its network, if it has one, on `device`."""
         return self.made_on(device) if self.made_on else self
+
+    def in_light(self, gathered: Float64) -> ImageMaker:
+        """Return the same maker in light that changes, if it knows any: its rates are those of mean light."""
+        if not self.knows_light:
+            return self
+        over = self.rate_over and partial(self.rate_over, light=gathered)
+        return replace(self, rate=partial(self.rate, light=gathered), rate_over=over)
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None

@@ -22,12 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import spike_times
-from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
+from spike4dgs.method.images.adaptive import AdaptiveSettings, gathered, half_windows, rates, shared_levels
 from spike4dgs.method.images.base import ImageMaker
 
 
@@ -52,20 +52,27 @@ def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:
     return np.where((halves >= s.still) | (halves == halves[-1]), np.inf, spans).astype(np.float32)
 
 
-def interval_image(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> Float32:
+def interval_image(
+    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: Float64 | None = None
+) -> Float32:
     """Return spikes per tick [H, W] float32, each the mean over its pixel's span around `tick`."""
-    return intervals(stream, tick, settings)[0]
+    return intervals(stream, tick, settings, light)[0]
 
 
-def intervals(stream: SpikeStream, tick: int, settings: IntervalSettings | None = None) -> tuple[Float32, Float32]:
-    """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module."""
+def intervals(
+    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: Float64 | None = None
+) -> tuple[Float32, Float32]:
+    """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module.
+
+    `light` [n_ticks] is what `images.light.Light.gathered` has of it; None: it is steady.
+    """
     s = settings or IntervalSettings()
     spikes, pixels = spike_times(stream), stream.height * stream.width
-    levels = shared_levels(stream, tick, s)
-    rate, halves = rates(stream, tick, s, levels), half_spans(stream.n_ticks, s)[levels]
+    levels = shared_levels(stream, tick, s, light)
+    rate, halves = rates(stream, tick, s, levels, light), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
-    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, halves, rate, spans)
+    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), rate, spans)
     image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
     return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
 
@@ -85,6 +92,7 @@ def _measure(
     starts: NDArray[np.int64],
     tick: int,
     halves: Float32,
+    light: NDArray[np.float64],
     rate: Float32,
     spans: Float32,
     start: int,
@@ -98,7 +106,7 @@ def _measure(
         i, j = _nearest(times, tick - halves[p]), _nearest(times, tick + halves[p])
         if i == j:  # one spike is nearest to both: the interval on the side where the tick lies
             i, j = (i - 1, j) if (times[i] >= tick and i > 0) or j + 1 == len(times) else (i, j + 1)
-        rate[p] = np.float32((j - i) / (times[j] - times[i]))
+        rate[p] = np.float32((j - i) / (light[times[j]] - light[times[i]]))
         spans[0, p], spans[1, p] = times[i] + 0.5 - tick, times[j] + 0.5 - tick
 
 
@@ -110,6 +118,7 @@ INTERVALS = ImageMaker(
     source="this project",
     rate=interval_image,
     rate_over=intervals,
+    knows_light=True,
     settings=IntervalSettings(),
     label="from the longest windows of constant light, and known spans where light changes",
 )

@@ -14,6 +14,7 @@ from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.light import Light
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
@@ -44,10 +45,18 @@ def choose_ticks(n_ticks: int, settings: ImageSettings) -> tuple[int, ...]:
 
 
 def make_training_images(
-    scene: TrainingScene, cameras: Sequence[Camera], make: ImageMaker, settings: ImageSettings, device: str
+    scene: TrainingScene,
+    cameras: Sequence[Camera],
+    make: ImageMaker,
+    settings: ImageSettings,
+    device: str,
+    light: Light | None = None,
 ) -> TrainingImages:
-    """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes."""
-    ticks, made, measured = _make(scene, make, settings, device)
+    """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes.
+
+    `light` is what changes in the whole scene's light, if anything: makers that know of it show mean light.
+    """
+    ticks, made, measured = _make(scene, make, settings, device, light)
     images = torch.from_numpy(undistorted(scene, made)).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
@@ -69,7 +78,7 @@ def make_images(
 
 
 def _make(
-    scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
+    scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str, light: Light | None = None
 ) -> tuple[tuple[int, ...], Float32, list[Half] | None]:
     """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
     make = make.on(device)
@@ -81,7 +90,8 @@ def _make(
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
         calibration = scene.calibrations[len(images)] if settings.flat_field and scene.calibrations else None
         gain = scene.radiance_gain * (1.0 if calibration else state.gain)
-        image, over = make.with_spans(stream, own, gain, calibration)
+        lit = make.in_light(light.gathered(state.clock, stream.n_ticks)) if light else make
+        image, over = lit.with_spans(stream, own, gain, calibration)
         images.append(image)
         if over is not None:
             spans.append(over.astype(np.float16))

@@ -131,6 +131,7 @@ class FittedModel(GaussianModel):
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
     estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
+    light: Tensor | None = None  # factors of the light over equal parts of the clip [n]; None: it is steady
 
     def _about(self) -> str:
         moving = ", ".join(str(len(g)) for g in self.pieces)
@@ -152,8 +153,16 @@ class FittedModel(GaussianModel):
         """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
         still = self._repeated.in_view(view) if len(self.background) and self.device == "cpu" else None
         if still is None:
-            return self.rendered(self.splats(t_us), view)
-        return self.image(still.render(self._moving(t_us), [0]).image, view)
+            image = self.rendered(self.splats(t_us), view)
+        else:
+            image = self.image(still.render(self._moving(t_us), [0]).image, view)
+        return image if self.light is None else image * self._light_at(t_us)
+
+    def _light_at(self, t_us: float) -> float:
+        """Return the factor of the light at a time, linear between the middles of the parts of `light`."""
+        assert self.light is not None
+        factors = self.light.double().cpu().numpy()
+        return float(np.interp(t_us / self.duration_us * len(factors) - 0.5, np.arange(len(factors)), factors))
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
@@ -177,7 +186,8 @@ class FittedModel(GaussianModel):
         """Write the model to one file; see `saved_model.load_model`."""
         pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
         background = {BACKGROUND: to_file_names(self.background.tensors())}
-        tensors = group(**pieces, **background, motion=self.motion.state_dict())
+        light = {} if self.light is None else {"light": {"factors": self.light}}
+        tensors = group(**pieces, **background, motion=self.motion.state_dict(), **light)
         config = {"motion": self.spec.as_dict(), "pieces": len(pieces), "filter": asdict(self.pixel_filter)}
         write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
@@ -197,9 +207,22 @@ class FittedModel(GaussianModel):
             for part in (*(f"piece{i}" for i in range(count)), BACKGROUND)
         )
         duration_us, found = file.provenance.duration_us, _filter(file.config.get("filter", {}))
-        made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, pixel_filter=found)
+        light = _light(file.part("light"))
+        made = cls(
+            tuple(pieces), background, motion.to(device), duration_us, device, spec, pixel_filter=found, light=light
+        )
         made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
         return made
+
+
+def _light(tensors: Mapping[str, Tensor]) -> Tensor | None:
+    """Return the factors of the light that a file has, if any."""
+    if not tensors:
+        return None
+    factors = tensors["factors"]
+    if factors.ndim != 1 or not 0 < len(factors) <= MAX_TICKS or not (factors.isfinite() & (factors >= 0)).all():
+        raise ValueError("finite factors of the light from 0 up, in one row")
+    return factors.float()
 
 
 def _filter(value: Mapping[str, Any]) -> PixelFilter:

@@ -84,6 +84,25 @@ def test_a_model_keeps_the_filter_that_it_was_fitted_with(tmp_path: Path) -> Non
     assert abs(images[1] - images[2]).max() > 0.01, "the filter matters"
 
 
+def test_a_model_keeps_the_light_that_it_was_fitted_in(tmp_path: Path) -> None:
+    steady, factors = model("paths"), torch.tensor([0.5, 1.0, 1.5, 1.0])
+    lit = dataclasses.replace(steady, light=factors)
+    lit.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    # The middles of four parts of the clip are at 1/8, 3/8, ...; linear between, constant beyond.
+    for share, factor in ((0.0, 0.5), (0.125, 0.5), (0.25, 0.75), (0.625, 1.5), (1.0, 1.0)):
+        image = loaded.render(WORLD.held_out, share * DURATION_US)
+        np.testing.assert_array_equal(image, lit.render(WORLD.held_out, share * DURATION_US))
+        np.testing.assert_allclose(image, factor * steady.render(WORLD.held_out, share * DURATION_US), rtol=1e-5)
+
+
+@pytest.mark.parametrize("factors", [[[1.0]], [], [1.0, float("nan")], [-1.0]])
+def test_a_light_that_is_none_is_refused(factors: Any, tmp_path: Path) -> None:
+    dataclasses.replace(model("paths"), light=torch.tensor(factors)).save(tmp_path / "m", provenance())
+    with pytest.raises(UserError, match="factors of the light"):
+        load_model(tmp_path / "m")
+
+
 @pytest.mark.parametrize("name", ["hexplane", "paths", "spacetime"])
 def test_a_model_of_the_version_with_flat_settings_renders_as_then(name: str, tmp_path: Path) -> None:
     """The same tensors by the same names, other settings; to the bit here, and elsewhere within the processor's."""
