@@ -29,6 +29,7 @@ from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
 from spike4dgs.benchmark.reports.console import Columns, make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
+from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record, of_scenes
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.results import of_one_seed
@@ -86,6 +87,8 @@ class FitChoice:
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
             error are always computed.
         refit: Fit anew also where OUT holds predictions of the same method, code, settings, scene, seed and budget.
+        in_process: Fit in the benchmark's process, for debuggers. Without it a fit has a process that is given the
+            training part of its scene alone.
         columns: Columns of the table on the terminal: short, or all metrics and costs. results.csv has all.
     """
 
@@ -100,6 +103,7 @@ class FitChoice:
     budget: str = DEFAULT_BUDGET
     metrics: tuple[str, ...] = (AUTO,)
     refit: bool = False
+    in_process: bool = False
     columns: Columns = "short"
 
 
@@ -198,9 +202,9 @@ def _run(
         if not runs and (line := release_line(opened)):
             console.print(line, highlight=False, markup=False)
         out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
-        cluster = (fits.workers, fits.scheduler)
-        typical_s = typical_fit_seconds()
-        settings = Settings(out, fits.seed, device, budget, fits.metrics, fits.seeds, *cluster, fits.refit, typical_s)
+        chosen = (fits.metrics, fits.seeds, fits.workers, fits.scheduler, fits.refit)
+        apart = None if fits.in_process else Apart()
+        settings = Settings(out, fits.seed, device, budget, *chosen, typical_fit_seconds(), apart)
         runs.append(run_split(opened, methods, settings, console, fits.columns))
     return runs
 

@@ -11,6 +11,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO
 from spike4dgs.benchmark.reports.console import make_console, print_results
+from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.leaderboard.season import publish as public
@@ -115,7 +116,7 @@ def predict(
         device: auto, cpu or cuda.
     """
     chosen = [get_method(name) for name in methods]
-    settings = Settings(out, seed, choose_device_for(chosen, device), make_budget(budget))
+    settings = Settings(out, seed, choose_device_for(chosen, device), make_budget(budget), apart=Apart())
     failed = predict_all(open_scenes(scenes), chosen, settings)
     print(f"predictions: {out / 'predictions'}, a folder for each method")
     return 1 if failed else 0

@@ -24,11 +24,13 @@ def submit(
     refit: bool = False,
     replace: bool = False,
     allow_gaps: bool = False,
+    container: str = "",
 ) -> int:
     """Check a result record and enter it into the leaderboard.
 
     With predictions and scenes, every hash and every score is computed again and the entry is labelled re-scored;
-    with --refit the method is fitted again too, and the entry is labelled re-fitted. Anything else is claimed and
+    with --refit the method is fitted again too, by a process that is given the training parts of the scenes alone, and
+    the entry is labelled re-fitted. Anything else is claimed and
     gets no rank. A record of a track's scenes and revisions is on that track's board, any other on a local one.
     Submitting a record twice changes nothing.
 
@@ -40,8 +42,10 @@ def submit(
         refit: Fit the method again, with the record's seed, budget and device, and compare the scores.
         replace: Replace another record of the same method and seed.
         allow_gaps: Accept recordings with gaps.
+        container: Command that starts the process of the second fit, such as one of bwrap or docker; {work} and {part}
+            in it are the folders that the process needs.
     """
-    files = Files(predictions, scenes, allow_gaps, _second_renderings, refit)
+    files = Files(predictions, scenes, allow_gaps, _second_renderings, refit, container)
     return _tell(work.submit(result, files, leaderboard, replace))
 
 

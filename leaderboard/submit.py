@@ -16,6 +16,7 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import PAPER, Budget, Method, choose_device_for, get_method
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.record import COSTS, Record, read_record
 from spike4dgs.benchmark.runs.refinement import SUFFIX
@@ -51,11 +52,16 @@ class Refit:
     tolerance_db: float
     bit_equal: bool
     costs: Mapping[str, Mapping[str, float | None]]
+    apart: str  # what kept the fit to the training parts: PROCESS or CONTAINER
 
 
-def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Console) -> Refit:
+PROCESS, CONTAINER = "process", "container"
+
+
+def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Console, apart: Apart) -> Refit:
     """Fit a record's method on its scenes with its seed, budget and device, and compare the scores.
 
+    Each fit has a process that sees the training part of its scene alone; `apart` may start it in a container.
     The run in `work` resumes after a kill and is removed at the end. Raises UserError where the installed method is
     another one than the record's, where a fit fails, and where a scene's PSNR differs by more than the tolerance.
     """
@@ -65,7 +71,7 @@ def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Cons
     psnr, costs, bit_equal = dict[str, float](), dict[str, Mapping[str, float | None]](), True
     for scene in (s for s in scenes if s.id in record["scenes"]):
         claimed = record["scenes"][scene.id]
-        again = _fit_scene(record, claimed, method, scene, out / scene.id, console)
+        again = _fit_scene(record, claimed, method, scene, out / scene.id, console, apart)
         psnr[scene.id], costs[scene.id] = again["metrics"]["psnr"], {cost: again[cost] for cost in COSTS}
         if abs(psnr[scene.id] - claimed["metrics"]["psnr"]) > TOLERANCE_DB:
             expected = f"a second fit within {TOLERANCE_DB} dB of the claimed {claimed['metrics']['psnr']:.2f} dB"
@@ -73,11 +79,17 @@ def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Cons
             raise problem(f"{name} on {scene.id}", expected, f"{psnr[scene.id]:.2f} dB", fix)
         bit_equal = bit_equal and again["predictions_sha256"] == claimed["predictions_sha256"]
     shutil.rmtree(out)
-    return Refit(psnr, TOLERANCE_DB, bit_equal, costs)
+    return Refit(psnr, TOLERANCE_DB, bit_equal, costs, CONTAINER if apart.container else PROCESS)
 
 
 def _fit_scene(
-    record: Record, claimed: Mapping[str, Any], method: Method, scene: Scene, out: Path, console: Console
+    record: Record,
+    claimed: Mapping[str, Any],
+    method: Method,
+    scene: Scene,
+    out: Path,
+    console: Console,
+    apart: Apart,
 ) -> Mapping[str, Any]:
     wanted, where = record["method"], f"{record['method']['name']} on {scene.id}"
     if claimed["status"] != "ok" or claimed["budget"] is None or wanted["seed"] is None:
@@ -90,7 +102,7 @@ def _fit_scene(
     if other := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):
         fix = "install the version that made the record, or submit without --refit"
         raise problem(where, "the installed method as in the record", f"another {', '.join(other)}", fix)
-    settings = Settings(out, seed=wanted["seed"], device=device, budget=budget, metrics=("psnr",))
+    settings = Settings(out, seed=wanted["seed"], device=device, budget=budget, metrics=("psnr",), apart=apart)
     records = {r["method"]["name"]: r for r in run_matrix([scene], [method], settings, console)}
     cell: Mapping[str, Any] = records[wanted["name"]]["scenes"][scene.id]
     if cell["status"] != "ok" or cell["metrics"]["psnr"] is None:
@@ -110,6 +122,7 @@ class Files:
     allow_gaps: bool = False
     second_renderings: SecondRenderings = no_renderings
     refit: bool = False
+    container: str = ""  # the command that starts the process of a second fit; see `Apart`
 
 
 @dataclass(frozen=True)
@@ -174,7 +187,9 @@ def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
         unverified = [m for m in METRICS if m in computed]
         return Verified(record, {"label": CLAIMED, "unverified": unverified, **nothing}, missing)
     rescored = verify_record(record, result, files.predictions, opened, files.second_renderings)
-    refit = fit_again(record, opened, leaderboard / WORK, make_console()) if files.refit else None
+    refit = None
+    if files.refit:
+        refit = fit_again(record, opened, leaderboard / WORK, make_console(), Apart(files.container))
     verification = {
         "label": RE_FITTED if refit else RE_SCORED,
         "unverified": [m for m in METRICS if m in rescored.unverified],

@@ -31,9 +31,9 @@ from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.predictions import INFO, MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
 from spike4dgs.benchmark.runs.record import PROTOCOL
-from spike4dgs.benchmark.runs.refinement import SUFFIX, Refinable, refined_cameras
+from spike4dgs.benchmark.runs.refinement import SUFFIX, Refinable, refined_cameras, views_of
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
+from spike4dgs.benchmark.scene.scene import Scene, Target, TrainingScene
 from spike4dgs.benchmark.weights import WeightsError
 
 
@@ -128,8 +128,18 @@ class Failure:
     traceback: str
 
 
+class FitFailed(Exception):
+    """The failure of a method in another process."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(failure.reason)
+        self.failure = failure
+
+
 def failure_of(error: Exception) -> Failure:
     """Return the failure that an exception means. Call it where the exception is handled."""
+    if isinstance(error, FitFailed):
+        return error.failure
     if isinstance(error, WeightsError):
         return Failure("skipped", error.reason, traceback.format_exc())  # records travel: no paths of this machine
     reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
@@ -142,17 +152,20 @@ def run_job(
     """Fit, save the model to `model_path` if it can be saved, and render the predictions of the job's variants.
 
     They go to `folders`; `work` holds the checkpoint until these are whole. Only the fit sees `scene.training`;
-    held-out cameras appear only in the calls to render, and refined ones are found after the fit.
+    held-out cameras appear only in the calls to render, and refined ones are found after the fit. All of it happens in
+    this process: `apart.fit_apart` does the same in one that sees the training part alone.
     """
-    request = FitRequest(job.budget, job.device, job.seed, progress)
-    model, fit_seconds = timed_fit(job.method, training_for(job.method, job.scene.training), request, work, note)
+    scene, request = job.scene, FitRequest(job.budget, job.device, job.seed, progress)
+    model, fit_seconds = timed_fit(job.method, training_for(job.method, scene.training), request, work, note)
     if isinstance(model, Savable):
-        model.save(model_path, _provenance(job, fit_seconds))
-    cameras = job.scene.cameras
+        model.save(model_path, provenance_of(job, fit_seconds))
+    cameras = scene.cameras
     for method, folder in zip(job.variants, folders, strict=True):
         if method != job.info:
-            cameras = {**cameras, **refined_cameras(cast(Refinable, model), job.scene)}
-        _predict(job, method, model, cameras, fit_seconds, folder)
+            cameras = {**cameras, **refined_cameras(cast(Refinable, model), views_of(scene))}
+        with PredictionWriter(folder) as writer:
+            costs = render_targets(model, scene, cameras, f"{method.name} on {scene.id}", job.device, writer.add)
+            writer.finish(prediction_info(job, method, {**costs, "fit_seconds": fit_seconds}))
     shutil.rmtree(work)
 
 
@@ -177,39 +190,51 @@ def timed_fit(
     return model, clock.seconds()
 
 
-def _predict(
-    job: Job, method: MethodInfo, model: Model, cameras: Mapping[str, Camera], fit_seconds: float, folder: Path
-) -> None:
-    """Render the targets as `cameras` see them into a predictions folder."""
+def render_targets(
+    model: Model,
+    scene: Scene,
+    cameras: Mapping[str, Camera],
+    where: str,
+    device: str,
+    add: Callable[[Target, Float32, float], None],
+) -> dict[str, float | None]:
+    """Render the scene's targets as `cameras` see them, hand each image and its time in us to `add`, return the costs.
+
+    `where` names the rendering in errors. The costs are those of `COSTS` but for `fit_seconds`.
+    """
     render_seconds, size = 0.0, getattr(model, "size_bytes", None)
-    with PredictionWriter(folder) as writer:
-        for target in job.scene.targets:
-            camera, t_us = cameras[target.camera], job.scene.t_us(target.tick)
-            start = time.perf_counter()
-            image = _render(model, camera, t_us, f"{method.name} on {job.scene.id}, {target.name}")
-            render_seconds += time.perf_counter() - start
-            writer.add(target, image, t_us)
-        writer.finish(
-            PredictionInfo(
-                method=method,
-                scene=job.scene.id,
-                scene_revision=job.scene.revision,
-                split=job.scene.split,
-                budget=job.budget.label,
-                device=job.device,
-                fit_seconds=fit_seconds,
-                render_fps=len(job.scene.targets) / render_seconds,
-                peak_memory_mb=peak_memory_mb(job.device),
-                model_mb=None if size is None else int(size) / 1e6,
-                environment=environment(job.device),
-                harness=harness(),
-                key=job.key,
-                created=utc_now(),
-            )
-        )
+    for target in scene.targets:
+        camera, t_us = cameras[target.camera], scene.t_us(target.tick)
+        start = time.perf_counter()
+        image = _render(model, camera, t_us, f"{where}, {target.name}")
+        render_seconds += time.perf_counter() - start
+        add(target, image, t_us)
+    return {
+        "render_fps": len(scene.targets) / render_seconds,
+        "peak_memory_mb": peak_memory_mb(device),
+        "model_mb": None if size is None else int(size) / 1e6,
+    }
 
 
-def _provenance(job: Job, fit_seconds: float) -> Provenance:
+def prediction_info(job: Job, method: MethodInfo, costs: Mapping[str, float | None]) -> PredictionInfo:
+    """Return what prediction.json says of the predictions of one of the job's variants."""
+    return PredictionInfo(
+        method=method,
+        scene=job.scene.id,
+        scene_revision=job.scene.revision,
+        split=job.scene.split,
+        budget=job.budget.label,
+        device=job.device,
+        environment=environment(job.device),
+        harness=harness(),
+        key=job.key,
+        created=utc_now(),
+        **costs,
+    )
+
+
+def provenance_of(job: Job, fit_seconds: float) -> Provenance:
+    """Return the provenance that is saved with the model of a job."""
     scene = job.scene
     return Provenance(
         method=job.info.as_dict(),

@@ -9,6 +9,7 @@ their own, METHOD.refined, beside the scores at the calibrated pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -30,23 +31,36 @@ class Refinable(Protocol):
         ...
 
 
-def refined_cameras(model: Refinable, scene: Scene) -> dict[str, Camera]:
-    """Return the held-out cameras at the model's estimates of their poses.
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a model gets of a held-out camera to estimate its pose; see the module."""
 
-    Raises UserError for a view in which every pixel moves.
-    """
-    cameras = {}
-    for name in scene.test:
-        targets = [t for t in scene.targets if t.camera == name]
-        start, stop = free_ticks([t.tick for t in targets], scene.n_ticks, round(scene.rate_hz * MAX_MS * 1e-3))
-        image = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
-        background = ~np.any([scene.moving(t) for t in targets], axis=0)
-        if not background.any():
-            fix = "publish the scores at the calibrated pose only"
-            raise problem(f"{scene.id}, {name}", "pixels at which nothing moves", "none", fix)
-        t_us = 0.5 * (scene.t_us(start) + scene.t_us(stop))
-        cameras[name] = model.refine(scene.cameras[name], image.astype(np.float32), background, t_us)
-    return cameras
+    camera: Camera
+    image: Float32  # [H, W]
+    background: Mask  # [H, W]
+    t_us: float
+
+
+def views_of(scene: Scene) -> tuple[View, ...]:
+    """Return a view of each held-out camera. Raises UserError for one in which every pixel moves."""
+    return tuple(_view(scene, name) for name in scene.test)
+
+
+def _view(scene: Scene, name: str) -> View:
+    targets = [t for t in scene.targets if t.camera == name]
+    start, stop = free_ticks([t.tick for t in targets], scene.n_ticks, round(scene.rate_hz * MAX_MS * 1e-3))
+    image = scene.stream(name).counts(start, stop) / np.float32((stop - start) * scene.radiance_gain)
+    background = ~np.any([scene.moving(t) for t in targets], axis=0)
+    if not background.any():
+        fix = "publish the scores at the calibrated pose only"
+        raise problem(f"{scene.id}, {name}", "pixels at which nothing moves", "none", fix)
+    t_us = 0.5 * (scene.t_us(start) + scene.t_us(stop))
+    return View(scene.cameras[name], image.astype(np.float32), background, t_us)
+
+
+def refined_cameras(model: Refinable, views: Sequence[View]) -> dict[str, Camera]:
+    """Return the cameras of some views at the model's estimates of their poses."""
+    return {v.camera.id: model.refine(v.camera, v.image, v.background, v.t_us) for v in views}
 
 
 def free_ticks(ticks: Sequence[int], n_ticks: int, most: int) -> tuple[int, int]:

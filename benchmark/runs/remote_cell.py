@@ -8,7 +8,6 @@ a lost one. Elsewhere it lies on the worker, and the fit of a lost worker begins
 from __future__ import annotations
 
 import os
-import pickle
 import socket
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -19,8 +18,10 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, write_bytes
-from spike4dgs.benchmark.method import Budget, Method, choose_device_for, find_methods, get_method, no_progress
-from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, run_job
+from spike4dgs.benchmark.method import Budget, choose_device_for, no_progress
+from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
+from spike4dgs.benchmark.runs.apart.messages import packed_method, unpacked_method
+from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of
 from spike4dgs.benchmark.runs.predictions import PredictionWriter
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
@@ -59,6 +60,7 @@ class Order:
     key: str  # of the caller's job
     folder: SharedFolder
     work: Path  # of the checkpoint, in the shared folder
+    apart: Apart | None = None
 
 
 @dataclass(frozen=True)
@@ -70,10 +72,10 @@ class Fitted:
     notes: tuple[str, ...]
 
 
-def make_order(job: Job, folder: SharedFolder, work: Path) -> Order:
+def make_order(job: Job, folder: SharedFolder, work: Path, apart: Apart | None = None) -> Order:
     """Return the order for a job. Raises an exception where the method can neither be pickled nor found by its name."""
     return Order(
-        method=_pickled_or_named(job.method),
+        method=packed_method(job.method),
         scene=job.scene.root.absolute(),
         split=job.scene.split,
         revision=job.scene.revision,
@@ -83,6 +85,7 @@ def make_order(job: Job, folder: SharedFolder, work: Path) -> Order:
         key=job.key,
         folder=folder,
         work=work.absolute(),
+        apart=apart,
     )
 
 
@@ -97,7 +100,7 @@ def fit_order(order: Order) -> Fitted | Failure:
         model, notes = Path(scratch) / "model.safetensors", list[str]()
         with _work_folder(order, Path(scratch) / "work") as work:
             try:
-                run_job(job, folders, model, work, no_progress, notes.append)
+                fit_job(job, folders, model, work, no_progress, notes.append, order.apart)
             except Exception as e:  # the method's failure, not the worker's
                 return failure_of(e)
         files = tuple(_read_files(folder) for folder in folders)
@@ -113,21 +116,12 @@ def store(fitted: Fitted, folders: Sequence[Path], model: Path) -> None:
             writer.copy(files)
 
 
-def _pickled_or_named(method: Method) -> bytes | str:
-    try:
-        return pickle.dumps(method)
-    except Exception:  # what pickle raises depends on the object
-        if find_methods().get(method.name) is method:
-            return method.name
-        raise
-
-
 def _job(order: Order) -> Job:
     """Return the job on this machine. Raises UserError where it is another one than the caller's."""
     worker = f"worker {os.getpid()} on {socket.gethostname()}"
     scene = _open(order.scene, order.split, order.revision, worker)
     try:
-        method = get_method(order.method) if isinstance(order.method, str) else pickle.loads(order.method)
+        method = unpacked_method(order.method)
         device = choose_device_for([method], order.device)
         job = Job(method, scene, order.seed, device, order.budget)
         if job.key == order.key:

@@ -7,8 +7,8 @@ OUT/logs/METHOD__SCENE.log      the traceback of a failed cell
 OUT/work/KEY/                   the checkpoint of an unfinished fit
 OUT/seed-K/                     the same for each further seed K
 
-Cells are fitted here one after another, or by processes or the workers of a cluster in any order. This process writes
-and scores everything.
+Cells are fitted here one after another, or by processes or the workers of a cluster in any order. Either way a fit may
+have a process for itself (`apart`). This process writes and scores everything.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, write_text
 from spike4dgs.benchmark.method import Budget, Method, no_progress
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
-from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, run_job, why_not_kept
+from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
+from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, why_not_kept
 from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
 from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
 from spike4dgs.benchmark.runs.predictions import open_predictions
@@ -59,6 +60,7 @@ class Settings:
     scheduler: str | None = None
     refit: bool = False  # also where predictions are there
     typical_s: Mapping[str, float] = field(default_factory=dict)  # of fits by method, somewhere: their ratios count
+    apart: Apart | None = None  # fits have a process each, which sees the training part alone; None: they see all
 
     def folder(self, seed: int) -> Path:
         """Return the folder that keeps what comes of a seed."""
@@ -77,6 +79,7 @@ class JobFiles:
     job: Job
     out: Path
     refit: bool = False
+    apart: Apart | None = None
 
     @property
     def title(self) -> str:
@@ -137,7 +140,12 @@ def run_matrix(
         _check_inputs(scene)
     selection = select_metrics(settings.metrics)
     jobs = [
-        JobFiles(Job(method, scene, seed, settings.device, settings.budget), settings.folder(seed), settings.refit)
+        JobFiles(
+            Job(method, scene, seed, settings.device, settings.budget),
+            settings.folder(seed),
+            settings.refit,
+            settings.apart,
+        )
         for seed in range(settings.seed, settings.seed + settings.seeds)
         for method in methods
         for scene in scenes
@@ -171,10 +179,10 @@ def _run_cells(
 
 
 def fit_here(files: JobFiles, shown: ShownCell) -> Failure | None:
-    """Fit in this process, or keep what is there; return the failure of the method, if it failed."""
+    """Fit on this machine, or keep what is there; return the failure of the method, if it failed."""
     try:
         if not files.is_done(shown):
-            run_job(files.job, files.folders, files.model, files.work, shown.progress, shown.note)
+            fit_job(files.job, files.folders, files.model, files.work, shown.progress, shown.note, files.apart)
     except Exception as e:  # whatever a method does wrong is its cell's failure, not the run's
         return failure_of(e)
     return None
@@ -193,7 +201,7 @@ def _spread(
             if files.is_done(ShownCell(no_progress, notes[k].append)):
                 settled[k] = None
             else:
-                orders[k] = make_order(files.job, folder, files.work)
+                orders[k] = make_order(files.job, folder, files.work, files.apart)
         except Exception as e:  # a method that cannot travel
             settled[k] = failure_of(e)
     arrivals = run(fit_order, list(orders.values()))

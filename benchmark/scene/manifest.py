@@ -89,13 +89,19 @@ class Manifest(Shown):
             raise problem(path, f"sha256 {digest[:16]}...", f"{actual[:16]}...", fix)
 
 
-def write_manifest(root: Path) -> Manifest:
-    """Hash every file below `root` (hidden files and the manifest itself excepted) and write manifest.json."""
+def write_manifest(root: Path, known: Manifest | None = None) -> Manifest:
+    """Hash every file below `root` (hidden files and the manifest itself excepted) and write manifest.json.
+
+    The hashes of files that were checked already may be `known`.
+    """
     meta = _scene_json(root)
     files: dict[str, dict[str, Any]] = {}
     for path in sorted(p for p in root.rglob("*") if p.is_file()):
         name = path.relative_to(root).as_posix()
-        if name != NAME and not any(part.startswith(".") for part in Path(name).parts):
+        if known and name in known.files:
+            files[name] = dict(zip(("bytes", "sha256"), known.files[name], strict=True))
+            files[name] |= {"content": known.recorded[name]} if name in known.recorded else {}
+        elif name != NAME and not any(part.startswith(".") for part in Path(name).parts):
             files[name] = {"bytes": path.stat().st_size, "sha256": sha256_file(path)}
             if is_encoded(name) and (content := _content(path, name, meta)):
                 files[name]["content"] = content

@@ -70,11 +70,11 @@ def stream_name(camera: str) -> str:
     return f"spikes/{camera}.dat"
 
 
-def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
+def finish_scene(root: Path, scene: SceneDescription, known: Manifest | None = None) -> Manifest:
     """Write scene.json, transforms, targets, the COLMAP model, README and croissant.json; last of all the manifest.
 
-    The streams, images and everything else are already in `root`. A folder without manifest.json is an unfinished
-    scene.
+    The streams, images and everything else are already in `root`; files of another scene that are `known` are not
+    hashed again. A folder without manifest.json is an unfinished scene.
     """
     size, splits = scene.cameras[0], scene.all_splits
     meta = {
@@ -107,7 +107,7 @@ def finish_scene(root: Path, scene: SceneDescription) -> Manifest:
     write_colmap(root / "sparse" / "0", scene.cameras, scene.points)
     write_text(root / "README.md", _readme(root, scene))
     write_croissant(root, meta, f"{scene.title}. {_summary(scene)}")
-    return write_manifest(root)
+    return write_manifest(root, known)
 
 
 def _write_targets(root: Path, scene: SceneDescription) -> None:

@@ -71,6 +71,7 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
         "name": row.name,
         "method": method["name"],
         "label": row.label,
+        "apart": row.apart,
         "ranked": row.ranked,
         "why": row.why,
         "seeds": [r["method"]["seed"] or 0 for r in row.records],

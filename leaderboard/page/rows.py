@@ -52,6 +52,12 @@ class Row:
         """The record of the first seed."""
         return self.records[0]
 
+    @property
+    def apart(self) -> str:
+        """What kept its second fits to the training parts, such as "process"; empty where there were none."""
+        refits = (e["verification"]["refit"] for e in self.entries.values())
+        return " / ".join(sorted({refit["apart"] for refit in refits if refit and "apart" in refit}))
+
 
 @dataclass(frozen=True)
 class Board:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.scene.verify import verify_content
 from spike4dgs.leaderboard.season.results import TABLE, read_result, read_results, result_path, table_text
@@ -21,7 +22,6 @@ from spike4dgs.leaderboard.season.season_file import (
     read_opening,
     season_folder,
 )
-from spike4dgs.leaderboard.season.training_part import write_training_part
 from spike4dgs.leaderboard.verify import verify_record
 
 _FORGED = "the published file was changed after the commitment, or is another season's"

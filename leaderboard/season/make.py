@@ -10,6 +10,7 @@ from spike4dgs.benchmark.environment import cpu_name, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.method import make_budget
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season.season_file import (
     OPENING_NAME,
@@ -26,7 +27,6 @@ from spike4dgs.leaderboard.season.season_file import (
     write_secret,
 )
 from spike4dgs.leaderboard.season.secret_folder import pack_file, pack_scene, scene_folder, training_folder
-from spike4dgs.leaderboard.season.training_part import write_training_part
 
 
 def make_season(

@@ -15,6 +15,7 @@ from spike4dgs.benchmark.method import Method, choose_device_for, get_method, ma
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.record import PROTOCOL, Record, check_record, is_complete, with_later_metrics
@@ -38,7 +39,8 @@ def predict_all(scenes: Sequence[Scene], methods: Sequence[Method], settings: Se
         RunDisplay(make_console(), len(scenes) * len(methods), [m.name for m in methods for _ in scenes]) as display,
     ):
         for method, scene in product(methods, scenes):
-            files = JobFiles(Job(method, scene, settings.seed, settings.device, settings.budget), settings.out)
+            job = Job(method, scene, settings.seed, settings.device, settings.budget)
+            files = JobFiles(job, settings.out, apart=settings.apart)
             with display.cell(f"{method.name} on {scene.id}") as shown:
                 if failure := fit_here(files, shown):
                     write_text(files.log, failure.traceback)
@@ -179,7 +181,7 @@ def score_season(
         if methods:
             chosen = [get_method(name) for name in methods]
             on = choose_device_for(chosen, device)
-            settings = Settings(runs_folder(secret), season.fit_seed, on, make_budget(season.budget))
+            settings = Settings(runs_folder(secret), season.fit_seed, on, make_budget(season.budget), apart=Apart())
             failed = predict_all(open_committed(secret, season, training=True), chosen, settings)
             refused += [f"{name}: not fitted, see its log in {settings.out / 'logs'}" for name in sorted(failed)]
             ran = [settings.out / "predictions" / name for name in methods if name not in failed]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, run
+from nosy_methods import Darker, PlaysBack
 from submissions import board, enter, read, release_of, submit
 
 from spike4dgs.benchmark import plugins
@@ -162,11 +163,10 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
 ) -> None:
     submitted = read(enter(done))["submitted"]
     entry = read(enter(done, refit=True))
-    assert installed["tfp+4dgs"].fits == 2
     refit = entry["verification"]["refit"]
     claimed = {scene: cell["metrics"]["psnr"] for scene, cell in entry["record"]["scenes"].items()}
     assert (entry["verification"]["label"], entry["submitted"]) == ("re-fitted", submitted)
-    assert refit["psnr"] == pytest.approx(claimed) and refit["bit_equal"] is True
+    assert refit["psnr"] == pytest.approx(claimed) and refit["bit_equal"] is True and refit["apart"] == "process"
     (row,) = board(done)["boards"][0]["rows"]
     costs = row["costs"]["fit_seconds"]
     assert row["label"] == "re-fitted" and costs["re-fitted"] == pytest.approx(
@@ -177,14 +177,16 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
     assert not list((done / "board/.refit").iterdir())
 
 
-def test_a_score_that_the_method_does_not_reach_is_refused(done: Path, installed: dict[str, Any]) -> None:
-    class Worse(CountMethod):
-        def fit(self, scene: Any, request: Any) -> Any:
-            model = super().fit(scene, request)
-            model.image = 0.9 * model.image
-            return model
+def test_a_method_that_finds_the_held_out_stream_is_not_fitted_again(done: Path, installed: dict[str, Any]) -> None:
+    installed["plays-back"] = PlaysBack()
+    run(done / "out", [done / "s0", done / "s1"], PlaysBack())
+    assert json.loads((done / "out/results/plays-back.json").read_text())["mean"]["psnr"] > 25
+    with pytest.raises(UserError, match="plays-back on pattern-0: expected a second fit that ends, found ValueError"):
+        enter(done, "plays-back", refit=True)
 
-    installed["tfp+4dgs"] = Worse("tfp+4dgs")
+
+def test_a_score_that_the_method_does_not_reach_is_refused(done: Path, installed: dict[str, Any]) -> None:
+    installed["tfp+4dgs"] = Darker("tfp+4dgs")
     with pytest.raises(UserError, match=r"on pattern-0: expected a second fit within 0\.3 dB of the claimed"):
         enter(done, refit=True)
     assert not (done / "board/local").exists()

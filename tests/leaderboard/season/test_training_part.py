@@ -14,6 +14,7 @@ from made_season import Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.metrics.measure import select_metrics
+from spike4dgs.benchmark.runs.apart.training_part import training_files, write_training_part
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.held_out import has_truth
 from spike4dgs.benchmark.runs.score import open_for, score_scene
@@ -21,7 +22,6 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season.season_file import OPENING_NAME, read_opening
 from spike4dgs.leaderboard.season.secret_folder import pack_scene, scene_folder, training_folder
-from spike4dgs.leaderboard.season.training_part import training_files, write_training_part
 
 SCENE = "car-9003-tiny"
 DESCRIPTIONS = ("scene.json", "manifest.json", "targets.json", "croissant.json", "README.md")

@@ -35,7 +35,7 @@ Spike4DGS.details = (() => {
       ["Method", `${row.method}${found.version ? `, version ${found.version}` : ""}`],
       ["Parts", Object.entries(row.parts).map(([k, v]) => `${k}: ${v}`).join(", ")],
       ["Given", row.given.join(", ") || "streams, clock and intrinsics only"],
-      ["Verified", row.label],
+      ["Verified", Spike4DGS.table.labelOf(row)],
       ["Why no rank", row.why],
       ["Run", found.run],
       ...found.entries.map((e) => ["Entry", `${e.path}, submitted ${e.submitted}, sha256 ${e.sha256}`]),

@@ -5,6 +5,14 @@ Spike4DGS.table = (() => {
   const MOST = 50; // rows that are drawn, for speed; a button shows the others
   const SCREEN = 20; // rows that are drawn at once; the rest follows when these are on the screen
   let rest = () => {};
+  const PROOFS = { // what a label proves, and what it does not
+    claimed: "nothing was computed again.",
+    "re-scored": "the images have these scores. Who made them, and from what, is not proven.",
+    "re-fitted": "the method reaches these scores when it is fitted again, by a process that is given the training part of a scene alone. "
+      + "A process can read every file that its user can read, and public scenes can be rendered by everybody: only a container keeps a method from "
+      + "files that it looks for, and only a season's scenes are unknown to it.",
+  };
+  const labelOf = (row) => (row.apart ? `${row.label} (${row.apart})` : row.label);
 
   /* `ranks`: row number -> {best, worst, ties()}; null while they are computed. `leftOut`: why others have none. */
   function draw(page, state, view, ranks, leftOut, act) {
@@ -26,6 +34,7 @@ Spike4DGS.table = (() => {
         c === metric && paper && el("th", { scope: "col", class: "number paper", title: view.board.published.source }, `${names[view.metric]}, paper`)]),
       el("th", { scope: "col" }, "Verified")));
     const best = bestValues(view);
+    const labels = new Set(view.shown.map((item) => item.row.label));
     const line = (item) => el("tr", { "data-row": item.row.name },
       rankCell(view, item, ranks, leftOut),
       el("th", { scope: "row", class: "name" },
@@ -34,7 +43,7 @@ Spike4DGS.table = (() => {
       view.columns.map((c) => [
         el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
-      el("td", { class: "nowrap" }, item.row.label));
+      el("td", { class: "nowrap", title: PROOFS[item.row.label] }, labelOf(item.row)));
     const body = el("tbody", {}, rows.slice(0, SCREEN).map(line));
     rest = () => body.append(...rows.slice(SCREEN).map(line));
     const caption = el("caption", {}, el("div", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
@@ -46,7 +55,9 @@ Spike4DGS.table = (() => {
     fill(byId("below"),
       view.shown.length > rows.length && el("button", { type: "button", id: "more", onclick: () => act.change({ all: true }) },
         `Show all ${view.shown.length} rows`),
-      paper && el("p", { class: "small" }, `Paper: ${view.board.published.source}`));
+      paper && el("p", { class: "small" }, `Paper: ${view.board.published.source}`),
+      el("p", { class: "small" }, el("strong", {}, "Verified. "), Object.entries(PROOFS).filter(([label]) => labels.has(label))
+        .map(([label, text]) => [el("em", {}, label), `: ${text} `])));
     count(view, rows.length, act);
   }
 
@@ -97,5 +108,5 @@ Spike4DGS.table = (() => {
     byId("scroller").style.minHeight = "";
   }
 
-  return { draw, finish };
+  return { draw, finish, labelOf };
 })();

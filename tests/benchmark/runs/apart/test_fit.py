@@ -1,0 +1,274 @@
+"""A fit in a process that sees the training part alone: what it sees, what it makes, and how it ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import dummy_methods
+import nosy_methods
+import pytest
+from changes import edit_json, files_in
+from dummy_methods import CountMethod, FailingMethod, WorkerKiller, prediction_bytes, run, wait_for, without_timings
+from nosy_methods import LacksWeights, Lies, LooksAround, PlaysBack, Refines, Swaps
+from rich.console import Console
+from small_scenes import write_small_scene
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Budget, get_method
+from spike4dgs.benchmark.runs.apart.fit import Apart
+from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+
+PSNR: dict[str, Any] = {"metrics": ("psnr",)}
+APART: dict[str, Any] = {"apart": Apart(), **PSNR}
+MADE = {"kind": "mitsuba", "world": "carousel", "variant": 7, "seed": 918273645, "versions": {"mitsuba": "3.98.7"}}
+
+
+@pytest.fixture
+def made_scene(small_scene: Path) -> Path:
+    """A scene that says how it was made, with recordings of light and darkness for two cameras."""
+    edit_json(small_scene / "scene.json", lambda meta: meta.update(source=MADE, title="A carousel"))
+    write_manifest(small_scene)
+    return small_scene
+
+
+def cell_of(records: list[dict[str, Any]]) -> dict[str, Any]:
+    (cell,) = records[0]["scenes"].values()
+    return dict(cell)
+
+
+def test_the_bits_are_those_of_a_fit_in_this_process(small_scene: Path, tmp_path: Path) -> None:
+    methods = (CountMethod(), get_method("tfp+static"))
+    here = run(tmp_path / "here", [small_scene], *methods, seed=3, budget=Budget(0.01), **PSNR)
+    apart = run(tmp_path / "apart", [small_scene], *methods, seed=3, budget=Budget(0.01), **APART)
+    assert [cell["status"] for r in apart for cell in r["scenes"].values()] == ["ok", "ok"]
+    assert prediction_bytes(tmp_path / "apart") == prediction_bytes(tmp_path / "here")
+    assert [without_timings(r) for r in apart] == [without_timings(r) for r in here]
+    models = [tmp_path / mode / "models/tfp+static/pattern-0.safetensors" for mode in ("here", "apart")]
+    assert all(path.is_file() for path in models)
+    info, other = (
+        json.loads((tmp_path / mode / "predictions/counts/pattern-0/prediction.json").read_text())
+        for mode in ("here", "apart")
+    )
+    assert {k: v for k, v in info.items() if k in ("key", "scene_revision", "split", "scene", "method", "budget")} == {
+        k: v for k, v in other.items() if k in ("key", "scene_revision", "split", "scene", "method", "budget")
+    }
+    assert other["fit_seconds"] > 0 and other["render_fps"] > 0 and other["peak_memory_mb"] > 10
+    again = CountMethod()
+    run(tmp_path / "here", [small_scene], again, seed=3, budget=Budget(0.01), **APART)
+    assert again.fits == 0, "what a fit in this process made is kept"
+
+
+def test_the_held_out_stream_is_not_next_to_the_others(small_scene: Path, tmp_path: Path) -> None:
+    cell = cell_of(run(tmp_path / "here", [small_scene], PlaysBack(), **PSNR))
+    assert cell["status"] == "ok" and cell["metrics"]["psnr"] > 25, "a method that looks for it in the scene finds it"
+    cell = cell_of(run(tmp_path / "apart", [small_scene], PlaysBack(), **APART))
+    assert cell["status"] == "failed" and "not enough values to unpack" in cell["error"]
+    assert not (tmp_path / "apart/predictions/plays-back/pattern-0").exists()
+
+
+def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_made(
+    made_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["spike4dgs", "run-benchmark", str(made_scene)])
+    monkeypatch.setenv("SPIKE4DGS_RELEASE", str(tmp_path))
+    monkeypatch.chdir(made_scene.parent)
+    seen, scene = tmp_path / "seen.json", open_scene(made_scene)
+    cell = cell_of(run(tmp_path / "out", [made_scene], LooksAround(seen), **APART))
+    assert cell["status"] == "ok"
+    found = json.loads(seen.read_text())
+    assert found["files"] == [
+        "README.md",
+        "croissant.json",
+        "manifest.json",
+        "scene.json",
+        *(f"sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")),
+        *(f"spikes/cam_0{i}.dat" for i in range(3)),
+        "targets.json",
+        *(f"transforms_{name}.json" for name in ("all", "test", "train")),
+    ]
+    assert not found["links"], "symbolic links say where the scene lies"
+    assert {found["names"][f"spikes/cam_0{i}.dat"] for i in range(3)} == {2}, "no copies"
+    text = json.dumps({key: found[key] for key in ("texts", "scene", "folder", "argv", "input")})
+    for secret in ("carousel", "918273645", "3.98.7", "pattern-0", str(made_scene)):
+        assert secret not in text, secret
+    assert json.loads(found["texts"]["scene.json"])["source"] == {"kind": "mitsuba"}
+    assert str(made_scene.parent) not in {found["environment"].get(name) for name in ("PWD", "SPIKE4DGS_RELEASE")}
+    assert found["scene"][:2] == ["scene", scene.revision]
+    training = scene.training.cameras
+    assert found["cameras"] == [
+        [c.id, *c.K.ravel().tolist(), *c.R.ravel().tolist(), *c.t.tolist()] for c in training
+    ], "poses to the last bit"
+    captured = capfd.readouterr()
+    assert "printed to standard output" in captured.err and "printed" not in captured.out
+
+
+@pytest.mark.parametrize("split", ["corner", "views-3"])
+def test_other_splits_hold_out_their_own_cameras(split: str, tmp_path: Path) -> None:
+    scene, seen = write_small_scene(tmp_path / "scene", splits=True), tmp_path / "seen.json"
+    with open(os.devnull, "w") as nothing:
+        opened = open_scene(scene, split=split)
+        (record,) = run_matrix([opened], [LooksAround(seen)], Settings(tmp_path / "o", **APART), Console(file=nothing))
+        (here,) = run_matrix([opened], [CountMethod()], Settings(tmp_path / "h", **PSNR), Console(file=nothing))
+    assert record["mean"] == here["mean"] and record["dataset"]["split"] == split
+    streams = [name for name in json.loads(seen.read_text())["files"] if name.startswith("spikes/")]
+    assert streams == [f"spikes/{camera}.dat" for camera in opened.train]
+
+
+def test_refined_views_are_sent_after_the_images_are_taken(small_scene: Path, tmp_path: Path) -> None:
+    method = Refines(tmp_path / "seen.json")
+    plain, refined = run(tmp_path / "out", [small_scene], method, **APART)
+    seen = json.loads((tmp_path / "seen.json").read_text())
+    assert seen["before"] == 3 and seen["image"] > 0 and 0 < seen["background"] < 40 * 24
+    assert [plain["method"]["name"], refined["method"]["name"]] == ["refines", "refines.refined"]
+    here = run(tmp_path / "here", [small_scene], Refines(tmp_path / "here.json"), **PSNR)
+    assert [r["mean"] for r in here] == [plain["mean"], refined["mean"]] and plain["mean"] != refined["mean"]
+    assert prediction_bytes(tmp_path / "out") == prediction_bytes(tmp_path / "here")
+    assert json.loads((tmp_path / "here.json").read_text()) == seen
+    model = json.loads((tmp_path / "out/models/refines/pattern-0.safetensors").read_text())
+    assert model == {"scene": "pattern-0", "revision": open_scene(small_scene).revision}
+
+
+def test_failures_come_back_as_from_this_process(small_scene: Path, tmp_path: Path) -> None:
+    user = UserError("here: expected light, found none; add some")
+    methods = [FailingMethod("value", ValueError("no luck")), FailingMethod("user", user), LacksWeights("weights")]
+    here = run(tmp_path / "here", [small_scene], *methods, **PSNR)
+    apart = run(tmp_path / "apart", [small_scene], *methods, CountMethod(), **APART)
+    assert [r["scenes"] for r in apart[:3]] == [r["scenes"] for r in here]
+    assert apart[3]["scenes"]["pattern-0"]["status"] == "ok"
+    assert "ValueError: no luck" in (tmp_path / "apart/logs/value__pattern-0.log").read_text()
+    assert not list((tmp_path / "apart").glob("work/*/part"))
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ((b"not JSON\n",), "expected a line of JSON from the fit's process"),
+        ((b'["done", null]\n',), "expected the line rendered, found ValueError: done"),
+        ((b'["rendered", {"fit_seconds": -1}]\n',), "expected numbers for fit_seconds, render_fps"),
+        ((b'["rendered", {"fit_seconds": null}]\n',), "expected numbers for fit_seconds"),
+        ((b'["failed", {"status": "ok", "reason": "so", "traceback": ""}]\n',), "so"),
+        (
+            (
+                b'["rendered", {"fit_seconds": 1, "render_fps": 1, "peak_memory_mb": 1, "model_mb": null}]\n',
+                b'["done", null]\n',
+            ),
+            "expected an image of a target, found none",
+        ),
+    ],
+)
+def test_a_process_that_says_what_it_must_not_fails_its_cell(
+    small_scene: Path, tmp_path: Path, lines: tuple[bytes, ...], message: str
+) -> None:
+    cell = cell_of(run(tmp_path / "out", [small_scene], Lies(lines), **APART))
+    assert cell["status"] == "failed" and message in cell["error"]
+    assert not (tmp_path / "out/predictions/lies/pattern-0").exists()
+
+
+def test_a_link_in_the_place_of_an_image_is_refused(small_scene: Path, tmp_path: Path) -> None:
+    truth = small_scene / "images/cam_03/000020.exr"
+    cell = cell_of(run(tmp_path / "out", [small_scene], Swaps(truth), **APART))
+    assert cell["status"] == "failed" and "expected an image of a target" in cell["error"]
+
+
+def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on_with_it(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "bullet").touch()
+    methods = (WorkerKiller("killer", tmp_path), CountMethod())
+    killed, other = run(tmp_path / "out", [small_scene], *methods, **APART)
+    assert "its end by signal 9" in cell_of([killed])["error"] and cell_of([other])["status"] == "ok"
+    assert cell_of(run(tmp_path / "out", [small_scene], methods[0], **APART))["status"] == "ok"
+    assert (tmp_path / "begins.txt").read_text().split() == ["0", "2"]
+    run(tmp_path / "whole", [small_scene], CountMethod("killer"), **PSNR)
+    same = "predictions/killer/pattern-0"
+    assert prediction_bytes(tmp_path / "out" / same) == prediction_bytes(tmp_path / "whole" / same)
+
+
+def caller(out: Path, scene: Path, folder: Path) -> subprocess.Popen[bytes]:
+    """Start a run in a process group whose method waits in its fit."""
+    code = (
+        "import sys; sys.path[:0] = sys.argv[4:]\n"
+        "from pathlib import Path; from dummy_methods import WaitingMethod, run\n"
+        "from spike4dgs.benchmark.runs.apart.fit import Apart\n"
+        "out, scene, folder = map(Path, sys.argv[1:4])\n"
+        "run(out, [scene], WaitingMethod('waits', folder), metrics=('psnr',), apart=Apart())\n"
+    )
+    support = str(Path(dummy_methods.__file__).parent)
+    command = [sys.executable, "-c", code, str(out), str(scene), str(folder), support]
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE)
+    wait_for(lambda: (folder / "begun").exists() or process.poll() is not None)
+    assert process.poll() is None
+    return process
+
+
+@pytest.mark.parametrize("how", ["kill", "interrupt"])
+def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path, tmp_path: Path, how: str) -> None:
+    process = caller(tmp_path / "out", small_scene, tmp_path)
+    assert len(list(tmp_path.glob("out/work/*/part/scene.json"))) == 1
+    if how == "kill":
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(60) in (-signal.SIGKILL, 1, -signal.SIGINT)
+    wait_for(lambda: not list(tmp_path.glob("out/work/*/part")))
+    assert process.stderr is not None
+    if how == "interrupt":
+        text = process.stderr.read().decode()  # ends when no process holds the pipe
+        assert text.count("KeyboardInterrupt") == 1, text
+    process.stderr.close()
+    (tmp_path / "go").touch()
+    waits = dummy_methods.WaitingMethod("waits", tmp_path)
+    assert cell_of(run(tmp_path / "out", [small_scene], waits, **APART))["status"] == "ok"
+    assert files_in(tmp_path / "out/work") == {}
+
+
+def test_progress_and_notes_reach_the_caller(small_scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "bullet").touch()
+    killer = WorkerKiller("killer", tmp_path)
+    run(tmp_path / "out", [small_scene], killer, **APART)
+    console = Console(file=(text := io.StringIO()), width=200)
+    run_matrix([open_scene(small_scene)], [killer], Settings(tmp_path / "out", **APART), console)
+    assert "resuming after" in text.getvalue()
+
+
+def test_workers_fit_apart_too(small_scene: Path, tmp_path: Path) -> None:
+    records = run(tmp_path / "out", [small_scene], PlaysBack(), CountMethod(), workers=2, **APART)
+    run(tmp_path / "here", [small_scene], CountMethod(), **PSNR)
+    assert [cell_of([r])["status"] for r in records] == ["failed", "ok"]
+    assert prediction_bytes(tmp_path / "out") == prediction_bytes(tmp_path / "here")
+
+
+def has_namespaces() -> bool:
+    command = ["unshare", "--user", "--map-root-user", "--mount", "--pid", "--fork", "true"]
+    return bool(shutil.which("unshare")) and subprocess.run(command, capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not has_namespaces(), reason="needs unshare and user namespaces")
+def test_in_a_container_not_even_a_known_path_is_read(small_scene: Path, tmp_path: Path) -> None:
+    """The command of the documentation: an empty folder lies over the scene's."""
+
+    method = nosy_methods.ReadsPath(small_scene / "spikes/cam_03.dat")
+    assert cell_of(run(tmp_path / "process", [small_scene], method, **APART))["status"] == "ok", "a process reads it"
+    unshare = "unshare --user --map-root-user --mount --net --pid --fork --kill-child --mount-proc"
+    fence = f"""{unshare} sh -c 'mount -t tmpfs none "$0" && exec "$@"' {small_scene}"""
+    settings = {"apart": Apart(fence), **PSNR}
+    cell = cell_of(run(tmp_path / "container", [small_scene], method, **settings))
+    assert cell["status"] == "failed" and "FileNotFoundError" in cell["error"]
+    assert cell_of(run(tmp_path / "container", [small_scene], CountMethod(), **settings))["status"] == "ok"
+
+
+def test_a_command_that_cannot_start_is_one_error(small_scene: Path, tmp_path: Path) -> None:
+    for command, message in (("no-such-program x", "no-such-program"), ("'", "No closing quotation")):
+        settings = {"apart": Apart(command), **PSNR}
+        cell = cell_of(run(tmp_path / "out", [small_scene], CountMethod(), **settings))
+        assert cell["status"] == "failed" and message in cell["error"] and "--container" in cell["error"]
