@@ -45,7 +45,7 @@ def submit(
         container: Command that starts the process of the second fit, such as one of bwrap or docker; {work} and {part}
             in it are the folders that the process needs.
     """
-    files = Files(predictions, scenes, allow_gaps, _second_renderings, refit, container)
+    files = Files(predictions, scenes, allow_gaps, second_renderings_of, refit, container)
     return _tell(work.submit(result, files, leaderboard, replace))
 
 
@@ -57,7 +57,8 @@ def submit_all(results: Mapping[Path, Path | None], **options: Any) -> int:
     return _tell(work.submit_all(results, **options))
 
 
-def _second_renderings(scene: Scene) -> Renderings | None:
+def second_renderings_of(scene: Scene) -> Renderings | None:
+    """Return second renderings of a target, as far as one of our worlds made the scene."""
     from spike4dgs.generators.second_renderings import second_renderings  # Mitsuba, only where it renders
 
     return second_renderings(scene)

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.benchmark.runs.apart.fit import Apart
+from spike4dgs.benchmark.runs.record import Record
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.cli.submit import second_renderings_of
+from spike4dgs.leaderboard.submit import WORK, fit_again
 from spike4dgs.leaderboard.tracks import current_release
 from spike4dgs.leaderboard.verify import verify_leaderboard as check
 
@@ -17,23 +24,35 @@ def verify_leaderboard(
     predictions: Path | None = None,
     scenes: tuple[Path, ...] = (),
     allow_gaps: bool = False,
+    refit: bool = False,
+    container: str = "",
 ) -> int:
     """Check a leaderboard folder: the release is the frozen one, entries are as submitted, boards follow from them.
 
-    With predictions and scenes, entries are scored again too, as far as their files are there. Problems are listed on
-    stderr, and the exit code is 1.
+    With predictions and scenes, entries are scored again too, as far as their files are there, and what they say of
+    their verification is compared with what comes out. That takes half a minute a scene for second renderings of a
+    target. With --refit those that are labelled re-fitted are fitted again. Problems are listed on stderr, and the exit
+    code is 1.
 
     Args:
         leaderboard: Leaderboard folder.
         predictions: Folder of a run's predictions, METHOD/SCENE.
         scenes: Scene folders.
         allow_gaps: Accept recordings with gaps.
+        refit: Fit again what is labelled re-fitted.
+        container: Command that starts the process of such a fit, as in `submit`.
     """
     release = current_release()
-    found = check(leaderboard, predictions, scenes, allow_gaps)
+
+    def again(record: Record, opened: Sequence[Scene]) -> object:
+        return fit_again(record, opened, leaderboard / WORK, make_console(), Apart(container))
+
+    found = check(leaderboard, predictions, scenes, allow_gaps, second_renderings_of, again if refit else None)
     for line in found.problems:
         print(f"error: {line}", file=sys.stderr)
-    again = f", {found.scored} scored again" if predictions is not None else ""
+    again_text = f", {found.scored} scored again" if predictions is not None else ""
+    if found.not_fitted:
+        again_text += f", {found.not_fitted} labelled re-fitted and not fitted again (--refit)"
     count = f"{len(found.problems)} problems" if found.problems else "no problems"
-    print(f"{leaderboard}: release {release.number}, {found.entries} entries{again}, {count}")
+    print(f"{leaderboard}: release {release.number}, {found.entries} entries{again_text}, {count}")
     return 1 if found.problems else 0

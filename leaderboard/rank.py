@@ -4,9 +4,9 @@
     local.json         boards of other scenes, revisions or splits, with the reason
     archive.json       entries from before release 1, without ranks
 
-A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration. Those
-are re-scored or re-fitted, complete, and without flags, which follow from the entry and the release. Every other entry
-is a row of its own after them, without rank.
+A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration, which
+is equal code, parameters and verification. Those are re-scored or re-fitted, complete, and without flags, which follow
+from the entry and the release. Every other entry is a row of its own after them, without rank.
 """
 
 from __future__ import annotations
@@ -118,10 +118,11 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict
 
     `entries` are by path. Without `ranked` no row has a rank.
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[tuple[bool, str], list[str]] = {}
     for path, entry in sorted(entries.items()):
-        groups.setdefault(_configuration(entry) if ranked and may_be_ranked(entry) else path, []).append(path)
-    rows = [(key not in entries, _row([entries[path] for path in paths], paths)) for key, paths in groups.items()]
+        counts = ranked and may_be_ranked(entry)
+        groups.setdefault((counts, counts and _configuration(entry) or path), []).append(path)
+    rows = [(counts, _row([entries[path] for path in paths], paths)) for (counts, _), paths in groups.items()]
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
 
     def order(row: tuple[bool, dict[str, Any]]) -> tuple[bool, float, str, str]:
@@ -137,8 +138,10 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict
 def may_be_ranked(entry: Entry) -> bool:
     """Return whether an entry is re-scored or re-fitted, complete and without flags."""
     record = entry["record"]
+    checked = entry["verification"]
     complete = is_complete(record) and record["mean"][PRIMARY] is not None
-    return complete and entry["verification"]["label"] != CLAIMED and not flags_of(entry)
+    verified = checked["label"] != CLAIMED and PRIMARY not in checked["unverified"]
+    return complete and verified and not flags_of(entry)
 
 
 def flags_of(entry: Mapping[str, Any]) -> list[str]:
@@ -173,12 +176,17 @@ def _names(text: str, name: str) -> bool:
     return re.search(rf"(?<![\w.-]){re.escape(name)}(?![\w.-]*\w)", text, re.IGNORECASE) is not None
 
 
-def _configuration(entry: Entry) -> str:
-    """Return what the seeds of a method have in common: all of the method but the seed, and budgets and devices."""
-    record = entry["record"]
+def _configuration(entry: Entry) -> str | None:
+    """Return what the seeds of a method have in common: all of the method but the seed, budgets, code, verification.
+
+    None where the code that fitted is not stated: such images may be of anything that bears the method's name.
+    """
+    record, checked = entry["record"], entry["verification"]
     method = {k: v for k, v in record["method"].items() if k != "seed"}
-    cells = {scene: cell["budget"] for scene, cell in record["scenes"].items()}
-    return json.dumps([method, cells], sort_keys=True)
+    cells = {scene: (cell["budget"], cell["fitted_with"]["harness"]) for scene, cell in record["scenes"].items()}
+    if any(code is None for _, code in cells.values()):
+        return None
+    return json.dumps([method, cells, checked["label"], sorted(checked["unverified"])], sort_keys=True)
 
 
 def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:

@@ -133,6 +133,10 @@ class _Download:
         with writing(finished):
             os.replace(pending, finished)
             (root / _STARTED).unlink(missing_ok=True)
+        listed = manifest.read_manifest(root)
+        for name in listed.recorded:
+            if (root / name).is_file():  # some are not asked for
+                listed.path(name)
         if self.selection.is_whole and (revision := open_scene(root, allow_gaps=True).revision) != scene.revision:
             fix = "the release was packed wrongly: tell its owner"
             raise problem(root, f"revision {scene.revision}", revision, fix)

@@ -20,6 +20,7 @@ from spike4dgs.benchmark.untrusted import MAX_SIDE
 GRAY = (0.212671, 0.715160, 0.072169)  # luminance of linear R, G, B (CIE XYZ's Y of sRGB primaries, as Mitsuba has it)
 Shape = tuple[int, int]  # H, W
 _AGAIN = "render or restore it"
+_MOST_CHANNELS = 16  # of an EXR: renderers write colour, depth, ids, flow and normals
 _MOST_SAMPLES = 1 << 27  # pixels times channels: 512 MB as floats
 _PNG_ERRORS = (SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error)  # beside OSError
 
@@ -144,14 +145,32 @@ def _read_channels(
 
 
 def _check_headers(path: Path, headers: Sequence[Mapping[str, Any]], shape: Shape | None) -> None:
-    """Raise UserError unless the first part has that shape, and none is too large to decode: all of them are."""
+    """Raise UserError unless the first part has that shape, and none is too large to decode: all of them are.
+
+    A window that is shifted, or another one to display, says that the pixels belong elsewhere: other programs would
+    show another image than the one that is scored.
+    """
     samples = 0
     for i, header in enumerate(headers):
-        (x0, y0), (x1, y1) = (map(int, corner) for corner in header["dataWindow"])
+        data, display = (_window(header[f"{name}Window"]) for name in ("data", "display"))
+        (x0, y0), (x1, y1) = data
         found = y1 - y0 + 1, x1 - x0 + 1
         _check_size(path, found, None if i else shape)
-        samples += found[0] * found[1] * len(header["channels"])
+        if data != display or (x0, y0) != (0, 0):
+            expected = f"a data window and a display window from (0, 0) to ({found[1] - 1}, {found[0] - 1})"
+            fix = "write the image without an offset or a crop"
+            raise problem(path, expected, f"{data[0]} to {data[1]} and {display[0]} to {display[1]}", fix)
+        if (channels := len(header["channels"])) > _MOST_CHANNELS:
+            fix = "write the channel Y alone"
+            raise problem(path, f"an image of at most {_MOST_CHANNELS} channels", str(channels), fix)
+        samples += found[0] * found[1] * channels
     _check_samples(path, samples)
+
+
+def _window(corners: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first and the last pixel (x, y) of a header's window."""
+    (x0, y0), (x1, y1) = (map(int, corner) for corner in corners)
+    return (x0, y0), (x1, y1)
 
 
 def _check_size(path: Path, found: Shape, shape: Shape | None) -> None:

@@ -1,7 +1,7 @@
 """manifest.json: the size and SHA-256 of every file of a scene, and the hash of the content of encoded data.
 
-The hashes of contents make the revision without a file being decoded, or even there. A reader of a file checks its
-bytes; `scene.verify` decodes them too and checks what the manifest says of their content.
+The hashes of contents make the revision without a file being decoded, or even there. Whoever reads a file checks its
+bytes and, by decoding them, its content: what is fitted and scored is what the revision was made of.
 """
 
 from __future__ import annotations
@@ -33,18 +33,22 @@ class Manifest(Shown):
     files: dict[str, tuple[int, str]]
     recorded: dict[str, str] = field(default_factory=dict)
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
+    _decoded: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def _about(self) -> str:
         return f"of {self.root.name[:100]}: {len(self.files)} files"
 
     def path(self, name: str) -> Path:
-        """Return the path of a recorded file after its size and hash were checked (once per process).
+        """Return the path of a recorded file after its size, hash and content were checked (once per process).
 
         Raises UserError where the file is not recorded, is missing, or differs from its record.
         """
         if name not in self._checked:
             self._check(name)
             self._checked.add(name)
+        if name not in self._decoded and name in self.recorded and is_encoded(name):
+            self._check_content(name)
+            self._decoded.add(name)
         return self.root / name
 
     def only(self, prefix: str) -> Manifest:
@@ -66,7 +70,7 @@ class Manifest(Shown):
         return found
 
     def problems(self) -> Iterator[str]:
-        """Check every recorded file and yield one line for each that is missing or differs."""
+        """Check the bytes of every recorded file and yield one line for each that is missing or differs."""
         for name in self.files:
             try:
                 self._check(name)
@@ -87,6 +91,12 @@ class Manifest(Shown):
         if (actual := sha256_file(path)) != digest:
             fix = "the file was changed or damaged: restore it or make the scene again"
             raise problem(path, f"sha256 {digest[:16]}...", f"{actual[:16]}...", fix)
+
+    def _check_content(self, name: str) -> None:
+        recorded, path = self.recorded[name], self.root / name
+        if (found := hash_content(path, name, _scene_json(self.root))) != recorded:
+            fix = "the manifest claims another content: restore the scene or make it again"
+            raise problem(path, f"content {recorded[:16]}...", f"{found[:16]}...", fix)
 
 
 def write_manifest(root: Path, known: Manifest | None = None) -> Manifest:

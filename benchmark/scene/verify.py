@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.content import data_files
 from spike4dgs.benchmark.scene.scene import Scene
 
 
@@ -17,11 +17,6 @@ def verify_content(scene: Scene) -> Iterator[str]:
     """
     for name in data_files(scene.manifest.files, scene.meta["streams"]).values():
         try:
-            path = scene.manifest.path(name)
-            if is_encoded(name) and (recorded := scene.manifest.recorded.get(name)):
-                found = hash_content(path, name, scene.meta)
-                if found != recorded:
-                    fix = "the manifest claims another content: restore the scene or make it again"
-                    raise problem(path, f"content {recorded[:16]}...", f"{found[:16]}...", fix)
+            scene.manifest.path(name)
         except UserError as e:
             yield str(e)

@@ -72,6 +72,7 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
         "method": method["name"],
         "label": row.label,
         "apart": row.apart,
+        "unverified": sorted(row.unverified),
         "ranked": row.ranked,
         "why": row.why,
         "seeds": [r["method"]["seed"] or 0 for r in row.records],

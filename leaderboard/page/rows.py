@@ -53,6 +53,11 @@ class Row:
         return self.records[0]
 
     @property
+    def unverified(self) -> set[str]:
+        """The metrics whose values are as claimed in an entry: they give no rank."""
+        return {metric for e in self.entries.values() for metric in e["verification"]["unverified"]}
+
+    @property
     def apart(self) -> str:
         """What kept its second fits to the training parts, such as "process"; empty where there were none."""
         refits = (e["verification"]["refit"] for e in self.entries.values())

@@ -38,10 +38,13 @@ def rounded(value: float | None) -> float | None:
 def image_scores(board: Board, metric: str) -> ImageScores:
     """Return the scores of a metric.
 
-    A row is compared if it may be ranked and has a score for every image that most rows have one for. An image without
-    a score in every row, such as the first of a temporal error, has no part in any mean.
+    A row is compared if it may be ranked, the metric was computed again from its images, and it has a score for every
+    image that most rows have one for. An image without a score in every row, such as the first of a temporal error, has
+    no part in any mean.
     """
     left_out = {i: row.why or "not ranked" for i, row in enumerate(board.rows) if not row.ranked}
+    claimed = f"{METRICS[metric].title} as claimed: the verifier lacked its weights"
+    left_out |= {i: claimed for i, row in enumerate(board.rows) if row.ranked and metric in row.unverified}
     scored = {i: _scored(row, board.scenes, metric) for i, row in enumerate(board.rows) if i not in left_out}
     union = [sorted(set().union(*(names[s] for names in scored.values()))) for s in range(len(board.scenes))]
     for i, names in scored.items():

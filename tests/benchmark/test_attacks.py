@@ -259,8 +259,9 @@ def test_folders_of_streams_and_of_spikecv(tmp_path: Path) -> None:
 def with_window(path: Path, width: int, height: int) -> Path:
     """The image, whose header states another size."""
     data = bytearray(path.read_bytes())
-    at = data.index(b"dataWindow\0box2i\0") + 21
-    data[at : at + 16] = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    for name in (b"dataWindow", b"displayWindow"):
+        at = data.index(name + b"\0box2i\0") + len(name) + 11
+        data[at : at + 16] = struct.pack("<4i", 0, 0, width - 1, height - 1)
     path.write_bytes(data)
     return path
 
@@ -277,14 +278,50 @@ def test_an_exr_of_another_size_than_expected(tmp_path: Path) -> None:
     refused(lambda: read_exr(tmp_path / "a.exr", (24, 41)), "expected an image of 41x24 pixels, found 40x24")
 
 
-def test_an_exr_of_many_channels(tmp_path: Path) -> None:
+def write_windows(path: Path, **windows: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    """Write 40x24 pixels with other windows."""
     import OpenEXR
 
-    channels = {f"c{i}": np.zeros((2000, 2000), np.float16) for i in range(34)}
+    named = {name: tuple(np.array(corner, np.int32) for corner in corners) for name, corners in windows.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **named}
+    OpenEXR.File(header, {"Y": np.ones((24, 40), np.float16)}).write(str(path))
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [
+        {"dataWindow": ((3, 5), (42, 28)), "displayWindow": ((0, 0), (39, 23))},
+        {"dataWindow": ((3, 5), (42, 28)), "displayWindow": ((3, 5), (42, 28))},
+        {"dataWindow": ((0, 0), (39, 23)), "displayWindow": ((0, 0), (799, 599))},
+        {"dataWindow": ((0, 0), (39, 23)), "displayWindow": ((10, 0), (39, 23))},
+    ],
+)
+def test_an_exr_whose_pixels_belong_elsewhere(tmp_path: Path, windows: dict[str, Any]) -> None:
+    write_windows(tmp_path / "a.exr", dataWindow=((0, 0), (39, 23)), displayWindow=((0, 0), (39, 23)))
+    assert read_exr(tmp_path / "a.exr", (24, 40)).shape == (24, 40)
+    write_windows(tmp_path / "a.exr", **windows)
+    message = r"expected a data window and a display window from \(0, 0\) to \(39, 23\), found \(.*; write the image"
+    refused(lambda: read_exr(tmp_path / "a.exr", (24, 40)), message)
+
+
+def test_an_exr_of_a_thousand_channels(tmp_path: Path) -> None:
+    import OpenEXR
+
+    channels = {"Y": np.ones((24, 40), np.float16), **{f"c{i}": np.ones((24, 40), np.float16) for i in range(999)}}
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(
         str(tmp_path / "a.exr")
     )
-    refused(lambda: read_exr(tmp_path / "a.exr"), "samples in all its channels, found 136000000")
+    refused(lambda: read_exr(tmp_path / "a.exr", (24, 40)), "expected an image of at most 16 channels, found 1000")
+
+
+def test_an_exr_of_many_channels(tmp_path: Path) -> None:
+    import OpenEXR
+
+    channels = {f"c{i}": np.zeros((2900, 2900), np.float16) for i in range(16)}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(
+        str(tmp_path / "a.exr")
+    )
+    refused(lambda: read_exr(tmp_path / "a.exr"), "samples in all its channels, found 134560000")
 
 
 @pytest.mark.parametrize("size", [(36000, 36000), (16384, 16384), (2**31 - 1, 1), (0, 0)])

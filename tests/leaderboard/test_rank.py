@@ -92,6 +92,32 @@ def test_a_row_is_the_mean_over_the_seeds_of_one_configuration(finished: Path) -
     ]
 
 
+def test_seeds_join_only_with_equal_code_parameters_and_verification(finished: Path) -> None:
+    """Gray images under another method's name are a row of their own, whatever they leave equal."""
+    record = json.loads((finished / "out/results/rough.json").read_text())
+
+    def of(seed: int, change: Any) -> Record:
+        found = entry_with(record, "a", 40.0 - 20 * (seed > 0), "2026-01-02T00:00:00Z", seed)
+        change(found)
+        return found
+
+    def fitted_with(harness: Any) -> Any:
+        return lambda e: [cell["fitted_with"].update(harness=harness) for cell in e["record"]["scenes"].values()]
+
+    other_commit = {**record["harness"], "commit": "ab" * 20}
+    refit = {"psnr": {}, "tolerance_db": 0.3, "bit_equal": True, "costs": {}}
+    for change in (
+        fitted_with(None),
+        fitted_with(other_commit),
+        lambda e: e["verification"].update(label="re-fitted", refit=refit),
+        lambda e: e["verification"].update(unverified=["metaiqa"]),
+        lambda e: e["record"]["method"].update(version="0.0.1"),
+    ):
+        assert ranks([of(0, lambda e: None), of(1, change)]) == [("a", 1, [0], 40.0), ("a", 2, [1], 20.0)]
+    assert ranks([of(0, fitted_with(None)), of(1, fitted_with(None))]) == [("a", 1, [0], 40.0), ("a", 2, [1], 20.0)]
+    assert ranks([of(0, lambda e: None), of(1, lambda e: None)]) == [("a", 1, [0, 1], 30.0)]
+
+
 def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     class Half(CountMethod):
         def fit(self, scene: Any, *args: Any, **kwargs: Any) -> Any:

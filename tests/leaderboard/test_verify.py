@@ -1,24 +1,32 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from changes import edit_json
+from changes import edit_json, exchange
 from dummy_methods import CountMethod, run
+from nosy_methods import Darker
 from submissions import board, edit_with_ledger, enter, entry_of, raise_metric, read, release_of, submit
 
+from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import INFO, SUMS
+from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE
 from spike4dgs.cli.score import score
 from spike4dgs.cli.verify_leaderboard import verify_leaderboard
-from spike4dgs.leaderboard import tracks
+from spike4dgs.leaderboard import tracks, verify
+from spike4dgs.leaderboard.truth_check import TruthCheck, check_truth
 
 
 def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
@@ -83,6 +91,13 @@ def test_missing_predictions_and_paths_are_refused(done: Path) -> None:
 def test_other_predictions_of_the_method_are_refused(done: Path) -> None:
     with pytest.raises(UserError, match="give the predictions that were scored"):
         enter(done, predictions=done / "out/predictions/rough")
+
+
+def test_an_exchanged_truth_is_refused(done: Path) -> None:
+    gray = np.full((24, 40), 0.5, np.float32)
+    exchange(done / "s0", "images/cam_03/000040.exr", lambda path: write_exr(path, gray, 2000.0))
+    with pytest.raises(UserError, match=r"images/cam_03/000040\.exr: expected content"):
+        enter(done)
 
 
 @pytest.fixture
@@ -211,6 +226,75 @@ def test_a_forgery_that_agrees_with_itself_is_found_with_the_files(
     assert not problems(done, capsys)
     (line,) = problems(done, capsys, **files(done))
     assert "tfp+4dgs.json, scene pattern-0" in line and "as computed from the files" in line
+
+
+def edit_truth(**changes: Any) -> Any:
+    return lambda entry: entry["verification"]["truth"]["pattern-0"].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (edit_truth(equal_pixels=0.0), r"scene pattern-0: expected equal_pixels 0\.\d+, as computed again, found 0\.0"),
+        (edit_truth(equal_images=1), "expected equal_images 0, as computed again, found 1"),
+        (lambda e: e["verification"]["truth"].pop("pattern-1"), "expected a check beside the truth of each scored"),
+        (
+            lambda e: e["verification"].update(label="re-fitted", refit=REFIT),
+            "expected a second fit of pattern-0, patt",
+        ),
+        (
+            lambda e: e["verification"].update(label="re-fitted", refit={**REFIT, "psnr": dict.fromkeys(SCENES, 90.0)}),
+            "found 90.00 dB",
+        ),
+    ],
+)
+def test_an_edited_verification_is_found_with_the_files(
+    done: Path, capsys: pytest.CaptureFixture[str], change: Any, message: str
+) -> None:
+    """Truth check or label edited together with the ledger: what was recomputed is compared."""
+    edit_with_ledger(enter(done), change)
+    enter(done, "rough")  # writes the boards anew
+    assert not problems(done, capsys)
+    lines = problems(done, capsys, **files(done))
+    assert len(lines) == 1 and "tfp+4dgs.json" in lines[0] and re.search(message, lines[0]), lines
+
+
+REFIT = {"psnr": {"pattern-0": 20.0}, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
+SCENES = ("pattern-0", "pattern-1")
+
+
+def test_flags_that_an_edit_hid_are_found(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A noise share that was edited, or removed as if nobody had measured it."""
+    edit_with_ledger(enter(done), edit_truth(noise_share=0.0, noise_share_error=0.01, ceiling_db=60.0))
+    enter(done, "rough")
+
+    def check(share: float) -> tuple[str, ...]:
+        def measured(*args: Any) -> TruthCheck:
+            return replace(check_truth(*args), noise_share=share, noise_share_error=0.01, ceiling_db=60.0)
+
+        monkeypatch.setattr(verify, "check_truth", measured)
+        return verify.verify_leaderboard(done / "board", **files(done)).problems
+
+    assert not check(0.001)
+    assert len(check(0.5)) == 2 and "expected noise_share 0.5, as computed again, found 0.0" in check(0.5)[1]
+    assert "expected the flags carries the truth's noise (pattern-0, pattern-1)" in check(0.5)[0], "rough states none"
+
+
+def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
+    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    methods: dict[str, Any] = {"tfp+4dgs": CountMethod("tfp+4dgs")}
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+    enter(done)
+    enter(done, refit=True)
+    capsys.readouterr()
+    assert verify_leaderboard(done / "board", **files(done)) == 0
+    assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in capsys.readouterr().out
+    assert verify_leaderboard(done / "board", **files(done), refit=True) == 0
+    methods["tfp+4dgs"] = Darker("tfp+4dgs")
+    (line,) = problems(done, capsys, **files(done), refit=True)
+    assert "expected a second fit within 0.3 dB of the claimed" in line
 
 
 def test_the_committed_leaderboard_has_no_problems(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -27,3 +28,11 @@ def flip_bit(path: Path, byte: int, bit: int = 0) -> None:
 def files_in(folder: Path) -> dict[str, bytes]:
     """Return relative path -> bytes of every file, hidden ones included."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def exchange(scene: Path, name: str, write: Callable[[Path], object]) -> None:
+    """Put another file in the place of a scene's. The manifest gets its bytes and keeps the first content."""
+    write(scene / name)
+    data = (scene / name).read_bytes()
+    facts = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    edit_json(scene / "manifest.json", lambda manifest: manifest["files"][name].update(facts))

@@ -15,19 +15,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changes import files_in, flip_bit
+from changes import exchange, files_in, flip_bit
 from fake_hub import REPOSITORY, serve_hub
 from range_server import Behaviour, serve
+from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release import scenes as scenes_module
 from spike4dgs.benchmark.release import source as source_module
 from spike4dgs.benchmark.release.index import BLOCK
+from spike4dgs.benchmark.release.pack import pack
 from spike4dgs.benchmark.release.scenes import Report, download, open_release
 from spike4dgs.benchmark.release.selection import Selection
 from spike4dgs.benchmark.release.source import Patience, Source
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.images import write_exr
+from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.cli import main
 
@@ -64,6 +67,15 @@ def test_scenes_come_out_as_they_were(whole: dict[str, bytes], scene_folders: tu
     assert {name for name in whole if name.startswith("pattern-1/")} == {
         f"pattern-1/{p.relative_to(scene_folders[1])}" for p in scene_folders[1].rglob("*") if p.is_file()
     }
+
+
+def test_a_release_whose_truth_was_exchanged_is_refused(tmp_path: Path) -> None:
+    root = write_small_scene(tmp_path / "pattern-1")
+    gray = np.full((24, 40), 0.5, np.float32)
+    exchange(root, "images/cam_03/000040.exr", lambda path: write_exr(path, gray, 2000.0))
+    pack(open_scenes([root]), tmp_path / "release", "1", 6_000_000)
+    with pytest.raises(UserError, match=r"images/cam_03/000040\.exr: expected content .* the manifest claims another"):
+        fetch(str(tmp_path / "release"), tmp_path / "out")
 
 
 @pytest.mark.parametrize("scheme", ["path", "file", "memory"])

@@ -15,7 +15,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from changes import flip_bit
+from changes import exchange, flip_bit
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
 from rich.console import Console
 from small_scenes import write_small_scene
@@ -27,7 +27,7 @@ from spike4dgs.benchmark.runs.cell import FitClock, Job
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.record import check_record, of_scenes
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
-from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.images import read_exr, write_exr, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
@@ -258,6 +258,24 @@ def test_a_damaged_scene_is_refused_before_any_work(small_scene: Path, tmp_path:
     flip_bit(small_scene / name, (small_scene / name).stat().st_size // 2)
     method = CountMethod()
     with pytest.raises(UserError, match=name):
+        run(tmp_path / "out", [small_scene], method)
+    assert method.fits == 0
+
+
+@pytest.mark.parametrize("kind", ["images", "masks"])
+def test_a_truth_that_was_exchanged_is_not_scored_under_the_first_ones_revision(
+    small_scene: Path, tmp_path: Path, kind: str
+) -> None:
+    revision = open_scene(small_scene).revision
+    if kind == "images":
+        name = "images/cam_03/000040.exr"
+        exchange(small_scene, name, lambda path: write_exr(path, np.full((24, 40), 0.5, np.float32), 2000.0))
+    else:
+        name = "masks/cam_03/000040.png"
+        exchange(small_scene, name, lambda path: write_mask(path, np.ones((24, 40), bool)))
+    assert open_scene(small_scene).revision == revision, "the manifest claims the content of the first one"
+    method = CountMethod()
+    with pytest.raises(UserError, match=f"{name}: expected content .*; the manifest claims another content"):
         run(tmp_path / "out", [small_scene], method)
     assert method.fits == 0
 

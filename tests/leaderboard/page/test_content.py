@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from page_boards import board, cell, failed, row
 
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics
 from spike4dgs.leaderboard.page.rows import Board, find_board
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores, rounded
@@ -55,6 +57,20 @@ def test_sensors_are_the_releases_or_what_records_state(committed: list[Board]) 
     made[0].first["sensors"] = {"s": "ideal", "t": "noisy"}
     made[1].first["sensors"] = {"s": "ideal"}
     assert [scene["sensor"] for scene in board_content(board("b", made), "b")["scenes"]] == ["ideal", "noisy"]
+
+
+def test_a_metric_that_nobody_computed_again_gives_no_rank() -> None:
+    """A false LPIPS, where the verifier lacked the weights."""
+    values = {"psnr": np.full(2, 20.0), "lpips_vgg": np.full(2, 0.3)}
+    honest, false = row("honest", {"s": cell(values)}), row("false", {"s": cell({**values, "lpips_vgg": np.zeros(2)})})
+    refit = {"verification": {"unverified": ["lpips_vgg"], "refit": None}}
+    false = replace(false, entries={"local/s@0/false.json": refit})
+    scores = image_scores(board("b", [honest, false]), "lpips_vgg")
+    assert list(scores.values) == [0]
+    assert scores.left_out == {1: f"{METRICS['lpips_vgg'].title} as claimed: the verifier lacked its weights"}
+    assert list(image_scores(board("b", [honest, false]), "psnr").values) == [0, 1]
+    content = board_content(board("b", [honest, false]), "b")
+    assert [r["unverified"] for r in content["rows"]] == [[], ["lpips_vgg"]]
 
 
 def test_rows_are_compared_where_every_image_has_a_score() -> None:

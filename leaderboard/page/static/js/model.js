@@ -121,9 +121,10 @@ Spike4DGS.model = (() => {
     const sign = descending ? -1 : 1;
     const byName = (a, b) => (a.row.name < b.row.name ? -1 : a.row.name > b.row.name ? 1 : a.index - b.index);
     if (column === "name") return (a, b) => sign * byName(a, b);
+    const proven = (item) => (item.row.unverified.includes(column) ? null : item.values[column]);
     return (a, b) => {
-      const x = a.values[column];
-      const y = b.values[column];
+      const x = proven(a);
+      const y = proven(b);
       if (x === null || y === null) return (x === null) - (y === null) || byName(a, b);
       return sign * (x - y) || byName(a, b);
     };

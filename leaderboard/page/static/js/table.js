@@ -41,7 +41,7 @@ Spike4DGS.table = (() => {
         el("button", { type: "button", class: "link", "aria-haspopup": "dialog", onclick: () => act.change({ row: item.row.name }) }, item.row.name),
         note(view, item)),
       view.columns.map((c) => [
-        el("td", { class: item.values[c.id] !== null && item.values[c.id] === best[c.id] ? "number best" : "number" }, format(c, item.values[c.id])),
+        el("td", { class: isBest(item, c, best) ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
       el("td", { class: "nowrap", title: PROOFS[item.row.label] }, labelOf(item.row)));
     const body = el("tbody", {}, rows.slice(0, SCREEN).map(line));
@@ -61,10 +61,13 @@ Spike4DGS.table = (() => {
     count(view, rows.length, act);
   }
 
+  const isClaimed = (item, c) => item.row.unverified.includes(c.id);
+  const isBest = (item, c, best) => !isClaimed(item, c) && item.values[c.id] !== null && item.values[c.id] === best[c.id];
+
   function bestValues(view) {
     const found = {};
     for (const c of view.columns) {
-      const values = view.shown.map((item) => item.values[c.id]).filter((v) => v !== null);
+      const values = view.shown.filter((item) => !isClaimed(item, c)).map((item) => item.values[c.id]).filter((v) => v !== null);
       found[c.id] = values.length ? (c.higher ? Math.max(...values) : Math.min(...values)) : null;
     }
     return found;
@@ -89,6 +92,8 @@ Spike4DGS.table = (() => {
       const which = item.missing.map((s) => `${view.board.scenes[s].id} ${item.row.cells[s].why}`);
       lines.push(`incomplete: ${which.join("; ")}`);
     } else if (!item.row.ranked && item.row.why) lines.push(`not ranked: ${item.row.why}`);
+    const claimed = view.columns.filter((c) => isClaimed(item, c) && item.row.label !== "claimed");
+    if (claimed.length) lines.push(`as claimed, for lack of weights: ${claimed.map((c) => c.title).join(", ")}`);
     if (item.row.seeds.length > 1) lines.push(`${item.row.seeds.length} seeds`);
     return lines.map((text) => el("div", { class: "note" }, text));
   }
