@@ -9,8 +9,8 @@ Spike4DGS.table = (() => {
     claimed: "nothing was computed again.",
     "re-scored": "the images have these scores. Who made them, and from what, is not proven.",
     "re-fitted": "the method reaches these scores when it is fitted again, by a process that is given the training part of a scene alone. "
-      + "A process can read every file that its user can read, and public scenes can be rendered by everybody: only a container keeps a method from "
-      + "files that it looks for, and only a season's scenes are unknown to it.",
+      + "A process can read every file that its user can read, and public scenes can be rendered by everybody: only a container (submit --refit "
+      + "--container) keeps a method from files that it looks for, and only a season's scenes are unknown to it.",
   };
   const labelOf = (row) => (row.apart ? `${row.label} (${row.apart})` : row.label);
 
