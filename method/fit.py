@@ -26,6 +26,7 @@ from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
+from spike4dgs.method.self_calibration.dark_drift import in_todays_dark
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.supervision.base import Supervision
@@ -139,7 +140,7 @@ class RecipeMethod(Shown):
         check_device(request.device)
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
-        scene = as_pinholes(scene)
+        scene = as_pinholes(in_todays_dark(scene))
         start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"], request.device))
         return self._fit(scene, start, settings, request)
 

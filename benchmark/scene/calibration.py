@@ -12,7 +12,7 @@ A recording is raw (calibration/flat/CAMERA.dat) or counted (.npz), with the sam
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,10 @@ class Calibration(Shown):
         height, width = self.gain.shape
         dead = int((self.gain <= 0).sum())
         return f"of a camera: {width}x{height} pixels, {dead} dead, {self.radiance_gain:.4g} spikes per tick of white"
+
+    def in_dark_of(self, scale: float) -> Calibration:
+        """Return the response with dark rates `scale` times as high: itself for 1."""
+        return self if scale == 1 else replace(self, dark=self.dark * np.float32(scale))
 
     def radiance(self, rate: Float32) -> Float32:
         """Return the linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""

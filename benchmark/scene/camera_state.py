@@ -1,4 +1,4 @@
-"""The state of a camera in an array beside its pose: clock, gain, bad pixels; its own ticks for those of the array."""
+"""The state of a camera in an array beside its pose: clock, gain, dark rate, bad pixels; its ticks for the array's."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class CameraState:
 
     clock: Clock = Clock()
     gain: float = 1.0  # spikes per light, relative to the array's `radiance_gain`; beside any flat field
+    dark: float = 1.0  # dark rates, relative to those of the recordings
     bad: Mask | None = None  # [H, W], pixels whose spikes say nothing; None: no such pixel is known
 
 

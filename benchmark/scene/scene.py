@@ -57,7 +57,7 @@ class TrainingScene(Shown):
     states: Mapping[str, CameraState] = field(default_factory=dict)  # by camera; see `state`
 
     def state(self, camera: str) -> CameraState:
-        """Return a camera's clock, gain and bad pixels, as far as they were estimated."""
+        """Return a camera's clock, gain, dark rate and bad pixels, as far as they were estimated."""
         return self.states.get(camera, PERFECT)
 
     def frames(self, camera: str) -> Frames:
@@ -70,9 +70,12 @@ class TrainingScene(Shown):
 
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...] | None:
-        """Each camera's response to light, estimated from its recordings; None unless all cameras have some."""
+        """Each camera's response to light, from its recordings and its state; None unless all have recordings."""
         known = [r for r in self.recordings if r is not None]
-        return tuple(estimate(r) for r in known) if known and len(known) == len(self.cameras) else None
+        if not known or len(known) < len(self.cameras):
+            return None
+        found = zip(self.cameras, map(estimate, known), strict=True)
+        return tuple(c.in_dark_of(self.state(camera.id).dark) for camera, c in found)
 
     @property
     def duration_us(self) -> float:

@@ -55,7 +55,7 @@ def light_of(scene: TrainingScene) -> Light | None:
     light = estimate_light(scene.streams, [scene.state(camera.id).clock for camera in scene.cameras])
     if light:
         spread = 100 * float(np.std(light.factors))
-        print(f"the light of {scene.id} changes by {spread:.1f} % RMS: fitted in its mean", file=sys.stderr)
+        print(f"the light changes by {spread:.1f} % RMS: fitted in its mean", file=sys.stderr)
     return light
 
 
