@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from submissions import board, enter, read, release_of, submit
 
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.cli.submit import submit_all
 
 
@@ -174,7 +176,7 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
     )
     assert costs["claimed"] != costs["re-fitted"]
     assert "tfp+4dgs: re-fitted, rank 1 of 1" in capsys.readouterr().out
-    assert not list((done / "board/.refit").iterdir())
+    assert [path.name for path in (done / "board/.refit").iterdir()] == [".made-by"]
 
 
 def test_a_method_that_finds_the_held_out_stream_is_not_fitted_again(done: Path, installed: dict[str, Any]) -> None:
@@ -190,6 +192,21 @@ def test_a_score_that_the_method_does_not_reach_is_refused(done: Path, installed
     with pytest.raises(UserError, match=r"on pattern-0: expected a second fit within 0\.3 dB of the claimed"):
         enter(done, refit=True)
     assert not (done / "board/local").exists()
+
+
+def test_a_sent_folder_of_second_fits_is_not_taken_for_one(done: Path, installed: dict[str, Any]) -> None:
+    """A method that does not reach its scores comes with `.refit`, in which the claimed images wait."""
+    installed["tfp+4dgs"] = Darker("tfp+4dgs")
+    record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
+    work = done / "board/.refit" / sha256_json([record["method"], record["dataset"]])[:16]
+    for number, scene in enumerate(("pattern-0", "pattern-1")):
+        run(work / scene, [done / f"s{number}"], Darker("tfp+4dgs"))
+        sent = work / scene / "predictions/tfp+4dgs" / scene
+        key = json.loads((sent / "prediction.json").read_text())["key"]
+        shutil.copytree(done / "out/predictions/tfp+4dgs" / scene, sent, dirs_exist_ok=True)
+        edit_json(sent / "prediction.json", lambda info, key=key: info.update(key=key))
+    with pytest.raises(UserError, match=r"on pattern-0: expected a second fit within 0\.3 dB of the claimed"):
+        enter(done, refit=True)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, get_method
-from spike4dgs.benchmark.runs.apart.fit import Apart
+from spike4dgs.benchmark.runs.apart.fit import Apart, fit_apart
+from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -239,6 +241,22 @@ def test_progress_and_notes_reach_the_caller(small_scene: Path, tmp_path: Path) 
     console = Console(file=(text := io.StringIO()), width=200)
     run_matrix([open_scene(small_scene)], [killer], Settings(tmp_path / "out", **APART), console)
     assert "resuming after" in text.getvalue()
+
+
+def test_the_part_is_on_the_disk_of_the_scene(small_scene: Path, tmp_path: Path) -> None:
+    other = Path("/dev/shm")
+    if not other.is_dir() or other.stat().st_dev == small_scene.stat().st_dev:
+        pytest.skip("no second disk here")
+    seen, steps = tmp_path / "seen.json", list[tuple[int, int, str]]()
+    job = Job(LooksAround(seen), open_scene(small_scene), 0, "cpu", Budget())
+    with tempfile.TemporaryDirectory(dir=other) as folder:
+        out = Path(folder)
+        fit_apart(job, [out / "images"], out / "model", out / "work", lambda *a: steps.append(a), print)
+        assert len(list((out / "images").rglob("*.exr"))) == 3 and not (out / "work").exists()
+    found = json.loads(seen.read_text())
+    assert Path(found["folder"]).parent == small_scene.parent and found["names"]["spikes/cam_00.dat"] == 2
+    assert not list(small_scene.parent.glob(".spike4dgs-fit-*"))
+    assert steps[-1] == (4, 4, "step 3"), "progress is passed on"
 
 
 def test_workers_fit_apart_too(small_scene: Path, tmp_path: Path) -> None:
