@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.schema_checks import Check, compiled
 
 if TYPE_CHECKING:
     from referencing.jsonschema import SchemaRegistry
@@ -34,8 +35,19 @@ def _registry() -> SchemaRegistry:
     return resources
 
 
+_checks: dict[int, tuple[dict[str, Any], Check]] = {}  # by the schema's id; it is kept, so that no other takes its id
+
+
+def _check_of(schema: dict[str, Any]) -> Check:
+    if id(schema) not in _checks:
+        _checks[id(schema)] = schema, compiled(schema, lambda name: load_schema("spike4dgs.benchmark", name))
+    return _checks[id(schema)][1]
+
+
 def check_schema(value: Any, schema: dict[str, Any], where: str | Path, fix: str) -> None:
     """Raise UserError that names the first difference of `value` from `schema`, and the schema's title."""
+    if _check_of(schema)(value):
+        return
     from jsonschema import Draft202012Validator
 
     validator = Draft202012Validator(schema, registry=_registry())
