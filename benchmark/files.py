@@ -14,6 +14,7 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -119,15 +120,52 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_text(value: Any) -> str:
-    """Return the text that `write_json` writes: equal values have equal texts."""
-    return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
+    """Return the text that `write_json` writes: equal values have equal texts.
+
+    It is that of json.dumps with an indent of 2, which is written in Python; here objects and lists without others in
+    them are left to its encoder in C.
+    """
+    return _indented(value, "\n") + "\n"
+
+
+def _indented(value: Any, line: str) -> str:
+    """Return a JSON value as text; `line` is a line break and the indent of the line that the value is in."""
+    inner = line + "  "
+    if not isinstance(value, dict | list | tuple) or not value:
+        return _encode(inner, value)
+    keyed = isinstance(value, dict)
+    if not any(isinstance(v, dict | list | tuple) for v in (value.values() if keyed else value)):
+        text = _encode(inner, value)
+        return f"{text[0]}{inner}{text[1:-1]}{line}{text[-1]}"
+    if not keyed:
+        return f"[{inner}{f',{inner}'.join(_indented(v, inner) for v in value)}{line}]"
+    if not all(isinstance(key, str) for key in value):
+        return json.dumps(value, indent=2, sort_keys=True, allow_nan=False).replace("\n", line)
+    items = [f"{_encode(inner, key)}: {_indented(value[key], inner)}" for key in sorted(value)]
+    return f"{{{inner}{f',{inner}'.join(items)}{line}}}"
+
+
+def _encode(inner: str, value: Any) -> str:
+    return _encoder(inner).encode(value)
+
+
+@lru_cache(64)
+def _encoder(inner: str) -> json.JSONEncoder:
+    return json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(f",{inner}", ": "))
 
 
 def read_text(path: Path, what: str, most_bytes: int = MOST_BYTES) -> str:
     """Read UTF-8 text. `what` names the kind of file for the error.
 
-    Raises UserError where the file is missing, unreadable or no plain file, where it has more than `most_bytes`, and
-    ValueError (UnicodeError) for bytes that are no UTF-8.
+    Raises UserError where `read_bytes` does, and ValueError (UnicodeError) for bytes that are no UTF-8.
+    """
+    return read_bytes(path, what, most_bytes).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_bytes(path: Path, what: str, most_bytes: int = MOST_BYTES) -> bytes:
+    """Read a file. `what` names its kind for the error.
+
+    Raises UserError where the file is missing, unreadable or no plain file, and where it has more than `most_bytes`.
     """
     try:
         status = path.stat()
@@ -137,7 +175,7 @@ def read_text(path: Path, what: str, most_bytes: int = MOST_BYTES) -> str:
             raise problem(path, what, "no plain file", "check the path")
         if status.st_size > most_bytes:
             raise problem(path, f"{what}, {most_bytes} bytes at most", f"{status.st_size}", "check the path")
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes()
     except FileNotFoundError:
         raise problem(path, what, "no such file", "check the path") from None
     except OSError as e:
@@ -149,8 +187,13 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
     Raises UserError where the file is missing, is not JSON, is not an object, or breaks a bound of `parse_json`.
     """
+    return json_object(read_bytes(path, what), path, what)
+
+
+def json_object(data: bytes, path: Path, what: str) -> dict[str, Any]:
+    """Return the JSON object that the bytes of the file `path` are, as `read_json` does."""
     try:
-        value = parse_json(read_text(path, what))
+        value = parse_json(data.decode("utf-8"))
     except ValueError as e:
         raise problem(path, f"{what} (JSON)", f"damaged text ({e})", "restore the file or make it again") from None
     if not isinstance(value, dict):

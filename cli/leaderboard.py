@@ -45,7 +45,7 @@ def show(
     if metric not in METRICS:
         raise problem("--metric", f"one of {', '.join(METRICS)}", repr(metric), "correct the name")
     folder, console = reading_folder(leaderboard), make_console()
-    boards, refused = gather(folder, runs, published=True)
+    boards, refused = gather(folder, runs, published=True, brief=metric == PRIMARY and not runs)
     if folder == SHIPPED:
         text = f"published entries of release {RELEASE}, as this version ships them"
         console.print(text if runs else f"{text}; --runs OUT adds your own", markup=False)
@@ -116,15 +116,15 @@ def ranking_table(board: Board, metric: str) -> Table:
     if comparison is not None:
         for k in np.argsort(-comparison.means if m.higher_is_better else comparison.means, kind="stable"):
             best, worst = comparison.best_ranks[k], comparison.worst_ranks[k]
-            tied = [board.rows[numbers[j]].name for j in comparison.tied(int(k))]
+            tied = comparison.tied(int(k))
             rank = str(best) if best == worst else f"{best}-{worst}"
-            shown = ", ".join(tied) if len(tied) <= 3 else f"{len(tied)} methods"
+            names = [board.rows[numbers[j]].name for j in tied[:3]]
+            shown = ", ".join(names) if len(tied) <= 3 else f"{len(tied)} methods"
             name = board.rows[numbers[k]].name
-            table.add_row(
-                rank, Text(name), m.format(comparison.means[k]), Text(shown), *_costs(board.rows[numbers[k]].records)
-            )
+            cells = (rank, name, m.format(comparison.means[k]), shown, *_costs(board.rows[numbers[k]].records))
+            table.add_row(*map(Text, cells))
     for i, why in scores.left_out.items():
-        table.add_row("-", Text(board.rows[i].name), "", Text(why), *_costs(board.rows[i].records))
+        table.add_row(*map(Text, ("-", board.rows[i].name, "", why, *_costs(board.rows[i].records))))
     return table
 
 

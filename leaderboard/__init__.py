@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from spike4dgs.benchmark.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from spike4dgs.leaderboard.entry import read_entries
     from spike4dgs.leaderboard.rank import rank_entries, write_boards
+    from spike4dgs.leaderboard.reading import read_entries
     from spike4dgs.leaderboard.submit import submit_all
     from spike4dgs.leaderboard.tracks import current_release, place_of
     from spike4dgs.leaderboard.verify import verify_leaderboard, verify_record
@@ -14,8 +14,8 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "entry": ("read_entries",),
             "rank": ("rank_entries", "write_boards"),
+            "reading": ("read_entries",),
             "submit": ("submit_all",),
             "tracks": ("current_release", "place_of"),
             "verify": ("verify_leaderboard", "verify_record"),

@@ -26,7 +26,7 @@ from typing import Any
 
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, write_text
+from spike4dgs.benchmark.files import json_object, locked, read_bytes, read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_of
@@ -34,6 +34,7 @@ from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_
 SCHEMA = "spike4dgs-entry/2"
 CLAIMED, RE_SCORED, RE_FITTED = LABELS = ("claimed", "re-scored", "re-fitted")  # from the weakest to the strongest
 FOLDERS = (PUBLIC, LOCAL, ARCHIVE)
+KIND = "a leaderboard entry"  # of files, in errors
 BOARD = "leaderboard.json"
 WAIT_S = 600.0  # for other submissions; one takes a second under the lock
 LEDGER = "LEDGER"
@@ -105,7 +106,17 @@ def read_entry(leaderboard: Path, path: str, ledger: Ledger) -> Entry:
     for it.
     """
     where = leaderboard / path
-    entry = read_json(where, "a leaderboard entry")
+    entry, sha256 = parse_entry(read_bytes(where, KIND), where, path)
+    check_listed(sha256, path, where, ledger)
+    return entry
+
+
+def parse_entry(data: bytes, where: Path, path: str) -> tuple[Entry, str]:
+    """Return the entry at `path` from its file's bytes, and the SHA-256 of its canonical JSON, as for the ledger.
+
+    Raises UserError where it is damaged or invalid, and where it belongs to another path.
+    """
+    entry = json_object(data, where, KIND)
     if entry.get("schema") != SCHEMA:
         raise problem(where, f"schema '{SCHEMA}'", repr(entry.get("schema"))[:80], "submit the record again")
     check_numbers(entry, where)
@@ -114,10 +125,14 @@ def read_entry(leaderboard: Path, path: str, ledger: Ledger) -> Entry:
     entry = {**entry, "record": checked(entry["record"], where)}
     if (name := entry_path(entry["record"], path.startswith(ARCHIVE))) != path:
         raise problem(where, f"the entry of {path}", f"that of {name}", "restore the file, or submit its record again")
+    return entry, sha256
+
+
+def check_listed(sha256: str, path: str, where: Path, ledger: Ledger) -> None:
+    """Raise UserError unless the ledger has a line for the entry at `path` with this hash."""
     if (sha256, path) not in ledger:
         fix = "restore the entry, or submit its record again with --replace"
         raise problem(where, f"an entry as {LEDGER} lists it", "another one, as after an edit by hand", fix)
-    return entry
 
 
 def checked(record: Record, where: Path) -> Record:
@@ -141,13 +156,14 @@ def check_numbers(value: Any, where: Path) -> None:
     waiting = [value]
     while waiting:
         item = waiting.pop()
-        if isinstance(item, Mapping):
+        if isinstance(item, int | float):
+            if not -_LARGEST <= item <= _LARGEST:  # NaN compares false
+                found = f"an integer of {len(str(abs(item)))} digits" if isinstance(item, int) else str(item)
+                raise problem(where, f"numbers within +-{_LARGEST:g}", found, "score the predictions again")
+        elif isinstance(item, dict):
             waiting += item.values()
         elif isinstance(item, list):
             waiting += item
-        elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:  # NaN compares false
-            found = f"an integer of {len(str(abs(item)))} digits" if isinstance(item, int) else str(item)
-            raise problem(where, f"numbers within +-{_LARGEST:g}", found, "score the predictions again")
 
 
 def read_ledger(leaderboard: Path) -> Ledger:
@@ -177,17 +193,6 @@ def entry_paths(leaderboard: Path, *folders: str) -> Iterator[str]:
             name = path.relative_to(leaderboard)
             if not any(part.startswith(".") for part in name.parts):
                 yield name.as_posix()
-
-
-def read_entries(leaderboard: Path, *folders: str) -> tuple[dict[str, Entry], dict[str, str]]:
-    """Return the entries by path, and why others were refused, by path: those do not block the leaderboard."""
-    ledger, entries, refused = read_ledger(leaderboard), dict[str, Entry](), dict[str, str]()
-    for path in entry_paths(leaderboard, *folders):
-        try:
-            entries[path] = read_entry(leaderboard, path, ledger)
-        except UserError as e:
-            refused[path] = str(e).removeprefix(f"{leaderboard / path}: ")
-    return entries, refused
 
 
 def typical_fit_seconds() -> dict[str, float]:

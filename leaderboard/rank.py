@@ -15,6 +15,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, Record, is_complete
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry, read_entries
+from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry
+from spike4dgs.leaderboard.reading import Reading, read_briefs
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, on_release, place_of
 
 SCHEMA = "spike4dgs-leaderboard/2"
@@ -50,7 +52,7 @@ def write_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
 
     A file without entries is removed, except leaderboard.json. The caller holds the leaderboard's lock.
     """
-    boards = make_boards(leaderboard)
+    boards = make_boards(read_briefs(leaderboard))
     for folder, name in FILES.items():
         if folder in boards:
             write_json(leaderboard / name, boards[folder])
@@ -59,13 +61,13 @@ def write_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
     return boards
 
 
-def make_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
+def make_boards(reading: Reading) -> dict[str, dict[str, Any]]:
     """Return the content of the boards by folder: always that of the tracks, the others where they have entries."""
     schema = load_schema("spike4dgs.leaderboard", "leaderboard.schema.json")
     keys = ("id", "title", "definition", "higher_is_better", "implementation", "takes", "unit", "digits")
     found = {}
     for folder, name in FILES.items():
-        entries, refused = read_entries(leaderboard, folder)
+        entries, refused = reading.of(folder).entries, reading.of(folder).refused
         if folder != PUBLIC and not entries and not refused:
             continue
         board = {
@@ -76,7 +78,7 @@ def make_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
             "boards": list(_public(entries) if folder == PUBLIC else _others(entries, folder)),
             "refused": [{"entry": path, "reason": reason} for path, reason in sorted(refused.items())],
         }
-        check_schema(board, schema, leaderboard / name, "restore the entries")
+        check_schema(board, schema, name, "restore the entries")
         found[folder] = board
     return found
 
@@ -119,10 +121,14 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict
     `entries` are by path. Without `ranked` no row has a rank.
     """
     groups: dict[tuple[bool, str], list[str]] = {}
+    flags = {path: flags_of(entry) for path, entry in entries.items()}
     for path, entry in sorted(entries.items()):
-        counts = ranked and may_be_ranked(entry)
+        counts = ranked and is_verified(entry) and not flags[path]
         groups.setdefault((counts, counts and _configuration(entry) or path), []).append(path)
-    rows = [(counts, _row([entries[path] for path in paths], paths)) for (counts, _), paths in groups.items()]
+    rows = [
+        (counts, _row([entries[path] for path in paths], paths, flags[paths[0]]))
+        for (counts, _), paths in groups.items()
+    ]
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
 
     def order(row: tuple[bool, dict[str, Any]]) -> tuple[bool, float, str, str]:
@@ -135,23 +141,23 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict
     ]
 
 
-def may_be_ranked(entry: Entry) -> bool:
-    """Return whether an entry is re-scored or re-fitted, complete and without flags."""
+def is_verified(entry: Entry) -> bool:
+    """Return whether an entry is re-scored or re-fitted, and complete; without flags it may be ranked."""
     record = entry["record"]
     checked = entry["verification"]
     complete = is_complete(record) and record["mean"][PRIMARY] is not None
-    verified = checked["label"] != CLAIMED and PRIMARY not in checked["unverified"]
-    return complete and verified and not flags_of(entry)
+    return complete and checked["label"] != CLAIMED and PRIMARY not in checked["unverified"]
 
 
 def flags_of(entry: Mapping[str, Any]) -> list[str]:
     """Return the flags of an entry, each with the scenes that it comes from; none for what may be ranked."""
     record, truth = entry["record"], entry["verification"]["truth"]
     release, found = current_release(), dict[str, list[str]]()
+    revisions = on_release(record["dataset"])["scenes"]
     for scene, cell in sorted(record["scenes"].items()):
         for flag in _of_truth(truth.get(scene)):
             found.setdefault(flag, []).append(scene)
-        revision, psnr = on_release(record["dataset"])["scenes"][scene], cell["metrics"]["psnr"]
+        revision, psnr = revisions[scene], cell["metrics"]["psnr"]
         ceiling = release.ceiling_db(scene, revision) or truth.get(scene, {}).get("ceiling_db")
         if psnr is not None and ceiling is not None and psnr > ceiling - RENDERED_DB:
             flag = CEILING if psnr > ceiling else RENDERED
@@ -173,7 +179,12 @@ def _of_truth(check: Mapping[str, Any] | None) -> Iterator[str]:
 
 def _names(text: str, name: str) -> bool:
     """Return whether a text has a name as a word of its own: car-1-small does not name car-1-small-lens."""
-    return re.search(rf"(?<![\w.-]){re.escape(name)}(?![\w.-]*\w)", text, re.IGNORECASE) is not None
+    return _word(name).search(text) is not None
+
+
+@lru_cache(1024)  # of a board there are some tens
+def _word(name: str) -> re.Pattern[str]:
+    return re.compile(rf"(?<![\w.-]){re.escape(name)}(?![\w.-]*\w)", re.IGNORECASE)
 
 
 def _configuration(entry: Entry) -> str | None:
@@ -189,14 +200,14 @@ def _configuration(entry: Entry) -> str | None:
     return json.dumps([method, cells, checked["label"], sorted(checked["unverified"])], sort_keys=True)
 
 
-def _row(entries: Sequence[Entry], paths: Sequence[str]) -> dict[str, Any]:
-    """Return the row of one method's entries, which are several only if all may be ranked."""
+def _row(entries: Sequence[Entry], paths: Sequence[str], flags: list[str]) -> dict[str, Any]:
+    """Return the row of one method's entries, which are several only if all may be ranked: then without flags."""
     records, checks = [e["record"] for e in entries], [e["verification"] for e in entries]
     first = records[0]
     return {
         "method": first["method"]["name"],
         "label": min((c["label"] for c in checks), key=LABELS.index),
-        "flags": flags_of(entries[0]) if len(entries) == 1 else [],
+        "flags": flags,
         "seeds": sorted({r["method"]["seed"] or 0 for r in records}),
         "entries": list(paths),
         "submitted": min(e["submitted"] for e in entries),

@@ -22,8 +22,9 @@ from spike4dgs.benchmark.runs.predictions import SUMS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value, sensor_of
 from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
-from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder, read_entries
+from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
+from spike4dgs.leaderboard.reading import read_all
 from spike4dgs.leaderboard.tracks import match_release
 from spike4dgs.leaderboard.truth_check import Renderings, SecondRenderings, TruthCheck, check_truth, no_renderings
 
@@ -159,9 +160,10 @@ def verify_leaderboard(
     too. Raises UserError where the folder is no leaderboard.
     """
     check_folder(leaderboard)
-    entries, refused = read_entries(leaderboard, *FOLDERS)
-    problems = [f"{leaderboard / path}: {reason}" for path, reason in refused.items()]
-    problems += _stale_boards(leaderboard)
+    reading = read_all(leaderboard, *FOLDERS)
+    entries = reading.entries
+    problems = [f"{leaderboard / path}: {reason}" for path, reason in reading.refused.items()]
+    problems += _stale_boards(leaderboard, make_boards(reading))
     scored = not_fitted = 0
     if predictions is not None:
         by_id = {open_scenes([scene], allow_gaps)[0].id: scene for scene in scenes}
@@ -179,9 +181,8 @@ def verify_leaderboard(
     return Findings(len(entries), scored, not_fitted, tuple(problems))
 
 
-def _stale_boards(leaderboard: Path) -> Iterator[str]:
-    """Yield a line for each board file that does not follow from the entries."""
-    boards = make_boards(leaderboard)
+def _stale_boards(leaderboard: Path, boards: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each board file that is not as the entries give it."""
     for folder, name in FILES.items():
         path = leaderboard / name
         if folder not in boards:

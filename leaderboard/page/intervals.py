@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
@@ -82,6 +82,7 @@ LEVEL = 0.95
 REPLICATES = 2000
 SEED = 20251
 FEWEST_SCENES = 3  # two scenes have one difference: no spread can be estimated from it
+FEW = 100  # methods whose pairs are compared without compiled loops
 MOST_UNITS = 60  # of the table of widened critical values: more units count as so many
 GRID = np.linspace(1, 6, 51)  # critical values of the table; it is interpolated, as on the page
 
@@ -98,19 +99,21 @@ class Comparison:
     half_widths: Float64
     better: Mask
 
-    @property
+    @cached_property
     def best_ranks(self) -> Int64:
         """One more than the number of methods that are better."""
         return np.asarray(1 + self.better.sum(0))
 
-    @property
+    @cached_property
     def worst_ranks(self) -> Int64:
         """The number of methods, less those that are worse."""
         return np.asarray(len(self.means) - self.better.sum(1))
 
     def tied(self, i: int) -> list[int]:
         """Return the methods that cannot be told from method `i`."""
-        return [j for j in range(len(self.means)) if j != i and not (self.better[i, j] or self.better[j, i])]
+        tied = ~(self.better[i] | self.better[:, i])
+        tied[i] = False
+        return [int(j) for j in np.flatnonzero(tied)]
 
 
 def resampled_means(
@@ -143,11 +146,11 @@ def widened_values(n: int) -> Float64:
     >>> f"{np.interp(1.96, GRID, widened_values(5)):.2f} {np.interp(2.9, GRID, widened_values(5)):.2f}"
     '3.11 6.78'
     """
-    from scipy.stats import norm, t
+    from scipy.special import ndtr, stdtrit  # what scipy.stats has as norm.sf and t.isf, which takes longer to import
 
     if not 2 <= n <= MOST_UNITS:
         raise ValueError(f"2 to {MOST_UNITS} units expected, found {n}")
-    values = np.sqrt(n / (n - 1)) * t.isf(norm.sf(GRID), n - 1)
+    values = -np.sqrt(n / (n - 1)) * stdtrit(n - 1, ndtr(-GRID))
     return np.array([float(f"{v:.4g}") for v in values])
 
 
@@ -171,15 +174,31 @@ def _half_widths(deviations: Float64, units: int) -> Float64:
     They are infinite for a single unit, of which there is no spread.
     """
     replicates, n = deviations.shape
-    errors, largest = np.zeros((n, n)), np.zeros(replicates)
-    for i in range(n - 1):
-        d = deviations[:, i, None] - deviations[:, i + 1 :]
-        errors[i, i + 1 :] = spread = np.sqrt(np.mean(d * d, axis=0))
-        ratios = np.abs(d[:, spread > 0]) / spread[spread > 0]
-        largest = np.maximum(largest, ratios.max(axis=1, initial=0))
+    if n > FEW:
+        from spike4dgs.leaderboard.page import pair_kernels  # numba takes longer to import than few methods take
+
+        errors, largest = pair_kernels.pair_statistics(deviations)
+    else:
+        errors, largest = pair_statistics(deviations)
     # The smallest value that at least LEVEL of the replicates do not exceed, without interpolation, as on the page.
     critical = np.sort(largest)[int(np.ceil(LEVEL * replicates)) - 1]
     if units < 2:
         return np.where(np.eye(n) > 0, 0, np.inf)
     wide = np.interp(critical, GRID, widened_values(min(units, MOST_UNITS)))
     return np.asarray((errors + errors.T) * wide)
+
+
+def pair_statistics(deviations: Float64) -> tuple[Float64, Float64]:
+    """Return two statistics of all pairs of methods, from deviations [R, M] of their means.
+
+    These are the standard errors [M, M] of the differences, for methods i < j and 0 elsewhere, and for each replicate
+    [R] the largest difference in units of its error.
+    """
+    replicates, n = deviations.shape
+    errors, largest = np.zeros((n, n)), np.zeros(replicates)
+    for i in range(n - 1):
+        d = deviations[:, i, None] - deviations[:, i + 1 :]
+        errors[i, i + 1 :] = spread = np.sqrt(np.mean(d * d, axis=0))
+        ratios = np.abs(d[:, spread > 0]) / spread[spread > 0]
+        largest = np.maximum(largest, ratios.max(axis=1, initial=0))
+    return errors, largest

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
-from spike4dgs.leaderboard.entry import Entry, read_entries
+from spike4dgs.leaderboard.entry import Entry
 from spike4dgs.leaderboard.rank import make_boards, reason
+from spike4dgs.leaderboard.reading import Reading, read_briefs, read_checked
 from spike4dgs.leaderboard.tracks import (
     ARCHIVE,
     LOCAL,
@@ -83,20 +83,21 @@ class Board:
 
 
 def gather(
-    leaderboard: Path, runs: Sequence[Path], published: bool = False
+    leaderboard: Path, runs: Sequence[Path], published: bool = False, brief: bool = False
 ) -> tuple[list[Board], list[dict[str, str]]]:
     """Return the boards of a leaderboard's entries with the rows of finished runs, and the refused entries.
 
     With `published` the entries that the package ships stand among them. A run's record that equals an entry, image by
-    image, lends its images to the entry's row. Raises UserError where a run has no records.
+    image, lends its images to the entry's row. With `brief` entries have what the ranking by the primary metric needs.
+    Raises UserError where a run has no records.
     """
     boards, refused = [], []
-    for folder, file in make_boards(leaderboard).items():
-        entries, _ = read_entries(leaderboard, folder)
+    reading = read_briefs(leaderboard) if brief else read_checked(leaderboard)
+    for folder, file in make_boards(reading).items():
         refused += file["refused"]
-        boards += [_board(leaderboard, folder, board, entries) for board in file["boards"]]
+        boards += [_board(folder, board, reading) for board in file["boards"]]
     if published and leaderboard.resolve() != SHIPPED.resolve():
-        _add_published(boards)
+        _add_published(boards, brief)
     for run in runs:
         for records in seeds_of_methods(run_records(run)):
             for board in _boards_of(boards, records[0]):
@@ -113,22 +114,22 @@ def run_records(run: Path) -> list[Record]:
     return [read_record(path) for path in paths]
 
 
-def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], entries: Mapping[str, Entry]) -> Board:
+def _board(folder: str, board: Mapping[str, Any], reading: Reading) -> Board:
     rows = []
     for row in board["rows"]:
-        own = {path: entries[path] for path in row["entries"]}
+        own = {path: reading.entries[path] for path in row["entries"]}
         why = "" if row["rank"] else "archived" if folder == ARCHIVE else reason(row)
         name = Path(row["entries"][0]).stem if len(own) == 1 else row["method"]
         records = tuple(e["record"] for e in own.values())
-        hashes = {path: sha256_json(read_json(leaderboard / path, "a leaderboard entry")) for path in own}
+        hashes = {path: reading.hashes[path] for path in own}
         rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes))
     name, title = (board["track"], board["title"]) if board["track"] else (board["title"], in_words(board["dataset"]))
     return Board(name, title, folder, board["why"], tuple(board["withheld"]), board["dataset"], rows)
 
 
-def _add_published(boards: list[Board]) -> None:
+def _add_published(boards: list[Board], brief: bool) -> None:
     """Add the rows of the shipped entries, except those that are there; another row of a name is marked."""
-    for theirs in gather(SHIPPED, ())[0]:
+    for theirs in gather(SHIPPED, (), brief=brief)[0]:
         same = (theirs.folder, theirs.name, theirs.dataset)
         ours = next((b for b in boards if (b.folder, b.name, b.dataset) == same), None)
         if ours is None:

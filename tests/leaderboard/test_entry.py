@@ -12,8 +12,9 @@ from submitters import lost, make_results, same_boards, submit_under_fire
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked
 from spike4dgs.leaderboard import entry
-from spike4dgs.leaderboard.entry import check_numbers, entry_path, read_entries, write_entry
+from spike4dgs.leaderboard.entry import check_numbers, entry_path, write_entry
 from spike4dgs.leaderboard.rank import write_boards
+from spike4dgs.leaderboard.reading import read_entries
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.predictions import read_info
 from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.cli.submit import submit_all
-from spike4dgs.leaderboard.entry import read_entries
+from spike4dgs.leaderboard.reading import read_entries
 from spike4dgs.leaderboard.season.results import Result, write_result
 
 REFUSED = r"expected a method that fits from spikes, found an oracle \(images, steps\)"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.leaderboard.page import intervals, pair_kernels
 from spike4dgs.leaderboard.page.intervals import (
     GRID,
     LEVEL,
@@ -17,6 +18,7 @@ from spike4dgs.leaderboard.page.intervals import (
     compare,
     draw_weights,
     hashed,
+    pair_statistics,
     resampled_means,
     widened_values,
 )
@@ -170,3 +172,23 @@ def test_other_numbers_of_seeds_share_the_draws_of_scenes_and_images() -> None:
     one = draw_weights((4, 3), 1, 3, 100, True, 2)
     three = draw_weights((4, 3), 3, 3, 100, True, 2).reshape(100, 7, 3).sum(2)
     np.testing.assert_allclose(one, three)
+
+
+@pytest.mark.parametrize("methods", [2, 31, 32, 33, 70])
+def test_the_compiled_pairs_are_those_of_numpy(methods: int) -> None:
+    deviations = np.random.default_rng(methods).normal(size=(500, methods))
+    deviations[:, -1] = deviations[:, 0]  # no error
+    deviations[:, methods // 2] = deviations[:, 0] + 1e-9 * deviations[:, 1]
+    errors, largest = pair_kernels.pair_statistics(deviations)
+    expected_errors, expected_largest = pair_statistics(deviations)
+    np.testing.assert_allclose(errors, expected_errors, rtol=1e-14)
+    np.testing.assert_allclose(largest, expected_largest, rtol=1e-14)
+
+
+def test_many_methods_are_compared_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(5).normal(size=(40, 5, 9)) + np.arange(40)[:, None, None] / 4
+    few = compare(scored(values), True)
+    monkeypatch.setattr(intervals, "FEW", 1)
+    many = compare(scored(values), True)
+    assert (few.better == many.better).all() and few.better.any()
+    assert few.best_ranks is few.best_ranks  # counted once, not for each row of a table
