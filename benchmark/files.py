@@ -21,7 +21,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 
 MOST_BYTES = 16 << 20  # of a text: a record of many scenes has some MB; parsed, JSON can take 25 times its size
 MOST_DEPTH = 64  # of nested JSON values; programs that walk along them need a depth for each
@@ -30,6 +30,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _ROOM = ("room for the file", "free some disk space, or choose another folder")
 _ACCESS = ("a folder that may be written to", "change its permissions, or choose another folder")
 _FOLDERS = ("folders on the way to the file", "remove what is there instead, or choose another folder")
+_SYSTEM = ("/proc/", "/sys/")  # where nothing can be made, and the system says that there is no such file
 _FAILURES = {  # what writing expected, and what to do; other errors are the program's
     errno.ENOSPC: _ROOM,
     errno.EDQUOT: _ROOM,
@@ -55,10 +56,18 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as e:
-        if e.errno not in _FAILURES:
+        if (failure := failure_of(e, path)) is None:
             raise
-        expected, fix = _FAILURES[e.errno]
-        raise problem(path, expected, os.strerror(e.errno).lower(), fix) from e
+        raise failure from e
+
+
+def failure_of(error: OSError, path: Path | str) -> UserError | None:
+    """Return what the system said while `path` was written as a UserError; None for an error that is the program's."""
+    nowhere = error.errno == errno.ENOENT and str(path).startswith(_SYSTEM)
+    if error.errno is None or (error.errno not in _FAILURES and not nowhere):
+        return None
+    expected, fix = _ACCESS if nowhere else _FAILURES[error.errno]
+    return problem(path, expected, os.strerror(error.errno).lower(), fix)
 
 
 @contextmanager
@@ -274,10 +283,11 @@ def locked(
 ) -> Iterator[None]:
     """Hold the lock on `file`, which is created if need be, and with `temporary` removed at the end.
 
-    The system releases the lock when the process ends, however it ends. Raises UserError where another process still
-    holds it after `wait_s` seconds; `where` and `expected` name for the error what is locked, such as "a folder that no
-    other run uses".
+    The system releases the lock when the process ends, however it ends. `where` and `expected` name for the error what
+    is locked, such as "a folder that no other run uses". Raises UserError where another process still holds it after
+    `wait_s` seconds, and where `file` is no plain file.
     """
+    _check_lock(file)
     lock = FileLock(file, timeout=wait_s)
     try:
         with writing(file.parent):
@@ -292,3 +302,24 @@ def locked(
         if temporary:
             file.unlink(missing_ok=True)
         lock.release()
+
+
+def _check_lock(file: Path) -> None:
+    """Raise UserError for a lock that is no plain file: a link's target would be emptied, a FIFO would wait forever."""
+    try:
+        mode = os.lstat(file).st_mode
+    except OSError:  # none yet; what else is wrong shows when it is made
+        return
+    if not stat.S_ISREG(mode):
+        found = "a symbolic link" if stat.S_ISLNK(mode) else "something else"
+        raise problem(file, "a plain file, which is the folder's lock", found, "remove it")
+
+
+_PART = re.compile(r"\..+\.[0-9]+\.part(\.[^.]+)?")  # as in `atomic_path` and `SpikeWriter`
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what killed processes left half written in a folder and below it. The caller holds the folder's lock."""
+    for path in folder.rglob(".*.part*"):
+        if _PART.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import locked, remove_parts
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -27,22 +28,27 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
         out: Folder for the maps and their images.
     """
     opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not used
-    rows = []
-    for camera in opened.cameras.values():
-        recordings = opened.recordings(camera.id)
-        if recordings is None:
-            fix = "make a scene with calibration/flat and calibration/dark"
-            raise problem(scene / "scene.json", "calibration recordings", f"none of {camera.id}", fix)
-        found = estimate(recordings)
-        write_maps(out / f"{camera.id}.npz", {"gain": found.gain, "dark": found.dark})
-        _plot(found, out / f"{camera.id}.png", camera.id)
-        level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
-        row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
-        rows.append(row + [f"{e:.3f}" if e is not None else "-" for e in _truth_errors(opened, camera, found)])
+    with locked(out / ".lock", out, "a folder that no other calibration writes to", temporary=True):
+        remove_parts(out)
+        rows = [_calibrated(opened, camera, scene, out) for camera in opened.cameras.values()]
     columns = "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
     show_table("", columns, rows, None)
     print(f"maps and images: {out}")
     return 0
+
+
+def _calibrated(opened: Scene, camera: Camera, scene: Path, out: Path) -> list[str]:
+    """Write the maps of a camera and their image; return its line of the table."""
+    recordings = opened.recordings(camera.id)
+    if recordings is None:
+        fix = "make a scene with calibration/flat and calibration/dark"
+        raise problem(scene / "scene.json", "calibration recordings", f"none of {camera.id}", fix)
+    found = estimate(recordings)
+    write_maps(out / f"{camera.id}.npz", {"gain": found.gain, "dark": found.dark})
+    _plot(found, out / f"{camera.id}.png", camera.id)
+    level, median = found.radiance_gain * recordings.flat_radiance, float(np.median(found.dark))
+    row = [camera.id, f"{level:.4f}", f"{median:.5f}", f"{100 * float(found.gain.std()):.2f}"]
+    return row + [f"{e:.3f}" if e is not None else "-" for e in _truth_errors(opened, camera, found)]
 
 
 def _truth_errors(scene: Scene, camera: Camera, found: Calibration) -> tuple[float | None, float | None]:

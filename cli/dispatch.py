@@ -8,6 +8,7 @@ import functools
 import importlib
 import inspect
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -51,9 +52,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its end
         return 141
+    except OSError as e:
+        from spike4dgs.benchmark.files import failure_of
+
+        if (failure := failure_of(e, str(e.filename or "the disk"))) is None:
+            raise
+        print(f"error: {failure}", file=sys.stderr)
+        return 2
+
+
+_THREADS = re.compile(r"\s*\+?0*[1-9][0-9]{0,3}\s*(,\s*\+?0*[1-9][0-9]{0,3}\s*)*")  # one number for each level of loops
+
+
+def _check_environment() -> None:
+    """Raise UserError for a number of threads that OpenMP would pass over, with a line that nobody understands."""
+    value = os.environ.get("OMP_NUM_THREADS", "1")
+    if not _THREADS.fullmatch(value):
+        raise problem("OMP_NUM_THREADS", "a number of threads, 1 to 9999", repr(value[:40]), "correct or unset it")
 
 
 def _dispatch(arguments: list[str]) -> int:
+    _check_environment()
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in ("-h", "--help"):
         print(_overview("spike4dgs", COMMANDS, GROUPS))

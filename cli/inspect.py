@@ -58,6 +58,9 @@ class StreamReport:
     missing: int  # ticks within gaps
 
 
+_WIDEST = 4.0  # sides of a panel: titles and legends need room next to a scene of one row
+
+
 def examine(name: str, stream: SpikeStream, recordings: Recordings | None = None) -> StreamReport:
     """Return the statistics of a whole stream, and its bad pixels: from recordings, or by isolation without any.
 
@@ -101,7 +104,7 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     """
     middle = _middle(stream)
     gain = float(np.percentile(report.rate, 99)) or 1.0  # shown as white; the scale of a raw recording is unknown
-    aspect = stream.height / stream.width
+    aspect = min(max(stream.height / stream.width, 1 / _WIDEST), _WIDEST)  # of the panel; the image keeps its shape
     heights = [6 * aspect + 0.6] * 2 + [2.4] * bool(stream.gaps)  # inches
     mosaic: list[Any] = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]
     figure = new_figure((12, sum(heights)), dpi=100)
@@ -168,6 +171,8 @@ def _print_reports(reports: list[StreamReport]) -> None:
     make_console().print(table)
     print("Rates are spikes per tick and pixel; 'two ISIs' is the share of pixels with only two adjacent intervals.")
     for r in reports:
+        if not r.rate.any():
+            print(f"{r.name}: no spike in the whole clip")
         for what, mask in r.bad.kinds.items():
             if mask.any():
                 first = ", ".join(f"({x}, {y})" for y, x in np.argwhere(mask)[:5])

@@ -47,6 +47,11 @@ class Compute:
     device: str = "auto"
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Raises UserError for a seed that no entry may have, before anything is computed."""
+        if not 0 <= self.seed < 2**63:
+            raise problem("--seed", "a seed from 0 up, of 64 bits", str(self.seed)[:40], "choose another seed")
+
 
 COMPUTE = Compute()
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, read_json, sha256_json, write_json, writing
+from spike4dgs.benchmark.files import locked, read_json, remove_parts, sha256_json, write_json, writing
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -73,6 +73,7 @@ class Maker:
         """Make or resume the scene, then move it to OUT/ID, replacing an existing scene. Return OUT/ID."""
         with _alone(self._work.with_name(f"{self.job.id}.lock")):
             self._open_work()
+            remove_parts(self._work)
             self._timed("background", self._render_static)
             self._timed("key frames", self._render_keys)
             self._timed("ground truth", self._render_targets)

@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from threading import Event, Lock
 from typing import Any, TypeVar
 
@@ -193,8 +194,43 @@ def _options(address: str) -> dict[str, Any]:
     from aiohttp import ClientTimeout
 
     # A slow connection is none that is cut: only silence counts. Proxies are taken from the environment.
-    client = {"timeout": ClientTimeout(total=None, sock_connect=30, sock_read=60), "trust_env": True}
+    client = {
+        "timeout": ClientTimeout(total=None, sock_connect=30, sock_read=60),
+        "trust_env": True,
+        "auto_decompress": False,  # a body of some kB can unpack to more than the memory holds
+        "response_class": _bounded_response(),
+    }
     return {"headers": {"Accept-Encoding": "identity"}, "client_kwargs": client}
+
+
+MOST_BODY = 64 << 20  # bytes of an answer: a piece of a release has 16 MiB, an index some MB
+_BLOCK = 1 << 16
+
+
+class TooMuch(Exception):
+    """Raised for an answer of more than MOST_BODY bytes."""
+
+
+@cache
+def _bounded_response() -> type:
+    from aiohttp import ClientResponse
+
+    class Bounded(ClientResponse):
+        """An answer that is read whole only as far as MOST_BODY bytes: a server may never stop sending."""
+
+        async def read(self) -> bytes:
+            """Raises TooMuch for more."""
+            if self._body is None:
+                parts, size = [], 0
+                while part := await self.content.read(_BLOCK):
+                    parts.append(part)
+                    if (size := size + len(part)) > MOST_BODY:
+                        self.close()
+                        raise TooMuch(f"an answer of more than {MOST_BODY >> 20} MiB")
+                self._body = b"".join(parts)
+            return await super().read()
+
+    return Bounded
 
 
 def _lasts(error: Exception) -> bool:
@@ -202,4 +238,6 @@ def _lasts(error: Exception) -> bool:
     status = getattr(error, "status", None) or getattr(getattr(error, "response", None), "status_code", None)
     if isinstance(status, int):
         return 400 <= status < 500 and status not in (408, 425, 429)  # timeout, too early, too many requests
-    return isinstance(error, PermissionError | NotADirectoryError | IsADirectoryError | ImportError | ValueError)
+    return isinstance(
+        error, TooMuch | PermissionError | NotADirectoryError | IsADirectoryError | ImportError | ValueError
+    )

@@ -43,7 +43,11 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Writ
             fix = "install opencv-contrib-python-headless, or pass --frames"
             raise problem(path, "an encoder for video in OpenCV", "none", fix)
 
+        count = 0
+
         def write(frame: UInt8) -> None:
+            nonlocal count
+            count += 1
             if frame.shape[:2] != size[::-1]:
                 raise problem(path, f"frames of {size[0]}x{size[1]}", f"{frame.shape}", "render all at one size")
             gray = frame.ndim == 2
@@ -53,3 +57,18 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Writ
             yield write
         finally:
             writer.release()
+        _check_whole(part, path, count)
+
+
+def _check_whole(part: Path, path: Path, frames: int) -> None:
+    """Raise UserError unless the last frame of a video can be read: OpenCV does not say that a disk is full."""
+    import cv2
+
+    video = cv2.VideoCapture(str(part), cv2.CAP_FFMPEG)
+    try:
+        video.set(cv2.CAP_PROP_POS_FRAMES, max(frames - 1, 0))
+        if frames and not video.read()[0]:
+            found = f"a broken one after {frames} frames"
+            raise problem(path, "a video with its last frame", found, "free some disk space, or choose another folder")
+    finally:
+        video.release()

@@ -186,7 +186,7 @@ def timed_fit(
     clock = FitClock(work / "fit_clock.json", checkpoint)
     if clock.before > 0:
         note(f"resuming after {clock.before:.0f} s of fitting")
-    model = method.fit(scene, request)
+    model = method.fit(scene, replace(request, progress=clock.watched(request.progress)))
     return model, clock.seconds()
 
 
@@ -267,19 +267,37 @@ def _render(model: Model, camera: Camera, t_us: float, where: str) -> Float32:
 class FitClock:
     """Seconds that went into a fit, over all its parts when it was killed and resumed.
 
-    Each part writes one small file as it starts: the seconds before it, and the time of its start. When it is killed,
-    the part counts up to the checkpoint's time of writing; work after that is lost, done again, and counted then.
+    A small file holds the seconds up to the last checkpoint; work after that is lost, done again, and counted then. A
+    new checkpoint is noticed at the fit's next report of its progress. No wall clock is read: those may be moved.
     """
 
     def __init__(self, path: Path, checkpoint: Path) -> None:
+        self._path, self._checkpoint = path, checkpoint
         self.before = 0.0
         if path.is_file() and checkpoint.is_file():
-            last = read_json(path, "the times of an unfinished fit")
-            lasted = checkpoint.stat().st_mtime - float(last["started_unix"])
-            self.before = float(last["seconds_before"]) + max(0.0, lasted)
+            self.before = float(read_json(path, "the times of an unfinished fit")["seconds"])
+        self._seen = self._version()
         self._start = time.perf_counter()
-        write_json(path, {"seconds_before": self.before, "started_unix": time.time()})
+        write_json(path, {"seconds": self.before})
 
     def seconds(self) -> float:
         """Seconds of all parts up to now."""
         return self.before + time.perf_counter() - self._start
+
+    def watched(self, progress: Progress) -> Progress:
+        """Return a receiver that passes progress on, and keeps the seconds of a new checkpoint."""
+
+        def report(done: int, total: int, note: str = "") -> None:
+            if (version := self._version()) != self._seen:
+                self._seen = version
+                write_json(self._path, {"seconds": self.seconds()})
+            progress(done, total, note)
+
+        return report
+
+    def _version(self) -> tuple[int, int] | None:
+        """Return what tells the checkpoint's file from an earlier one."""
+        if not self._checkpoint.is_file():
+            return None
+        status = self._checkpoint.stat()
+        return status.st_ino, status.st_mtime_ns

@@ -23,7 +23,7 @@ from uuid import uuid4
 from rich.console import Console
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, write_text
+from spike4dgs.benchmark.files import locked, remove_parts, write_text
 from spike4dgs.benchmark.method import Budget, Method, no_progress
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
 from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
@@ -156,6 +156,7 @@ def run_matrix(
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
         RunDisplay(console, len(jobs), [files.job.method.name for files in jobs], settings.typical_s) as display,
     ):
+        remove_parts(settings.out)
         for k, cells in _run_cells(jobs, settings, selection, display):
             found[k] = cells
             first = k - k % len(scenes)  # of the cells of one record

@@ -67,8 +67,10 @@ def write_site(
     An earlier page in `out` is replaced. Raises UserError where something else is there, and where a vendored library
     is not the one that was pinned.
     """
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
+    if out.exists() and not (out.is_dir() and ((out / MARK).is_file() or _is_empty(out))):
         raise problem(out, "a new or empty folder, or an earlier page", "something else", "choose another --out")
+    if not (out / MARK).exists():  # the first file: one that is killed leaves a page, which the next one replaces
+        write_text(out / MARK, "")
     written, left_out, content = set[Path](), list[str](), []
     for path in static_files():
         write_bytes(out / path, (STATIC / path).read_bytes())
@@ -91,10 +93,16 @@ def write_site(
         content.append(one)
     put("boards", {**facts(boards), "docs": docs, "boards": content, "refused": list(refused)})
     for earlier in [*(out / "data").glob("*"), *(out / "pictures").rglob("*.webp")]:
-        if earlier not in written:
+        if earlier not in written and earlier.is_file():
             earlier.unlink()
     first = [p for p in written if p.relative_to(out).parts[0] not in ("data", "pictures")] + [out / MARK]
     return Site(len(written), sum(p.stat().st_size for p in first), tuple(left_out))
+
+
+def _is_empty(folder: Path) -> bool:
+    """Return whether a folder holds no more than folders and what a killed page left half written."""
+    left = Path(MARK).stem
+    return all(path.is_dir() or path.name.startswith(f".{left}.") for path in folder.rglob("*"))
 
 
 def _write_scores(board: Board, number: int, put: Callable[[str, Any], None]) -> list[str]:

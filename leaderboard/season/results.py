@@ -86,12 +86,21 @@ def write_result(seasons: Path, number: int, result: Result) -> None:
     """
     path = result_path(seasons, number, result.name)
     check_no_oracle(result.record, path)
+    for other in path.parent.glob("*.json"):
+        if other.stem != result.name and _alike(other.stem) == _alike(result.name):
+            fix = "a name is scored once in a season, however it is written: submit under another one"
+            raise problem(path, "a name that differs in letters or digits", other.stem, fix)
     if path.exists():
         if read_result(path).predictions_sha256 != result.predictions_sha256:
             fix = "a name is scored once in a season: submit under another one"
             raise problem(path, "no result of this name, or the same predictions", "other predictions", fix)
         return
     write_json(path, {"schema": SCHEMA, "submitted_as": result.submitted_as, "record": result.record})
+
+
+def _alike(name: str) -> str:
+    """Return the letters and digits of a name, and the + and brackets that tell recipes apart."""
+    return "".join(c for c in name.casefold() if c.isalnum() or c in "+[]=")
 
 
 def read_result(path: Path) -> Result:

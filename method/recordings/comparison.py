@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.method import Method, Model
+from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
 from spike4dgs.benchmark.reports.error_map import show_error, show_error_scale
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -59,7 +60,7 @@ def compare(
 def residual_db(image: NDArray[np.floating], rendered: NDArray[np.floating]) -> float:
     """Return the PSNR in dB of renders against images, over all pixels that are numbers; both clipped to [0, 1].
 
-    NaN where there is none, infinite where they are equal.
+    NaN where there is none, MAX_PSNR_DB where they are equal.
 
     >>> round(residual_db(np.array([0.5, np.nan]), np.array([0.6, 0.0])), 3)
     20.0
@@ -69,7 +70,7 @@ def residual_db(image: NDArray[np.floating], rendered: NDArray[np.floating]) -> 
         return math.nan
     difference = np.clip(image[known], 0, 1).astype(np.float64) - np.clip(rendered[known], 0, 1)
     error = float(np.mean(difference**2))
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return min(-10 * math.log10(error), MAX_PSNR_DB) if error > 0 else MAX_PSNR_DB
 
 
 def residuals(found: Comparison) -> dict[str, float]:

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from spike4dgs.benchmark.environment import command_line, device_type, environment, harness, utc_now
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, sha256_json
+from spike4dgs.benchmark.files import locked, remove_parts, sha256_json
 from spike4dgs.benchmark.method import FitRequest, Method
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
@@ -64,6 +64,7 @@ def fit_recording(
     """
     console, times, seed = make_console(), dict[str, float](), request.seed
     with locked(out / ".lock", out, "a folder that no other fit uses"):
+        remove_parts(out)
         with _timed(times, "opening"):
             recording = open_recording(scene, seed)
         with _timed(times, "poses and clocks"):

@@ -13,13 +13,14 @@ from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.repair import LONGEST_TICKS, fill_gaps, fill_pixels
 from spike4dgs.method.recordings.camera_facts import between_views, from_recordings
 
 LEAST_PRESENT = 0.5  # share of its ticks with which a camera is used: a shorter one would be filled more than recorded
 MOST_BAD = 0.5  # share of its pixels with which it is: half of an image tells little, and its recordings may be wrong
+MOST_RATIO = 30.0  # of the cameras' mean rates: gains differ by some percent, and what cameras see by two or three
 LEAST_GAIN = 0.005  # largest difference from 1 below which gains are left as they are: an estimate's own error
 
 
@@ -39,6 +40,7 @@ def survey_streams(scene: TrainingScene) -> Survey:
     """
     notes: list[str] = []
     scene = _enough(scene, notes)
+    _check_exposures(scene)
     filled = tuple(fill_gaps(stream) for stream in scene.streams)
     notes += _gap_notes(scene, replace(scene, streams=filled))
     recordings = scene.recordings or (None,) * len(filled)
@@ -82,14 +84,29 @@ def survey_gains(scene: TrainingScene) -> tuple[TrainingScene, tuple[str, ...]]:
 def _enough(scene: TrainingScene, notes: list[str]) -> TrainingScene:
     """Return the scene of those cameras that have recorded most of their ticks."""
     share = [float(present(s.gaps, s.n_ticks).mean()) for s in scene.streams]
-    kept = [i for i, s in enumerate(share) if s >= LEAST_PRESENT]
+    silent = [not s.packed.any() for s in scene.streams]
+    kept = [i for i, s in enumerate(share) if s >= LEAST_PRESENT and not silent[i]]
+    notes += [f"{c.id} has no spike: left out" for c, s in zip(scene.cameras, silent, strict=True) if s]
     for camera, own in zip(scene.cameras, share, strict=True):
         if own < LEAST_PRESENT:
             notes.append(f"{camera.id} lacks {1 - own:.0%} of its ticks: left out")
     if len(kept) < min(2, len(share)):
         fix = "record again, or choose another split"
-        raise problem(f"scene {scene.id}", "two cameras that recorded most ticks", f"{len(kept)}", fix)
+        raise problem(f"scene {scene.id}", "two cameras that recorded spikes, in most ticks", f"{len(kept)}", fix)
     return _only(scene, kept)
+
+
+def _check_exposures(scene: TrainingScene) -> None:
+    """Raise UserError where a camera counts spikes at quite another rate than the others.
+
+    Gains are corrected, but one camera of such a pair is saturated or sees nothing.
+    """
+    means = {c.id: float(total_counts(s).mean()) / s.n_ticks for c, s in zip(scene.cameras, scene.streams, strict=True)}
+    low, high = min(means, key=means.__getitem__), max(means, key=means.__getitem__)
+    if means[high] > MOST_RATIO * means[low]:
+        expected = f"cameras whose mean rates differ by less than {MOST_RATIO:g} times"
+        found = f"{means[low]:.2g} spikes per tick and pixel of {low}, {means[high]:.2g} of {high}"
+        raise problem(f"scene {scene.id}", expected, found, "set the exposures alike, or leave the camera out")
 
 
 def _only(scene: TrainingScene, kept: Sequence[int]) -> TrainingScene:

@@ -167,3 +167,20 @@ def test_the_real_recording_is_upright_and_of_the_known_rate() -> None:
     # Bits of the wrong order break up every edge: the right order is the smoother image.
     wrong = np.unpackbits(np.fromfile(path, np.uint8)).reshape(-1, 250, 400)[:, ::-1].mean(axis=0)
     assert np.abs(np.diff(report.rate, axis=1)).mean() < 0.8 * np.abs(np.diff(wrong, axis=1)).mean()
+
+
+@pytest.mark.parametrize(("width", "height"), [(16384, 8), (8, 3000), (1, 1)])
+@pytest.mark.filterwarnings("error")
+def test_extreme_sizes_are_shown_without_warnings(tmp_path: Path, width: int, height: int) -> None:
+    fired = np.random.default_rng(0).random((60, height, width)) < 0.3
+    with SpikeWriter(tmp_path / "s.dat", width, height) as writer:
+        writer.write(pack(fired))
+    assert inspect(tmp_path / "s.dat", dat_file=DatFile(width, height, 20_000.0), out=tmp_path / "out") == 0
+    assert (tmp_path / "out/s/s.png").is_file()
+
+
+def test_a_camera_without_a_spike_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with SpikeWriter(tmp_path / "dark.dat", 40, 24) as writer:
+        writer.write(np.zeros((60, 120), np.uint8))
+    assert inspect(tmp_path / "dark.dat", dat_file=DatFile(40, 24, 20_000.0), out=tmp_path / "out") == 0
+    assert "dark: no spike in the whole clip" in capsys.readouterr().out

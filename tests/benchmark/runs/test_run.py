@@ -226,21 +226,31 @@ def test_a_killed_run_resumes_and_equals_an_uninterrupted_one(small_scene: Path,
 
 
 def test_the_fit_time_of_a_resumed_fit_is_the_sum_of_its_parts(tmp_path: Path) -> None:
-    path, checkpoint = tmp_path / "clock.json", tmp_path / "checkpoint"
+    path, checkpoint, said = tmp_path / "clock.json", tmp_path / "checkpoint", list[int]()
 
-    def part(seconds: float) -> FitClock:
-        """The clock of the next part, after one that wrote its last checkpoint `seconds` after its start."""
-        checkpoint.write_text("half done")
-        written = json.loads(path.read_text())["started_unix"] + seconds
-        os.utime(checkpoint, (written, written))
-        return FitClock(path, checkpoint)
+    def progress(done: int, total: int, note: str = "") -> None:
+        said.append(done)
 
-    assert FitClock(path, checkpoint).before == 0
-    assert part(40.0).before == pytest.approx(40, abs=1e-3), "what came after is lost with the kill, and done again"
-    third = part(30.0)
-    assert third.before == pytest.approx(70, abs=1e-3) and third.seconds() >= third.before
-    checkpoint.unlink()
+    first = FitClock(path, checkpoint)
+    first.before = 40.0  # as if it had begun so long ago
+    report = first.watched(progress)
+    report(1, 9)
     assert FitClock(path, checkpoint).before == 0, "without a checkpoint everything is done again"
+    checkpoint.write_text("half done")
+    os.utime(checkpoint, (1.0, 1.0))  # a wall clock that was moved
+    report(2, 9)
+    first.before = 50.0
+    report(3, 9)  # no new checkpoint: what comes after is lost with a kill, and done again
+    second = FitClock(path, checkpoint)
+    assert second.before == pytest.approx(40, abs=1) and second.seconds() >= second.before
+    second.before += 30
+    checkpoint.write_text("three quarters")
+    second.watched(progress)(5, 9)
+    assert FitClock(path, checkpoint).before == pytest.approx(70, abs=2)
+    assert FitClock(path, checkpoint).before == pytest.approx(70, abs=2), "killed before it wrote a checkpoint"
+    assert said == [1, 2, 3, 5]
+    checkpoint.unlink()
+    assert FitClock(path, checkpoint).before == 0
 
 
 def test_two_runs_cannot_share_a_folder(small_scene: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import reveal, score
-from spike4dgs.leaderboard.season.results import predict_all, read_results
+from spike4dgs.leaderboard.season.results import predict_all, read_results, write_result
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
 
@@ -48,6 +49,14 @@ def test_the_table_ranks_by_psnr(scored: Made) -> None:
     assert [row.split(" | ")[:4] for row in rows] == [
         [f"| {i}", r.name, "predictions", f"{r.record['mean']['psnr']:.2f}"] for i, r in enumerate(results, start=1)
     ]
+
+
+@pytest.mark.parametrize("name", ["Counts", "co.unts", "COUNTS_"])
+def test_a_name_that_is_written_in_another_way_is_the_same(scored: Made, name: str) -> None:
+    (result,) = (r for r in read_results(scored.seasons, scored.season) if r.name == "counts")
+    record = {**result.record, "method": {**result.record["method"], "name": name}}
+    with pytest.raises(UserError, match="a name that differs in letters or digits, found counts"):
+        write_result(scored.seasons, NUMBER, replace(result, record=record))
 
 
 def test_a_name_is_scored_once(scored: Made, capsys: pytest.CaptureFixture[str]) -> None:

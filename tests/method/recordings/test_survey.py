@@ -84,7 +84,7 @@ def test_a_camera_that_lacks_most_ticks_is_left_out():
         1:
     ] and f"{NAMES[0]} lacks 80% of its ticks: left out" in found.notes
     gap = (Gap("x", 0, 200, "stall"),)
-    with pytest.raises(UserError, match="two cameras that recorded most ticks"):
+    with pytest.raises(UserError, match="two cameras that recorded spikes, in most ticks"):
         survey_streams(replace(SCENE, streams=tuple(replace(s, gaps=gap) for s in SCENE.streams)))
 
 
@@ -150,3 +150,24 @@ def test_gains_come_from_the_views():
         for s in (scene, found)
     ]
     np.testing.assert_allclose(images[0] / images[1], [found.state(c).gain for c in NAMES], rtol=1e-5)
+
+
+def test_a_camera_without_a_spike_is_left_out_and_said():
+    found = survey_streams(changed(1, np.zeros_like))
+    assert f"{NAMES[1]} has no spike: left out" in found.notes
+    assert [c.id for c in found.scene.cameras] == [n for n in NAMES if n != NAMES[1]]
+
+
+def test_two_cameras_must_have_spikes():
+    silent = changed(0, np.zeros_like).streams[0]
+    with pytest.raises(UserError, match="expected two cameras that recorded spikes, in most ticks, found 0"):
+        survey_streams(replace(SCENE, streams=(silent,) * len(NAMES)))
+
+
+def test_exposures_that_differ_by_orders_of_magnitude_are_refused():
+    def dimmed(spikes):
+        spikes[np.arange(len(spikes)) % 100 > 0] = 0
+        return spikes
+
+    with pytest.raises(UserError, match=f"mean rates differ by less than 30 times, found .* of {NAMES[2]}, .*alike"):
+        survey_streams(changed(2, dimmed))

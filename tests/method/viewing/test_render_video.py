@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,6 +141,22 @@ def test_colours_survive_the_video(tmp_path: Path) -> None:
         write(frame)
     ok, found = cv2.VideoCapture(str(tmp_path / "v.avi")).read()
     assert ok and np.abs(found[:, :, ::-1].astype(int) - frame).mean() < 4
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+def test_a_video_that_a_disk_has_no_room_for_is_an_error(tmp_path: Path, suffix: str) -> None:
+    """OpenCV writes on as if nothing were wrong."""
+    images = np.random.default_rng(0).integers(0, 256, (30, 96, 128), np.uint8)
+    path, old = tmp_path / f"v{suffix}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, old[1]))
+    try:
+        with pytest.raises(UserError, match="a video with its last frame, found a broken one after 30 frames"):
+            with video_writer(path, (128, 96), 30.0) as write:
+                for image in images:
+                    write(image)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failure_leaves_no_video(tmp_path: Path) -> None:

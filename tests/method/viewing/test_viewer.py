@@ -32,6 +32,7 @@ from spike4dgs.method.viewing.content import (
     padded,
     window,
 )
+from spike4dgs.method.viewing.serving import free_port, is_own
 from spike4dgs.method.viewing.viewer import FREE, Viewer
 
 TRAINED = WORLD.training.cameras
@@ -108,6 +109,67 @@ def test_without_viser_the_command_says_what_to_install(
     assert main(["view", "any.safetensors"]) == 2
     expected = "error: view: expected the package viser, found none; pip install 'spike4dgs[viewer]'\n"
     assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "message"),
+    [
+        ("127.0.0.1", 0, "--port: expected a port, 1 to 65535, found 0"),
+        ("127.0.0.1", 65536, "--port: expected a port, 1 to 65535, found 65536"),
+        ("203.0.113.7", 8080, "--host: expected an address of this machine, found '203.0.113.7'"),
+        ("no such host", 8080, "--host: expected an address of this machine, found 'no such host'"),
+    ],
+)
+def test_a_bad_host_or_port_is_an_error(host: str, port: int, message: str) -> None:
+    with pytest.raises(UserError) as e:
+        free_port(host, port)
+    assert str(e.value).startswith(message)
+
+
+def test_a_port_that_is_taken_is_passed_over() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < free_port("127.0.0.1", port) < port + 1000
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "asked", "own"),
+    [
+        ("127.0.0.1", "http://localhost:8080", "localhost:8080", True),
+        ("127.0.0.1", "http://127.0.0.1:9000", "127.0.0.1:9000", True),  # through a tunnel
+        ("127.0.0.1", None, "localhost:8080", True),  # a program
+        ("127.0.0.1", "https://a.example", "localhost:8080", False),
+        ("127.0.0.1", "http://localhost:3000", "localhost:8080", False),
+        ("127.0.0.1", "null", "localhost:8080", False),
+        ("127.0.0.1", "http://a.example:8080", "a.example:8080", False),  # a name that points at this machine
+        ("0.0.0.0", "http://lab:8080", "lab:8080", True),
+        ("0.0.0.0", "https://a.example", "lab:8080", False),
+    ],
+)
+def test_whose_pages_are_the_viewers_own(host: str, origin: str | None, asked: str, own: bool) -> None:
+    assert is_own(origin, asked, host) == own
+
+
+def test_a_page_of_another_origin_gets_no_socket(viewer: Viewer) -> None:
+    def status(origin: str) -> bytes:
+        host, _, port = viewer.url.removeprefix("http://").partition(":")
+        lines = (
+            "GET / HTTP/1.1",
+            f"Host: {host}:{port}",
+            f"Origin: {origin}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+            "Sec-WebSocket-Version: 13",
+        )
+        with socket.create_connection(("127.0.0.1", int(port)), 30) as connection:
+            connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            return connection.recv(12)
+
+    assert status("https://a.example") == b"HTTP/1.1 403"
+    assert status(viewer.url) == b"HTTP/1.1 101"
 
 
 @pytest.fixture
