@@ -27,6 +27,8 @@ MOST_BYTES = 16 << 20  # of a text: a record of many scenes has some MB; parsed,
 MOST_DEPTH = 64  # of nested JSON values; programs that walk along them need a depth for each
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
+_RUST_ERROR = re.compile(r"\(os error ([0-9]+)\)")
+
 _ROOM = ("room for the file", "free some disk space, or choose another folder")
 _ACCESS = ("a folder that may be written to", "change its permissions, or choose another folder")
 _FOLDERS = ("folders on the way to the file", "remove what is there instead, or choose another folder")
@@ -57,6 +59,11 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as e:
         if (failure := failure_of(e, path)) is None:
+            raise
+        raise failure from e
+    except Exception as e:
+        told = _RUST_ERROR.search(str(e))  # safetensors raises errors of another kind
+        if told is None or (failure := failure_of(OSError(int(told[1]), ""), path)) is None:
             raise
         raise failure from e
 

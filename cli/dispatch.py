@@ -71,8 +71,19 @@ def _check_environment() -> None:
         raise problem("OMP_NUM_THREADS", "a number of threads, 1 to 9999", repr(value[:40]), "correct or unset it")
 
 
+def _check_names(arguments: Iterable[str]) -> None:
+    """Raise UserError for names that are no text: records and pages are UTF-8, and OpenEXR takes no other names."""
+    for where, name in (*(("argument", a) for a in arguments), ("working folder", os.getcwd())):
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            shown = ascii(os.fsencode(name)[:80])[1:]
+            raise problem(where, "a name in UTF-8", shown, "rename the folder, or link to it by another name") from None
+
+
 def _dispatch(arguments: list[str]) -> int:
     _check_environment()
+    _check_names(arguments)
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in ("-h", "--help"):
         print(_overview("spike4dgs", COMMANDS, GROUPS))

@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +100,27 @@ class SpikeStream(Shown):
     def _check(self, start: int, stop: int) -> None:
         if not 0 <= start <= stop <= self.n_ticks:
             raise problem(self.source, f"a window within ticks [0, {self.n_ticks})", f"[{start}, {stop})", "shorten it")
+
+
+class _Packed:
+    """The field `packed` of a stream. Its file is looked at each time: to read behind a file's end ends the process."""
+
+    def __get__(self, stream: SpikeStream | None, owner: type) -> Any:
+        """Return the packed ticks. Raises UserError where the mapped file was cut since it was opened."""
+        if stream is None:
+            return self
+        packed: UInt8 = stream.__dict__["packed"]
+        mapped = packed.base
+        if isinstance(mapped, mmap.mmap) and (size := mapped.size()) < len(mapped):
+            fix = "another program cut the stream: restore it, and run again"
+            raise problem(stream.source, f"{len(mapped)} bytes, as when it was opened", f"{size}", fix)
+        return packed
+
+    def __set__(self, stream: SpikeStream, packed: UInt8) -> None:
+        stream.__dict__["packed"] = packed
+
+
+SpikeStream.packed = _Packed()  # after the dataclass, to which it would be a default
 
 
 def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:

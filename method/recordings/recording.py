@@ -6,7 +6,7 @@ camera. The held-out cameras' streams and recordings are read after it, to judge
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from spike4dgs.method.starts.structure_from_motion import FEATURES, FOCAL_PRIOR,
 GIVEN = "given by the scene"
 ESTIMATED = "estimated with COLMAP, the focal length too: the unit of length is the array's largest distance"
 ALL = "all"  # the split of a recording without poses
+LEAST_SIDE = 16  # pixels: views are matched at half their size, with windows of some pixels
 WHITE_PERCENTILE = 99.0  # of the mean rates; the rate of white is not known without a scene
 
 
@@ -57,6 +58,7 @@ def open_recording(root: Path, seed: int = 0) -> Recording:
         return _without_poses(root, open_stream_folder(root, allow_gaps=True), seed)
     scene = open_scene(root, allow_gaps=True)
     notes = (f"the fit does not see the held-out {', '.join(scene.test)}",) if scene.test else ()
+    _check_size(root, scene.training.streams)
     recorded = {c: scene.stream(c) for c in scene.train}
     surveyed = survey_streams(replace(scene.training, streams=tuple(recorded.values())))
     training, gain_notes = survey_gains(surveyed.scene)
@@ -70,6 +72,7 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     if len(streams) < 2 or len(kinds) > 1:
         found = f"{len(streams)} stream(s) of {len(kinds)} kind(s)"
         raise problem(root, "two or more streams of one size, rate and length", found, "record all cameras together")
+    _check_size(root, streams.values())
     names = sorted(streams)
     revision = sha256_json({c: sha256_file(Path(streams[c].source)) for c in names})
     first = streams[names[0]]
@@ -98,6 +101,13 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     )
     facts = camera_facts(training, streams, surveyed.bad)
     return Recording(training, ALL, ESTIMATED, facts, notes=(*surveyed.notes, *notes, *gain_notes))
+
+
+def _check_size(root: Path, streams: Iterable[SpikeStream]) -> None:
+    """Raise UserError for views in which nothing can be matched."""
+    side = min(min(stream.width, stream.height) for stream in streams)
+    if side < LEAST_SIDE:
+        raise problem(root, f"views of {LEAST_SIDE} pixels or more each way", f"{side}", "record all of the sensor")
 
 
 def _guess(names: Sequence[str], stream: SpikeStream) -> tuple[Camera, ...]:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import atomic_path, json_text, write_json, writing
+from spike4dgs.benchmark.files import atomic_path, json_text, locked, remove_parts, write_json, writing
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
@@ -189,3 +189,44 @@ def test_json_with_keys_that_are_numbers_and_without_values_that_are_none() -> N
     for number in (float("nan"), float("inf")):
         with pytest.raises(ValueError, match="not JSON compliant"):
             json_text({"a": [{"b": [number]}]})
+
+
+def test_a_lock_that_is_a_link_leaves_its_target_alone(tmp_path: Path) -> None:
+    target = tmp_path / "precious"
+    target.write_text("content")
+    (tmp_path / "x.lock").symlink_to(target)
+    with pytest.raises(UserError, match="x.lock: expected a plain file, .* found a symbolic link; remove it"):
+        with locked(tmp_path / "x.lock", "x", "free"):
+            pass
+    assert target.read_text() == "content"
+
+
+def test_a_lock_that_is_a_fifo_is_an_error_and_no_wait(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.lock")
+    with pytest.raises(UserError, match="x.lock: expected a plain file, .* found something else; remove it"):
+        with locked(tmp_path / "x.lock", "x", "free"):
+            pass
+
+
+def test_parts_of_killed_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    gone = [".a.123.part.json", "deeper/.b.7.part", "deeper/.cam_00.dat.99.part"]
+    kept = [".a.part", ".car.json", "a.123.part.json", ".lock", "deeper/cam_00.dat", ".parts/x.png"]
+    for name in gone + kept:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    remove_parts(tmp_path)
+    assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="a system without /proc")
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="/proc/spike4dgs/a.json: expected a folder that may be written to"):
+        write_json(Path("/proc/spike4dgs/a.json"), {})
+
+
+def test_weights_on_a_full_disk(tmp_path: Path) -> None:
+    def write(path: Path) -> None:
+        with atomic_path(path) as part, file_size_limit(4096):
+            safetensors.numpy.save_file({"a": BIG}, part)
+
+    refused(tmp_path / "a.safetensors", write, "ile too large; free some disk space")

@@ -199,3 +199,41 @@ def test_verify_names_every_damaged_file(small_scene: Path, capsys: pytest.Captu
 def test_python_m_runs_the_command_line() -> None:
     done = python("-m", "spike4dgs.cli", "verify", "nowhere")
     assert done.returncode == 2 and done.stderr.startswith("error: nowhere: expected a scene folder")
+
+
+@pytest.mark.parametrize(
+    ("value", "good"), [("x", False), ("0", False), ("-1", False), ("", False), ("2", True), ("4, 2", True)]
+)
+def test_a_number_of_threads_that_openmp_would_pass_over(
+    value: str, good: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
+    assert main(["--version"]) == (0 if good else 2)
+    if not good:
+        expected = (
+            f"error: OMP_NUM_THREADS: expected a number of threads, 1 to 9999, found {value!r}; correct or unset it"
+        )
+        assert capsys.readouterr().err == f"{expected}\n"
+
+
+@pytest.mark.parametrize("command", ["fit", "run-benchmark"])
+@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+def test_a_bad_seed_is_refused_before_any_work(
+    command: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(tmp_path / "none"), "--seed", seed]) == 2
+    assert capsys.readouterr().err.startswith("error: --seed: expected a ")
+
+
+def test_a_full_disk_for_the_output_is_one_line() -> None:
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(['--help']))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("error: the disk: expected room for the file")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_folder_whose_name_is_no_text_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = os.fsdecode(os.fsencode(tmp_path) + b"/sc\xff")
+    assert main(["inspect", name]) == 2
+    assert capsys.readouterr().err.endswith(r"sc\xff'; rename the folder, or link to it by another name" + "\n")

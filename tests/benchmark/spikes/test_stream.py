@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -155,3 +156,16 @@ def test_bad_files_are_refused_in_one_line(
     with pytest.raises(UserError, match=message) as error:
         open_stream(path, *size, 20000.0, n_ticks=n_ticks)
     assert "\n" not in str(error.value)
+
+
+def test_a_stream_that_is_cut_while_it_is_mapped_is_an_error(tmp_path: Path) -> None:
+    """Where pages of the map lie behind the end of the file, the system ends the process."""
+    path = tmp_path / "s.dat"
+    with SpikeWriter(path, 8, 8) as writer:
+        writer.write(np.ones((20_000, 8), np.uint8))
+    stream = open_stream(path, 8, 8, 20_000.0)
+    assert stream.counts(0, 20_000).sum() == 160_000
+    os.truncate(path, 100)
+    for read in (lambda: stream.counts(0, 20_000), lambda: stream.window(19_000, 19_010), lambda: stream.packed):
+        with pytest.raises(UserError, match="s.dat: expected 160000 bytes, as when it was opened, found 100; another"):
+            read()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from small_scenes import array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -141,3 +144,9 @@ def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
     scene = scene_with_recordings(tmp_path / "other", FACTS | {"dark_ticks": 77})
     with pytest.raises(UserError, match="77 ticks"):
         calibrate(scene, out=tmp_path / "out")
+
+
+def test_two_calibrations_into_one_folder_exclude_each_other(tmp_path: Path) -> None:
+    with locked(tmp_path / ".lock", "x", "free"), pytest.raises(UserError, match="found a run in progress; wait"):
+        calibrate(write_small_scene(tmp_path / "scene"), out=tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "scene"]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from changes import files_in
 from page_boards import board, cell, row
 
+from spike4dgs.benchmark import files
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.leaderboard.page import site
 from spike4dgs.leaderboard.page.site import script, write_site
@@ -39,6 +42,39 @@ def test_a_page_is_replaced_and_equal_boards_give_equal_bytes(tmp_path: Path) ->
     (tmp_path / "other/mine.txt").touch()
     with pytest.raises(UserError, match="an earlier page"):
         write_site(tmp_path / "other", small())
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 7, 20])
+def test_a_page_that_was_killed_while_it_was_written_is_replaced(
+    tmp_path: Path, after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process ends as the given number of files have their names, and leaves another one half written."""
+    count = 0
+
+    def replace(part: str, path: Path) -> None:
+        nonlocal count
+        if (count := count + 1) > after:
+            raise KeyboardInterrupt
+        os.rename(part, path)
+
+    out = tmp_path / "page"
+    with monkeypatch.context() as killed:
+        killed.setattr(files, "os", SimpleNamespace(**{**vars(os), "replace": replace}))
+        killed.setattr(Path, "unlink", lambda *_, **__: None)
+        with pytest.raises(KeyboardInterrupt):
+            write_site(out, small())
+    assert [p for p in out.rglob("*") if ".part" in p.name]
+    write_site(out, small())
+    write_site(tmp_path / "again", small())
+    assert {k: v for k, v in files_in(out).items() if ".part" not in str(k)} == files_in(tmp_path / "again")
+
+
+def test_a_folder_with_anything_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "data/car").mkdir(parents=True)
+    (tmp_path / "data/car/scene.json").touch()
+    with pytest.raises(UserError, match="an earlier page"):
+        write_site(tmp_path, small())
+    assert [p.name for p in tmp_path.rglob("*")] == ["data", "car", "scene.json"]
 
 
 def test_data_are_strings_of_a_script() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import small_scenes
 import torch
 from devtools import browser
 from PIL import Image
@@ -247,7 +248,7 @@ def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
         with SpikeWriter(tmp_path / f"{name}.dat", 96, 60) as writer:
             writer.write(dark.packed)
     write_stream_folder(tmp_path, dict.fromkeys("ab", dark))
-    with pytest.raises(UserError, match="calibrate-rig"):
+    with pytest.raises(UserError, match="expected two cameras that recorded spikes, in most ticks, found 0"):
         open_recording(tmp_path)
 
 
@@ -297,3 +298,13 @@ def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, capsys: pytest.Cap
     assert "resuming after" in capsys.readouterr().out and not (out / "work").exists()
     camera = WORLD.held_out
     np.testing.assert_array_equal(load_model(out / MODEL).model.render(camera, 500.0), model.render(camera, 500.0))
+
+
+def test_views_of_a_few_pixels_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(small_scenes, "WIDTH", 8)
+    monkeypatch.setattr(small_scenes, "HEIGHT", 8)
+    cameras = small_scenes.array_cameras(width=8, height=8)
+    monkeypatch.setattr(small_scenes, "array_cameras", lambda: cameras)
+    scene = small_scenes.write_small_scene(tmp_path / "scene")
+    with pytest.raises(UserError, match="expected views of 16 pixels or more each way, found 8"):
+        open_recording(scene)
