@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.schema_checks import Check, compiled
+from spike4dgs.benchmark.json_values.schema_checks import Check, compiled
 
 if TYPE_CHECKING:
     from referencing.jsonschema import SchemaRegistry

@@ -13,10 +13,10 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.benchmark import schemas
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_bytes, user_cache, write_bytes
 from spike4dgs.benchmark.metrics.table import PRIMARY
@@ -159,8 +159,7 @@ def _code() -> str:
 @cache
 def _code_of(release: Path) -> str:
     digest = hashlib.sha256()
-    for package in ("spike4dgs.benchmark", "spike4dgs.leaderboard"):
-        root = Path(str(files(package)))
+    for root in (Path(schemas.__file__).parent, Path(__file__).parent):
         for path in sorted([*root.rglob("*.py"), *root.rglob("*.schema.json")]):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())

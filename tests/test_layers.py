@@ -23,14 +23,14 @@ MAY_IMPORT = {
 }
 # The modules and folders of each room, low to high: each imports only those before it.
 ORDER = {
-    "benchmark": "errors arrays lazy plugins variants files compilation schemas untrusted croissant environment "
-    "weights screen spikes scene exchange release metrics method runs reports",
+    "benchmark": "errors arrays lazy plugins variants json_values files compilation schemas untrusted croissant "
+    "environment weights screen spikes scene exchange release metrics method runs reports",
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
     "schedule models checkpoint msdi images matching starts self_calibration trainer fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",
-    "leaderboard": "tracks entry truth_check rank verify submit page season",
+    "leaderboard": "tracks entry reading truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error images recorder_runs recorder saved_models oracle_truth "
     "oracle_methods oracle_ladder faults patterns poses spike_agreement scene_noise",
 }

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import parse_json
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 NAME = "release.json"

@@ -36,7 +36,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Half, Mask
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, parse_json
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_SIDE, check_header, is_id, positive, shown, whole
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 

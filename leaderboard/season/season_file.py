@@ -17,7 +17,8 @@ from typing import Any
 
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import json_text, read_json, write_json, write_text
+from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.json_values.text import json_text
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT
 

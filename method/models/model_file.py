@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, parse_json
+from spike4dgs.benchmark.files import atomic_path
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.runs.provenance import Provenance, read_provenance
 from spike4dgs.benchmark.untrusted import check_header
 from spike4dgs.method.settings import Settings

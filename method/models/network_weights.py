@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, parse_json, sha256_file
+from spike4dgs.benchmark.files import atomic_path, sha256_file
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.weights import FoundWeights, NamedWeights, find_weights, load_into, read_header, read_tensors
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from submissions import submit
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import import_spikecv
-from spike4dgs.benchmark.files import MOST_BYTES, parse_json, read_json
+from spike4dgs.benchmark.files import MOST_BYTES, read_json
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter, open_predictions
 from spike4dgs.benchmark.runs.record import check_record, read_record

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import resource
 import subprocess
@@ -16,12 +15,10 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from dummy_methods import CountMethod, run
-from hypothesis import given
-from hypothesis import strategies as st
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import atomic_path, json_text, locked, remove_parts, write_json, writing
+from spike4dgs.benchmark.files import atomic_path, locked, remove_parts, write_json, writing
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
@@ -171,24 +168,6 @@ def test_every_file_has_the_mode_that_the_umask_gives(tmp_path: Path, umask: int
     finally:
         os.umask(before)
     assert {p.name: p.stat().st_mode & 0o777 for p in tmp_path.iterdir()} == {"a.json": mode, "a.safetensors": mode}
-
-
-@given(
-    st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
-        lambda values: st.lists(values) | st.dictionaries(st.text(), values) | st.tuples(values, values),
-    )
-)
-def test_json_has_the_text_of_the_standard_library(value: object) -> None:
-    assert json_text(value) == json.dumps(value, indent=2, sort_keys=True) + "\n"
-
-
-def test_json_with_keys_that_are_numbers_and_without_values_that_are_none() -> None:
-    value = {"b": {2: [1, {"x": []}], 10: {}}, "a": [[], {1: 2}]}
-    assert json_text(value) == json.dumps(value, indent=2, sort_keys=True) + "\n"
-    for number in (float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="not JSON compliant"):
-            json_text({"a": [{"b": [number]}]})
 
 
 def test_a_lock_that_is_a_link_leaves_its_target_alone(tmp_path: Path) -> None:

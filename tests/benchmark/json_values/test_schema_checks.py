@@ -15,7 +15,7 @@ from jsonschema import Draft202012Validator
 from mutations import VALUES, Raw, pick
 
 from spike4dgs.benchmark import schemas
-from spike4dgs.benchmark.schema_checks import compiled
+from spike4dgs.benchmark.json_values.schema_checks import compiled
 from spike4dgs.benchmark.schemas import load_schema
 from spike4dgs.leaderboard.tracks import SHIPPED
 
