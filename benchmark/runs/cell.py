@@ -295,9 +295,5 @@ class FitClock:
 
         return report
 
-    def _version(self) -> tuple[int, int] | None:
-        """Return what tells the checkpoint's file from an earlier one."""
-        if not self._checkpoint.is_file():
-            return None
-        status = self._checkpoint.stat()
-        return status.st_ino, status.st_mtime_ns
+    def _version(self) -> int | None:
+        return self._checkpoint.stat().st_mtime_ns if self._checkpoint.is_file() else None
