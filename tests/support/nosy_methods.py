@@ -119,7 +119,8 @@ class Lies(CountMethod):
         self._lines = lines
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
-        pipe = request.progress.__self__._lines  # type: ignore[attr-defined]
+        inside = [c.cell_contents for c in request.progress.__closure__]  # type: ignore[attr-defined]
+        (pipe,) = (f.__self__._lines for f in inside if hasattr(getattr(f, "__self__", None), "_lines"))
         for line in self._lines:
             os.write(pipe, line)
         return super().fit(scene, request)
