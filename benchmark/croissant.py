@@ -64,7 +64,7 @@ def write_croissant(root: Path, meta: dict[str, Any], description: str) -> None:
         file_object(name, (root / name).stat().st_size, kind, sha256_file(root / name)) for name, kind in single.items()
     ]
     sets = [_file_set(name, *value) for name, value in found.items()]
-    ours = meta["source"]["kind"] != "spikecv"  # of a recording that was imported we do not know whose it is
+    ours = meta["source"]["kind"] not in ("spikecv", "frames")  # we do not know whose an import is
     about = (meta["id"], description, meta["licence"])
     write_json(root / NAME, dataset(*about, ours=ours, distribution=[*files, *sets], records=_records(root)))
 

@@ -34,7 +34,8 @@ GROUPS: dict[str, str] = {
     "Leaderboard": "leaderboard submit verify-leaderboard season",
     "Look": "inspect images render view",
     "Recorder": "record board-clip calibrate-rig",
-    "Exchange": "import-dat import-spikecv export-spikecv export-nerfstudio export-colmap export-ply download release",
+    "Exchange": "import-dat import-frames import-spikecv export-spikecv export-nerfstudio export-colmap export-ply "
+    "download release",
     "Train": "make-msdi-data train-msdi train-spk2img",
     "Measure": "report speed poses patterns spike-agreement",
     "This machine": "doctor completion",
@@ -214,6 +215,11 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.cli.import_dat:import_dat",
         "make a folder of streams or a scene from bare .dat files, with cameras of COLMAP, OpenCV or Kalibr",
         "import-dat recordings --width 400 --height 250 --rate-hz 20000 --cameras camchain.yaml --out data/first",
+    ),
+    "import-frames": Command(
+        "spike4dgs.cli.import_frames:import_frames",
+        "make a scene of what an array of ordinary cameras filmed, each instant held still",
+        "import-frames footage --cameras cameras.yml --held-out cam_1 --width 240 --out data/first",
     ),
     "import-spikecv": Command(
         "spike4dgs.cli.spikecv:import_spikecv",

@@ -82,11 +82,7 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
 def sensor_facts(job: Job) -> dict[str, Any]:
     """Return `sensor` of scene.json."""
     return {
-        "model": SENSOR.name,
-        "rows_bottom_up": True,
-        "pixel_filter": "box",  # of the truth too: see `rendering.render`
-        "reset": SENSOR.reset,
-        "most_spikes_per_tick": SENSOR.most_spikes_per_tick,
+        **calibration.noisy_facts(),
         "gain_map": job.gain_map,
         "dark_map": job.dark_map,
         "photons_per_spike": SENSOR.photons_per_spike if job.shot_noise else None,
@@ -104,9 +100,5 @@ def extras(job: Job) -> dict[str, dict[str, Any]]:
         },
         "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S, "coding": "8-bit sRGB gray"},
         "events": {"threshold": THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"},
-        "calibration": {
-            "flat_radiance": calibration.FLAT_RADIANCE,
-            "flat_ticks": calibration.FLAT_TICKS,
-            "dark_ticks": calibration.DARK_TICKS,
-        },
+        "calibration": calibration.calibration_facts(),
     }

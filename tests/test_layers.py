@@ -26,7 +26,7 @@ ORDER = {
     "benchmark": "errors arrays lazy plugins variants json_values files compilation schemas untrusted croissant "
     "environment weights screen spikes scene exchange release metrics method runs reports",
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
-    "second_renderings truth previews scene_maker scene_differences scene_check make_dataset",
+    "second_renderings truth held_frames previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
     "schedule models checkpoint msdi images matching starts self_calibration trainer fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,32 @@ def _rng(name: str, seed: int, camera: str) -> np.random.Generator:
 FLAT_RADIANCE = 0.7
 FLAT_TICKS = 500  # 25 ms
 DARK_TICKS = 2000  # 100 ms: the darkest hundredth of the pixels fires every 670 ticks
+
+
+def calibration_facts() -> dict[str, Any]:
+    """Return `calibration` of scene.json for the recordings of `write_calibration`."""
+    return {"flat_radiance": FLAT_RADIANCE, "flat_ticks": FLAT_TICKS, "dark_ticks": DARK_TICKS}
+
+
+def noisy_sensor(camera: Camera, seed: int, noise_seed: Sequence[int]) -> Sensor:
+    """Return a camera's sensor with all noise of the model: the maps of `seed`, and shot noise of `noise_seed`."""
+    pixels = camera.height, camera.width, seed, camera.id
+    photons = SENSOR.photons_per_spike
+    return Sensor(gain=gain_map(*pixels), dark=dark_map(*pixels), photons=photons, noise_seed=tuple(noise_seed))
+
+
+def noisy_facts() -> dict[str, Any]:
+    """Return `sensor` of scene.json for `noisy_sensor`."""
+    return {
+        "model": SENSOR.name,
+        "rows_bottom_up": True,
+        "pixel_filter": "box",  # of the truth too
+        "reset": SENSOR.reset,
+        "most_spikes_per_tick": SENSOR.most_spikes_per_tick,
+        "gain_map": True,
+        "dark_map": True,
+        "photons_per_spike": SENSOR.photons_per_spike,
+    }
 
 
 def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Sequence[int]) -> None:

@@ -37,6 +37,7 @@ from spike4dgs.method.starts.plane_sweep import (
     sweep_all,
     widest_baseline,
 )
+from spike4dgs.method.starts.surrounding import looked_at, points_inside
 from spike4dgs.method.training_views.changes import COUNTS, changing, without_specks
 from spike4dgs.method.training_views.pinholes import nearest_pixels, seen_pixels, undistorted
 
@@ -85,7 +86,14 @@ def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS) -> Start:
 
 
 def swept(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> Start:
-    """Return the same, with corrected images or not."""
+    """Return the same, with corrected images or not; for cameras around their subject see `surrounding`."""
+    if (ball := looked_at(scene.cameras)) is not None:
+        mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
+        points = points_inside(ball, scene.cameras)
+        seen = np.stack([look_up(c, m, points) for c, m in zip(scene.cameras, mean, strict=True)])
+        known = np.isfinite(seen).any(axis=0)
+        values = np.nanmedian(seen[:, known], axis=0)
+        return Start(scene.cameras, points[known].astype(np.float32), values.astype(np.float32))
     return filled(scene, *matched(scene, settings, flat_field), settings)
 
 

@@ -27,8 +27,8 @@ from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.rig import grid_camera
-from spike4dgs.generators.sensor.calibration import dark_map, gain_map
-from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
+from spike4dgs.generators.sensor.calibration import noisy_sensor
+from spike4dgs.generators.sensor.model import random_charge, simulate
 from spike4dgs.generators.worlds import RigSpec
 from spike4dgs.generators.worlds.meshes import rotation
 
@@ -157,12 +157,7 @@ def write_board_clip(
     poses = [board_pose(tick / n_ticks, distance_m) for tick in key_ticks]
     for camera in cameras:
         size, entropy = (camera.height, camera.width), [seed, *f"board {camera.id}".encode()]
-        sensor = Sensor(
-            gain=gain_map(*size, seed, camera.id),
-            dark=dark_map(*size, seed, camera.id),
-            photons=SENSOR.photons_per_spike,
-            noise_seed=tuple(entropy),
-        )
+        sensor = noisy_sensor(camera, seed, entropy)
         with SpikeWriter(out / stream_name(camera.id), camera.width, camera.height) as writer:
             keys = _Keys(camera, board, poses)
             for packed in simulate(keys, key_ticks, n_ticks, sensor, random_charge(*size, entropy)):

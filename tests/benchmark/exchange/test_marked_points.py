@@ -1,0 +1,44 @@
+"""CSV files of points marked in images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.exchange.marked_points import read_marked_points
+
+HEAD = "camera,frame,point,x,y\n"
+
+
+def test_pixel_centres_move_from_whole_numbers_to_a_half(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text(HEAD + "cam_0,0,knee,10,20.5\ncam_1,0,knee,-1,3\n")
+    found = read_marked_points(tmp_path / "points.csv")
+    assert found.camera == ("cam_0", "cam_1")
+    assert found.of == (("0", "knee"),) * 2
+    np.testing.assert_array_equal(found.uv, [[10.5, 21], [-0.5, 3.5]])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "a head line"),
+        ("x,y\n1,2\n", "a head line"),
+        (HEAD + "cam_0,0,knee,1\n", "line 2: expected camera, frame, point and two finite numbers"),
+        (HEAD + "cam_0,0,knee,1,nan\n", "line 2"),
+        (HEAD + "cam_0,0,knee,1,1e12\n", "line 2"),
+        (HEAD + "cam_0,0,knee,1,2\ncam_0,0,knee,1,3\n", "line 3: expected a point once in a frame"),
+        (HEAD + "cam_0,0,\0,1,x\n", "line 2"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "points.csv").write_text(text)
+    with pytest.raises(UserError, match=expected):
+        read_marked_points(tmp_path / "points.csv")
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        read_marked_points(tmp_path / "points.csv")

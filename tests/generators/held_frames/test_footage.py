@@ -1,0 +1,121 @@
+"""Footage of cameras: what is found, in which order, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.generators.held_frames.footage import find_footage, read_frames
+
+WIDTH, HEIGHT = 32, 16
+
+
+def write_images(
+    folder: Path, values: list[int], suffix: str = ".png", size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> None:
+    folder.mkdir(parents=True)
+    for k, value in enumerate(values):
+        Image.new("L", size, value).save(folder / f"img_{k}{suffix}")
+
+
+def test_images_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    values = [10 * k for k in range(12)]  # img_10 after img_9
+    write_images(tmp_path / "left", values)
+    write_images(tmp_path / "right", values)
+    (tmp_path / "notes.txt").write_text("no footage")
+    found = find_footage(tmp_path)
+    assert sorted(found) == ["left", "right"]
+    footage = found["left"]
+    assert (footage.frames, footage.width, footage.height) == (12, WIDTH, HEIGHT)
+    assert [int(image[0, 0]) for image in read_frames(footage, [0, 2, 11])] == [0, 20, 110]
+
+
+def test_a_video_gives_the_frames_that_are_asked_for_in_rgb(tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "cam_0.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
+    for k in range(6):
+        writer.write(np.full((48, 64, 3), (200, 30 * k, 20), np.uint8))  # blue, green, red
+    writer.release()
+    footage = find_footage(tmp_path)["cam_0"]
+    assert (footage.frames, footage.width, footage.height) == (6, 64, 48)
+    one, four = read_frames(footage, [1, 4])
+    for image, green in ((one, 30), (four, 120)):
+        assert np.abs(image.mean((0, 1)) - (20, green, 200)).max() < 6  # JPEG's colours
+
+
+def test_colour_and_palette_images_are_rgb(tmp_path: Path) -> None:
+    colour = Image.new("RGB", (WIDTH, HEIGHT), (10, 20, 30))
+    (tmp_path / "a").mkdir()
+    colour.save(tmp_path / "a/0.png")
+    colour.quantize().save(tmp_path / "a/1.png")
+    first, second = read_frames(find_footage(tmp_path)["a"], [0, 1])
+    assert first.shape == (HEIGHT, WIDTH, 3) and (first == (10, 20, 30)).all() and (second == first).all()
+
+
+def damaged(folder: Path) -> None:
+    (folder / "cam_1/img_0.png").write_bytes(b"no image")
+
+
+def other_size(folder: Path) -> None:
+    for path in (folder / "cam_1").iterdir():
+        Image.new("L", (WIDTH, HEIGHT + 1)).save(path)
+
+
+def other_length(folder: Path) -> None:
+    (folder / "cam_1/img_1.png").unlink()
+
+
+def sixteen_bits(folder: Path) -> None:
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(folder / "cam_1/img_0.png")
+
+
+def twice(folder: Path) -> None:
+    (folder / "cam_1.mp4").write_bytes(b"no video")
+
+
+def bad_video(folder: Path) -> None:
+    (folder / "cam_2.mp4").write_bytes(b"no video")
+
+
+def odd_name(folder: Path) -> None:
+    (folder / "cam_1").rename(folder / "cam 1!")
+
+
+def nothing(folder: Path) -> None:
+    for path in folder.glob("*/*"):
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (damaged, "an image"),
+        (other_size, "one size for all cameras"),
+        (other_length, "the same number of frames"),
+        (sixteen_bits, "8 bits a channel"),
+        (twice, "a video"),
+        (bad_video, "a video"),
+        (odd_name, "the id of a camera"),
+        (nothing, "a subfolder of images, or a video"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_other_footage_is_refused(tmp_path: Path, change, expected: str) -> None:  # type: ignore[no-untyped-def]
+    for camera in ("cam_0", "cam_1"):
+        write_images(tmp_path / camera, [0, 100])
+    change(tmp_path)
+    with pytest.raises(UserError, match=expected) as caught:
+        find_footage(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_frame_of_another_size_is_refused_when_it_is_read(tmp_path: Path) -> None:
+    write_images(tmp_path / "cam_0", [0, 100])
+    Image.new("L", (WIDTH + 2, HEIGHT)).save(tmp_path / "cam_0/img_1.png")
+    footage = find_footage(tmp_path)["cam_0"]
+    with pytest.raises(UserError, match=f"img_1.png: expected frames of {WIDTH}x{HEIGHT} pixels"):
+        list(read_frames(footage, [0, 1]))
