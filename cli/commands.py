@@ -201,6 +201,16 @@ COMMANDS: dict[str, Command] = {
         "check a release: a host's limits, its index, every byte",
         "release check releases/1",
     ),
+    "release publish": Command(
+        "spike4dgs.cli.release:publish",
+        "upload a release to Zenodo, Hugging Face or a web server; with --dry-run show what would be sent",
+        "release publish releases/1 --to zenodo-sandbox --dry-run",
+    ),
+    "release wheel": Command(
+        "spike4dgs.cli.release:wheel",
+        "write a wheel of a small release, by which pip brings its scenes",
+        "release wheel releases/quick-start --out dist",
+    ),
     "release fingerprint": Command(
         "spike4dgs.cli.release:fingerprint",
         "write small files by which scenes made on other processors are recognised",

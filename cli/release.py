@@ -1,4 +1,4 @@
-"""`release pack`, `release check` and `release fingerprint`: make a release of scenes, check it, and know it again."""
+"""`release pack`, `check`, `publish`, `wheel` and `fingerprint`: make a release, upload it, and know it again."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ from spike4dgs.benchmark.release.check import find_problems
 from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fingerprint
 from spike4dgs.benchmark.release.index import Release, read_release
 from spike4dgs.benchmark.release.pack import pack as pack_scenes
+from spike4dgs.benchmark.release.publish import plan, send, token_of
 from spike4dgs.benchmark.release.source import size_text
+from spike4dgs.benchmark.release.wheel import write_wheel
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.scene.scene import open_scenes
 
 
-def pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000) -> int:
+def pack(
+    scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000, flat: bool = False
+) -> int:
     """Pack scene folders into uncompressed tars with an index, a dataset card, Croissant and sums.
 
     The same scenes give the same bytes. A killed run resumes.
@@ -30,13 +34,14 @@ def pack(scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", sh
         out: Folder of the release.
         name: Name of the release.
         shard_mb: Size of a tar in 10^6 bytes; a camera that is larger has a tar of its own.
+        flat: Put all files into one folder, as Zenodo needs them.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
         raise problem("--name", "letters, digits, dots, dashes", repr(name), "choose another name")
     if shard_mb < 1:
         raise problem("--shard-mb", "at least 1", str(shard_mb), "correct the number")
     opened = open_scenes(scenes, allow_gaps=True)
-    release = pack_scenes(opened, out, name, shard_mb * 1_000_000)
+    release = pack_scenes(opened, out, name, shard_mb * 1_000_000, flat)
     make_console().print(_costs(release))
     size = sum(shard.bytes for shard in release.shards)
     print(f"{out}: {len(release.scenes)} scenes, {size} bytes in {len(release.shards)} shards")
@@ -62,6 +67,50 @@ def check(folder: Positional[Path]) -> int:
         make_console().print(_costs(release))
         print(f"{folder}: good; release.json has sha256 {release.sha256}")
     return 2 if problems else 0
+
+
+def publish(folder: Positional[Path], *, to: str, dry_run: bool = False) -> int:
+    """Check a release and upload it: to Zenodo, to Hugging Face, or to a web server that takes PUT.
+
+    The token comes from the environment: ZENODO_TOKEN, HF_TOKEN or SPIKE4DGS_UPLOAD_TOKEN. Zenodo's record stays a
+    draft, whose DOI is registered when a person publishes it.
+
+    Args:
+        folder: Folder of the release.
+        to: zenodo, zenodo-sandbox, hf://datasets/OWNER/NAME, or https://HOST/FOLDER.
+        dry_run: Show what would be sent, byte for byte, and send nothing; needs no token.
+    """
+    problems = list(find_problems(folder))
+    for line in problems:
+        print(f"error: {line}", file=sys.stderr)
+    if problems:
+        return 2
+    release = read_release(folder)
+    upload = plan(folder, release, to)
+    for line in upload.lines():
+        print(line)
+    print(f"{len(upload.files)} files, {upload.bytes} bytes ({size_text(upload.bytes)}), licence {upload.licence}")
+    if dry_run:
+        print("a dry run: nothing was sent")
+        return 0
+    address = send(folder, upload, token_of(upload))
+    print(f"spike4dgs download all --from {address} --sha256 {release.sha256} --out data")
+    return 0
+
+
+def wheel(folder: Positional[Path], *, out: Path = Path("dist"), version: str = "1.0") -> int:
+    """Write a wheel of a small release, by which `pip install` brings its scenes.
+
+    Args:
+        folder: Folder of the release.
+        out: Folder of the wheel.
+        version: Version of the package, numbers with dots.
+    """
+    path = write_wheel(folder, read_release(folder), out, version)
+    package = path.name.partition("-")[0]
+    print(f"{path}: {size_text(path.stat().st_size)}, sha256 {sha256_file(path)}")
+    print(f'pip install {path}; spike4dgs download all --from "$(python -m {package})" --out data')
+    return 0
 
 
 def fingerprint(scenes: Positional[tuple[Path, ...]], *, out: Path) -> int:

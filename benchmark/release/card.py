@@ -1,4 +1,7 @@
-"""What people and catalogues read of a release: README.md, the dataset card, and croissant.json."""
+"""What people and catalogues read of a release: README.md, the dataset card, DATASHEET.md and croissant.json.
+
+The datasheet answers the questions of Gebru et al., "Datasheets for Datasets" (CACM 64, 2021).
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,14 @@ from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import SceneEntry, Shard
 from spike4dgs.benchmark.release.source import size_text
 
-README = "README.md"
-NAMES = (README, croissant.NAME)
+README, DATASHEET = "README.md", "DATASHEET.md"
+NAMES = (README, DATASHEET, croissant.NAME)
 
 
 def write_card(root: Path, name: str, scenes: Sequence[SceneEntry], shards: Sequence[Shard]) -> None:
-    """Write README.md and croissant.json of a release whose release.json is there."""
+    """Write README.md, DATASHEET.md and croissant.json of a release whose release.json is there."""
     write_text(root / README, _readme(name, scenes, shards))
+    write_text(root / DATASHEET, _datasheet(name, scenes, shards))
     write_json(root / croissant.NAME, _croissant(root, name, scenes, shards))
 
 
@@ -28,7 +32,8 @@ def _licence(scenes: Sequence[SceneEntry]) -> str:
     return found.pop() if len(found) == 1 else "other"
 
 
-def _description(scenes: Sequence[SceneEntry]) -> str:
+def description(scenes: Sequence[SceneEntry]) -> str:
+    """Return a sentence about the scenes of a release."""
     return f"{len(scenes)} scenes of spike-camera arrays: packed streams, poses, calibration and ground truth."
 
 
@@ -50,7 +55,7 @@ tags:
 
 # Spike4DGS, release {name}
 
-{_description(scenes)} {size} in {len(shards)} uncompressed tar files.
+{description(scenes)} {size} in {len(shards)} uncompressed tar files.
 
     spike4dgs download all --from THIS_FOLDER --out data
 
@@ -65,13 +70,60 @@ fetches and unpacks scenes; `--scenes`, `--cameras`, `--parts` and `--window-ms`
   path in the scene folder, offset, bytes, SHA-256, and the SHA-256 of every MiB.
 - The tars are a WebDataset: a sample is a camera of a scene, with its stream, calibration and images
   (`car-0-small/cam_00.spikes.dat`), or the scene's own files (`car-0-small/scene.scene.json`).
+- `DATASHEET.md`: why the data were made, how, from what, and what they are for.
 - `SHA256SUMS`: `sha256sum -c SHA256SUMS` checks all files.
 """
 
 
+def _datasheet(name: str, scenes: Sequence[SceneEntry], shards: Sequence[Shard]) -> str:
+    cameras, seconds = sum(len(s.streams) for s in scenes), sum(s.n_ticks / s.rate_hz for s in scenes)
+    sizes = ", ".join(sorted({f"{s.width}x{s.height}" for s in scenes}))
+    rates = ", ".join(sorted({f"{s.rate_hz:g}" for s in scenes}))
+    licences = "\n".join(f"- {s.id} ({s.title}): {s.licence}" for s in scenes)
+    return f"""# Datasheet of Spike4DGS, release {name}
+
+## Motivation
+
+To compare methods that reconstruct fast scenes in four dimensions from an array of spike cameras, sensors whose pixels
+fire one-bit spikes. No recording of more than two such cameras is public. Made by the Spike4DGS developers.
+
+## Composition
+
+- {len(scenes)} scenes, {cameras} streams, {seconds:g} s of time in all; {sizes} pixels, {rates} ticks per second;
+  {size_text(sum(s.bytes for s in shards))}.
+- An instance is a scene: packed streams of its cameras, their poses and calibration, and of the held-out cameras the
+  images that are scored. Scenes of `make-dataset` have depth, flow, object ids, frames and events too.
+- `scene.json` of each scene states its `source`: the program, world, variant, seed and versions that made it, or the
+  footage it shows. Splits and scored images are in it and in `targets.json`: train on `train`, never on ground truth.
+- Errors known: the renderer's noise, which `make-dataset --audit` reports. Gaps of recordings are in `scene.json`.
+- No person's data in scenes of `make-dataset`. The files need nothing from elsewhere.
+
+## Collection and processing
+
+Scenes of `make-dataset`: Mitsuba renders radiance, and a sensor model whose constants follow calibrations of a real
+250x400 camera turns it into spikes; nothing is filmed. Recordings under uniform light and in the dark are kept as
+counts. Everything can be made again with the same program, which is free.
+
+## Uses
+
+Reconstruction, view synthesis, image formation from spikes, calibration. Not for claims about a real camera that the
+sensor model does not cover (`docs/sensor.md` of the program lists what it leaves out), nor as training data for methods
+that are then scored on the same scenes.
+
+## Distribution and licences
+
+{licences}
+
+## Maintenance
+
+`release.json` names every scene's revision, the hash of what is fitted and scored; a changed scene has another. Errors
+are mended in a new release, and old ones stay. The program's changelog tells what changed.
+"""
+
+
 def _croissant(root: Path, name: str, scenes: Sequence[SceneEntry], shards: Sequence[Shard]) -> dict[str, Any]:
-    description = root / index.NAME
-    first = croissant.file_object(index.NAME, description.stat().st_size, "application/json", sha256_file(description))
+    about = root / index.NAME
+    first = croissant.file_object(index.NAME, about.stat().st_size, "application/json", sha256_file(about))
     tars = [croissant.file_object(s.file, s.bytes, "application/x-tar", s.sha256) for s in shards]
     lists = [croissant.file_object(s.index, s.index_bytes, "application/json", s.index_sha256) for s in shards]
     fields = {
@@ -82,7 +134,7 @@ def _croissant(root: Path, name: str, scenes: Sequence[SceneEntry], shards: Sequ
     }
     return croissant.dataset(
         f"spike4dgs-{name}",
-        _description(scenes),
+        description(scenes),
         _licence(scenes),
         ours=True,
         distribution=[first, *tars, *lists],

@@ -65,8 +65,8 @@ class _PlannedSample:
         return sum(file.packed_bytes for file in self.files)
 
 
-def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int) -> Release:
-    """Write a release of scenes into the folder `out` and return it.
+def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: bool = False) -> Release:
+    """Write a release of scenes into the folder `out` and return it; with `flat` all files lie in `out` itself.
 
     A shard is as long as `shard_bytes`, or shorter; a camera that is longer has a shard of its own. Raises UserError
     where two scenes have one id, where a file is not what its manifest says, and where `out` holds another release.
@@ -77,7 +77,8 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int) -> Rel
         scenes = [_with_counts(scene, out / _COUNTED / scene.id) for scene in scenes]
         samples = [sample for scene in scenes for sample in _samples(scene)]
         shards = list(_in_shards(samples, shard_bytes))
-        names = [f"shards/{i // _SHARDS_PER_FOLDER:03d}/spike4dgs-{name}-{i:05d}.tar" for i in range(len(shards))]
+        folders = ["" if flat else f"shards/{i // _SHARDS_PER_FOLDER:03d}/" for i in range(len(shards))]
+        names = [f"{folder}spike4dgs-{name}-{i:05d}.tar" for i, folder in enumerate(folders)]
         _refuse_others(out, [*names, *map(index_of, names)])
         total = sum(file.bytes for sample in samples for file in sample.files)
         written = []
