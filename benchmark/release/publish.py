@@ -67,7 +67,8 @@ class Upload:
     def lines(self) -> Iterator[str]:
         """Yield the requests as text: what a dry run shows."""
         if self.kind == "zenodo":
-            yield f"POST {self.address}/api/deposit/depositions"
+            yield f"GET {self.address}/api/deposit/depositions?status=draft"
+            yield f"POST {self.address}/api/deposit/depositions, or PUT to the draft that has this title"
             yield from json.dumps({"metadata": self.metadata}, indent=2).splitlines()
         if self.kind == "hub":
             yield f"create the dataset repository {self.address.removeprefix(_HUB)}, and commit:"

@@ -18,6 +18,7 @@ VIDEOS = (".avi", ".mkv", ".mov", ".mp4")
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF")
 _MODES = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB"}  # of 8 bits a channel -> as it is read
 _MOST_PIXELS = 1 << 26  # of a frame
+_MOST_FRAMES = 1_000_000  # of a video, whose header may state any number
 _AGAIN = "restore or export it"
 
 
@@ -117,7 +118,9 @@ def _video(path: Path) -> Footage:
         n, width, height = (int(video.get(key)) for key in keys) if video.isOpened() else (0, 0, 0)
     finally:
         video.release()
-    if not (n > 0 and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= _MOST_PIXELS):
+    if not (
+        0 < n <= _MOST_FRAMES and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= _MOST_PIXELS
+    ):
         raise problem(path, "a video", f"{n} frames of {width}x{height}", _AGAIN)
     return Footage((path,), n, width, height)
 

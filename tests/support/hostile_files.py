@@ -374,6 +374,36 @@ def read_imports(folder: Path, out: Path) -> None:
     read_all([*reads, lambda: import_spikecv(folder / "spikecv", out / "spikecv", Recording(20000.0))])
 
 
+def make_footage(folder: Path) -> None:
+    import cv2
+    from PIL import Image
+
+    rng = np.random.default_rng(3)
+    frames = rng.integers(0, 256, (3, 24, 40, 3), dtype=np.uint8)
+    for name in ("png", "jpg", "bmp", "tif"):
+        (folder / "images" / name).mkdir(parents=True)
+        for k, frame in enumerate(frames):
+            Image.fromarray(frame).save(folder / f"images/{name}/{k}.{name}")
+    (folder / "videos").mkdir()
+    video = cv2.VideoWriter(str(folder / "videos/a.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (40, 24))
+    for frame in frames:
+        video.write(frame)
+    video.release()
+    rows = [f"cam_{c},0,{p},{p + c},7.5" for c in range(2) for p in range(20)]
+    (folder / "points.csv").write_text("\n".join(["camera,frame,point,x,y", *rows]) + "\n")
+
+
+def read_footage(folder: Path, out: Path) -> None:
+    from spike4dgs.benchmark.exchange.marked_points import read_marked_points
+    from spike4dgs.generators.held_frames.footage import find_footage, read_frames
+
+    def frames(name: str) -> None:
+        for footage in find_footage(folder / name).values():
+            list(read_frames(footage, range(footage.frames)))
+
+    read_all([partial(frames, "images"), partial(frames, "videos"), lambda: read_marked_points(folder / "points.csv")])
+
+
 def make_recording(folder: Path) -> None:
     from spike4dgs.benchmark.spikes.folder import write_stream_folder
     from spike4dgs.benchmark.spikes.gaps import Gap
@@ -443,8 +473,14 @@ CASES: dict[str, Case] = {
             **dict.fromkeys(("colmap/*.bin", "in/*.dat", "spikecv/a.dat"), None),
         },
     ),
+    "footage": Case(
+        5,
+        make_footage,
+        read_footage,
+        {"images/png/*": m.in_png, "images/[jbt]*/*": None, "videos/*": None, "points.csv": m.in_text},
+    ),
     "recording": Case(
-        10, make_recording, read_recording, {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
+        5, make_recording, read_recording, {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
     ),
 }
 
