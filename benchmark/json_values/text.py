@@ -26,11 +26,11 @@ def _indented(value: Any, line: str) -> str:
     inner = line + "  "
     if not isinstance(value, dict | list | tuple) or not value:
         return _encode(inner, value)
-    keyed = isinstance(value, dict)
-    if not any(isinstance(v, dict | list | tuple) for v in (value.values() if keyed else value)):
+    parts = value.values() if isinstance(value, dict) else value
+    if not any(isinstance(v, dict | list | tuple) for v in parts):
         text = _encode(inner, value)
         return f"{text[0]}{inner}{text[1:-1]}{line}{text[-1]}"
-    if not keyed:
+    if not isinstance(value, dict):
         return f"[{inner}{f',{inner}'.join(_indented(v, inner) for v in value)}{line}]"
     if not all(isinstance(key, str) for key in value):
         return json.dumps(value, indent=2, sort_keys=True, allow_nan=False).replace("\n", line)

@@ -120,7 +120,7 @@ class _Packed:
         stream.__dict__["packed"] = packed
 
 
-SpikeStream.packed = _Packed()  # after the dataclass, to which it would be a default
+SpikeStream.packed = _Packed()  # type: ignore[assignment]  # after the dataclass, to which it would be a default
 
 
 def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:

@@ -7,6 +7,7 @@ the server compares that with the host that the request goes to.
 from __future__ import annotations
 
 import http
+import inspect
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -75,7 +76,7 @@ def own_origins(host: str) -> Iterator[None]:
             if not is_own(request.headers.get("Origin"), request.headers.get("Host"), host):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "another page's request\n")
             answer = process_request(connection, request) if process_request else None
-            return await answer if hasattr(answer, "__await__") else answer
+            return await answer if inspect.isawaitable(answer) else answer
 
         return original(*arguments, process_request=checked, **options)
 

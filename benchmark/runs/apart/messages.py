@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import parse_json
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.method import Budget, Method, find_methods, get_method
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.provenance import Provenance
