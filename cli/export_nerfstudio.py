@@ -2,9 +2,14 @@
 
     OUT/train/CAMERA_TICK.png, OUT/val/..., OUT/test/...
     OUT/transforms_train.json, OUT/transforms_val.json, OUT/transforms_test.json
+    OUT/transforms.json
 
-Each transforms file has one `camera_angle_x` and frames of `file_path` (without suffix), `time` and `transform_matrix`
-(camera to world, OpenGL axes). Many programs for dynamic scenes read the same layout.
+Each transforms_*.json has one `camera_angle_x`, `w`, `h` and frames of `file_path` (without suffix), `time` and
+`transform_matrix` (camera to world, OpenGL axes). Many programs for dynamic scenes read the same layout.
+
+Some of them take images for square, and put the principal point of a wide one too low. transforms.json has all images
+with intrinsics for each (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), and lists the parts (`train_filenames`, ...): the other
+parser of nerfstudio and nerfbaselines load it.
 """
 
 from __future__ import annotations
@@ -86,7 +91,8 @@ def export_nerfstudio(
         path = out / f"transforms_{name}.json"
         print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
         if of_part:  # the parser opens the first image
-            write_json(path, {"camera_angle_x": angle, "frames": of_part})
+            write_json(path, _d_nerf(angle, used[0], of_part))
+    write_json(out / "transforms.json", _with_intrinsics(frames))
     print(_LOSSES)
     return 0
 
@@ -113,9 +119,27 @@ def _angle_x(cameras: Sequence[Camera], where: Path) -> float:
 
 
 def _write(out: Path, part: str, scene: Scene, target: Target, radiance: Float32) -> dict[str, Any]:
-    """Write linear radiance [H, W] or [H, W, 3] as a PNG and return its frame."""
-    pixels, name = encode_srgb(radiance), f"{target.camera}_{target.tick:06d}"
+    """Write linear radiance [H, W] or [H, W, 3] as a PNG and return its frame of transforms.json."""
+    pixels, name = encode_srgb(radiance), f"{part}/{target.camera}_{target.tick:06d}.png"
     rgb = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
-    write_png(out / part / f"{name}.png", rgb)
-    pose = to_nerfstudio(scene.cameras[target.camera])["transform_matrix"]
-    return {"file_path": f"./{part}/{name}", "time": target.tick / scene.n_ticks, "transform_matrix": pose}
+    write_png(out / name, rgb)
+    return {"file_path": name, "time": target.tick / scene.n_ticks, **to_nerfstudio(scene.cameras[target.camera])}
+
+
+def _with_intrinsics(parts: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return transforms.json of the frames of each part. A part without images is not listed."""
+    names = {f"{part}_filenames": [frame["file_path"] for frame in frames] for part, frames in parts.items() if frames}
+    return {**names, "frames": [frame for frames in parts.values() for frame in frames]}
+
+
+def _d_nerf(angle: float, camera: Camera, frames: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return transforms_*.json of frames that share one field of view."""
+    listed = [
+        {
+            "file_path": f"./{frame['file_path'].removesuffix('.png')}",
+            "time": frame["time"],
+            "transform_matrix": frame["transform_matrix"],
+        }
+        for frame in frames
+    ]
+    return {"camera_angle_x": angle, "w": camera.width, "h": camera.height, "frames": listed}

@@ -1,7 +1,9 @@
-"""SpikeCV folders: `config.yaml` beside one stream, one folder per camera. Import and export.
+"""SpikeCV folders: `config.yaml` and the streams that it describes. Import and export.
 
 config.yaml knows `filename`, `spike_w`, `spike_h`, `is_labeled`, `labeled_data_type` and `labeled_data_suffix`, and
-nothing of the frame rate, the order of rows, the camera, its pose or the time: an import asks for them.
+nothing of the frame rate, the order of rows, the camera, its pose or the time: an import asks for them. SpikeCV's
+loader uses the size and the labels alone. Its own datasets give `filename` the dataset's name, and keep their streams
+in folders below; an export names the one stream of a camera.
 
 Both formats are one bit per pixel, row-major, least significant bit first, so for H * W a multiple of 8 the bytes are
 the same. Otherwise SpikeCV counts H * W bits to a tick without padding (tick t begins at bit t * H * W), while ours
@@ -27,6 +29,8 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_str
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids, inside, read_yaml, shown
 
 CONFIG = "config.yaml"
+_SUFFIX = ".dat"
+_RAW = 0  # SpikeCV's number for the task `raw`; its loader refuses a task that is not listed, labels or none
 _TICKS = 512  # packed anew at a time: a multiple of 8, so that every part but the last is whole bytes
 
 
@@ -49,7 +53,7 @@ def import_spikecv(
     where a folder is damaged, or the poses do not fit.
     """
     recording.check()
-    sources = {path.name: _read_config(path) for path in _spikecv_folders(folder)}
+    sources = _find_sources(folder)
     check_ids(sources, "camera", folder, "rename the camera's folder")
     cameras = None if transforms is None else _read_poses(transforms, sources)
     check_new(out)
@@ -84,7 +88,7 @@ def _config(camera: str, stream: SpikeStream) -> str:
         "spike_w": stream.width,
         "spike_h": stream.height,
         "is_labeled": False,
-        "labeled_data_type": [],
+        "labeled_data_type": [_RAW],
         "labeled_data_suffix": "",
     }
     return str(yaml.safe_dump(config, sort_keys=False))
@@ -99,8 +103,23 @@ def _spikecv_folders(folder: Path) -> list[Path]:
     return found
 
 
-def _read_config(folder: Path) -> _Source:
-    """Read config.yaml of a SpikeCV folder. Raises UserError where it or the stream is missing or damaged."""
+def _find_sources(folder: Path) -> dict[str, _Source]:
+    """Return the streams of all SpikeCV folders by camera. Raises UserError where two have one name."""
+    found: dict[str, _Source] = {}
+    for camera, source in (pair for described in _spikecv_folders(folder) for pair in _read_folder(described)):
+        if camera in found:
+            two = f"{found[camera].path} and {source.path}"
+            raise problem(folder, "streams of different names", two, "rename one: a camera is called like its stream")
+        found[camera] = source
+    return found
+
+
+def _read_folder(folder: Path) -> Iterator[tuple[str, _Source]]:
+    """Yield the streams that config.yaml describes, with their cameras: the one that it names, called like the folder.
+
+    If that is a dataset's name and no file, each .dat file below, called like the file. Raises UserError where
+    config.yaml or a stream is missing or damaged.
+    """
     path = folder / CONFIG
     keys = "filename, spike_w and spike_h"
     config = read_yaml(path, "a stream's description")
@@ -111,7 +130,15 @@ def _read_config(folder: Path) -> _Source:
     if not isinstance(name, str) or any(type(side) is not int or not 0 < side <= MAX_SIDE for side in (width, height)):
         found = f"{shown(name)}, {shown(width)}, {shown(height)}"
         raise problem(path, f"{keys} of one stream", found, "correct the file")
-    return _source(inside(folder, name, path), width, height)
+    named = inside(folder, name, path)
+    if named.is_file() or named.suffix == _SUFFIX:
+        yield folder.name, _source(named, width, height)
+        return
+    below = [inside(folder, dat.relative_to(folder).as_posix(), path) for dat in sorted(folder.rglob(f"*{_SUFFIX}"))]
+    if not below:
+        raise problem(path, f"a stream called {shown(name)}, or {_SUFFIX} files below", "neither", "restore them")
+    for dat in below:
+        yield dat.stem, _source(dat, width, height)
 
 
 def _source(path: Path, width: int, height: int) -> _Source:

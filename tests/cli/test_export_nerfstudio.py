@@ -80,6 +80,31 @@ def test_known_points_fall_on_the_same_pixels(exported: Path) -> None:
     assert seen == set(cameras)
 
 
+def test_one_file_has_the_intrinsics_of_every_image(exported: Path) -> None:
+    """As nerfstudio's parser and nerfbaselines read it: paths with suffix, and parts by the lists of file names."""
+    points = np.random.default_rng(0).uniform(-0.8, 0.8, (50, 3))
+    cameras, data = {c.id: c for c in array_cameras()}, json.loads((exported / "transforms.json").read_text())
+    frames = {frame["file_path"]: frame for frame in data["frames"]}
+    for name, f in frames.items():
+        with Image.open(exported / name) as image:
+            assert image.size == (f["w"], f["h"]) == (40, 24)
+        local = np.linalg.inv(f["transform_matrix"]) @ np.c_[points, np.ones(50)].T
+        u = f["cx"] - f["fl_x"] * local[0] / local[2]
+        v = f["cy"] + f["fl_y"] * local[1] / local[2]
+        truth = cameras[Path(name).stem.rpartition("_")[0]].project(points)[0]
+        assert np.abs(np.stack([u, v], axis=1) - truth).max() < 1e-9
+    for part in ("train", "val", "test"):
+        of_part = load(exported, part)
+        assert data[f"{part}_filenames"] == [f"{part}/{frame.name}.png" for frame in of_part]
+        assert [frames[name]["time"] for name in data[f"{part}_filenames"]] == [frame.time for frame in of_part]
+
+
+def test_the_size_is_stated_for_readers_that_do_not_look_at_the_image(exported: Path) -> None:
+    for part in ("train", "val", "test"):
+        meta = json.loads((exported / f"transforms_{part}.json").read_text())
+        assert (meta["w"], meta["h"]) == (40, 24)
+
+
 def test_training_images_are_made_of_the_training_spikes(small_scene: Path, exported: Path) -> None:
     scene, frames = open_scene(small_scene), load(exported, "train")
     assert [f.name for f in frames] == [f"{c}_{t:06d}" for c in scene.train for t in (0, 20, 40, 60)]
@@ -141,6 +166,7 @@ def test_a_recording_without_ground_truth_has_no_test_images(
     import_spikecv(tmp_path / "spikecv", tmp_path / "back", Recording(20000.0), tmp_path / "poses.json")
     export_nerfstudio(tmp_path / "back", tmp_path / "export")
     assert len(load(tmp_path / "export", "train")) == 16 and not (tmp_path / "export/transforms_test.json").exists()
+    assert "test_filenames" not in json.loads((tmp_path / "export/transforms.json").read_text())
     assert "no transforms_test.json: the scene has no such images" in capsys.readouterr().out
 
 

@@ -56,6 +56,8 @@ def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, caps
     assert "not in SpikeCV's format: 20000 ticks per second" in capsys.readouterr().out
     config = yaml.safe_load((tmp_path / "spikecv/cam_01/config.yaml").read_text())
     assert (config["filename"], config["spike_w"], config["spike_h"]) == ("cam_01.dat", WIDTH, HEIGHT)
+    # What SpikeCV's data_parameter_dict asks of the file: the task `raw`, its number 0, is one of the list.
+    assert 0 in config["labeled_data_type"] and config["is_labeled"] is False
     transforms = tmp_path / "poses.json"
     transforms.write_text(json.dumps({"frames": [{"camera": c.id, **to_nerfstudio(c)} for c in array_cameras()]}))
     arguments = ["--rate-hz", "20000", "--transforms", str(transforms), "--radiance-gain", "0.6"]
@@ -103,6 +105,33 @@ def test_a_scene_of_any_size_goes_out_and_comes_back(
     np.testing.assert_array_equal(open_scene(root / "back").stream("cam").window(0, n), spikes)
 
 
+def write_dataset(folder: Path, *streams: str) -> np.ndarray:
+    """A folder as SpikeCV publishes its own: `filename` names the dataset, the streams lie in folders below."""
+    spikes = random_spikes(20, 10, 12)
+    config = "filename: vidar_reconstruction2019\nspike_w: 12\nspike_h: 10\nis_labeled: false\n"
+    for i, name in enumerate(streams):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.packbits(np.roll(spikes, i, axis=0)[:, ::-1].reshape(-1), bitorder="little").tofile(folder / name)
+    (folder / "config.yaml").write_text(config + "labeled_data_type: [0]\nlabeled_data_suffix: None\n")
+    return spikes
+
+
+def test_a_dataset_of_spikecv_has_a_camera_for_each_stream_below(tmp_path: Path) -> None:
+    spikes = write_dataset(tmp_path / "recVidarReal2019", "classA/ballon.dat", "classB/car.dat")
+    import_spikecv(tmp_path / "recVidarReal2019", tmp_path / "out", Recording(40000.0))
+    streams = open_stream_folder(tmp_path / "out")
+    assert list(streams) == ["ballon", "car"]
+    for i, stream in enumerate(streams.values()):
+        np.testing.assert_array_equal(stream.window(0, 20), np.roll(spikes, i, axis=0))
+
+
+def test_streams_that_would_be_one_camera_are_refused(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "in", "classA/ballon.dat", "classB/ballon.dat")
+    with pytest.raises(UserError, match=r"different names, found .*classA/ballon.dat and .*classB/ballon.dat"):
+        import_spikecv(tmp_path / "in", tmp_path / "out", Recording(40000.0))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -112,6 +141,7 @@ def test_a_scene_of_any_size_goes_out_and_comes_back(
         ("{filename: a.dat, spike_w: 11}", "config.yaml: expected filename, spike_w and spike_h, found no 'spike_h'"),
         ("{filename: [a.dat, b.dat], spike_w: 11, spike_h: 5}", "config.yaml: expected .* of one stream"),
         ("{filename: a.dat, spike_w: eleven, spike_h: 5}", "config.yaml: expected .* of one stream"),
+        ("{filename: ../b, spike_w: 11, spike_h: 5}", "config.yaml: expected a path inside cam, found '../b'"),
         ("{filename: b.dat, spike_w: 11, spike_h: 5}", "b.dat: expected the stream that config.yaml names, found no"),
         ("{filename: a.dat, spike_w: 12, spike_h: 50}", r"a.dat: expected whole ticks of 12x50 pixels, found 62 bytes"),
     ],
