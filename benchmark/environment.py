@@ -14,6 +14,8 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -47,23 +49,43 @@ def install_line() -> str:
     return f"pip install 'spike4dgs[{extra}]'"
 
 
-def missing_rasterizer() -> Missing | None:
-    """Return the first part that rendering on CUDA lacks here; None where it works. PyTorch must see a device."""
+def missing_rasterizer(device: str = "cuda") -> Missing | None:
+    """Return the first part that rendering on a CUDA device lacks here; None where it works. PyTorch must see it."""
     import torch
 
     if find_spec("numba_cuda") is None:
         return Missing("the package numba-cuda", "none", install_line())
     if torch.version.cuda is None:
         return Missing("a PyTorch with CUDA", f"torch {torch.__version__}", PYTORCH)
-    failure = trial()
+    theirs, ours = torch.version.cuda.partition(".")[0], (_version("cuda-bindings") or "").partition(".")[0]
+    if ours and ours != theirs:  # both would be loaded into one process
+        fix = install_line() if theirs in ("12", "13") else f"install a PyTorch for CUDA {ours} from pytorch.org"
+        return Missing(f"numba-cuda for CUDA {theirs}, which PyTorch is for", f"that for CUDA {ours}", fix)
+    failure = trial(device)
     if failure:
         return Missing("a numba-cuda that works with the driver", failure, f"{install_line()}, or update the driver")
     return None
 
 
+@contextmanager
+def numba_stream(device: Any) -> Iterator[Any]:
+    """Make a torch device numba's own, and yield torch's present stream there as numba's.
+
+    Torch's guard is the outer one: numba's leaves its own device behind where the thread had none of numba's before.
+    """
+    import torch
+
+    cuda: Any = import_module("numba.cuda")
+    with torch.cuda.device(device), cuda.gpus[torch.cuda.current_device()]:
+        yield cuda.external_stream(torch.cuda.current_stream().cuda_stream)
+
+
 @cache
-def trial() -> str:
-    """Compile a kernel and run it on a tensor of the first device; return what fails, or nothing."""
+def trial(device: str = "cuda") -> str:
+    """Compile a kernel and run it as the rasteriser does; return what fails, or nothing.
+
+    That is on the device that is asked for, on a stream of torch, and in a backward pass too, which has its own thread.
+    """
     import torch
 
     try:
@@ -72,10 +94,24 @@ def trial() -> str:
         def add_one(a: Any) -> None:
             a[0] += 1
 
-        one = torch.ones(1, device="cuda")
-        cuda.jit(add_one)[1, 1](cuda.as_cuda_array(one))
-        cuda.synchronize()
-        return "" if one.item() == 2 else "a wrong sum"
+        kernel = cuda.jit(add_one)
+
+        def added(tensor: Any) -> Any:
+            made = tensor.detach().clone()
+            with numba_stream(made.device) as stream:
+                kernel[1, 1, stream](cuda.as_cuda_array(made, sync=False))
+            return made
+
+        class AddOne(torch.autograd.Function):
+            forward = staticmethod(lambda ctx, a: added(a))
+            backward = staticmethod(lambda ctx, gradient: added(gradient))
+
+        one = torch.ones(1, device=device, requires_grad=True)
+        with torch.cuda.device(one.device), torch.cuda.stream(torch.cuda.Stream()):
+            two = AddOne.apply(one)
+            two.backward()
+            torch.cuda.synchronize()
+        return "" if two.item() == one.grad.item() == 2 else "a wrong sum"
     except Exception as e:  # the driver, the compiler and their bindings each have their own
         return f"{type(e).__name__}: {str(e).strip().partition(chr(10))[0]}"
 
@@ -162,7 +198,7 @@ def choose_device(device: str, *, rasterizes: bool = True) -> str:
     index = device.partition(":")[2] or "0"
     if not index.isdigit() or int(index) >= torch.cuda.device_count():
         raise problem("--device", "a CUDA device of this machine", repr(device), "use --device cpu")
-    if rasterizes and (missing := missing_rasterizer()):
+    if rasterizes and (missing := missing_rasterizer(device)):
         raise problem(f"--device {device}", missing.expected, missing.found, f"{missing.fix}; or use --device cpu")
     return device
 

@@ -217,8 +217,9 @@ class Trainer:
         return render(splats, views, self.settings.pixel_filter)
 
     def _views(self, chosen: Sequence[int]) -> Views:
-        v, rows = self.training_images.views, list(chosen)
-        return Views(v.w2c[rows], v.K[rows], v.width, v.height)
+        v = self.training_images.views  # not v.w2c[list(chosen)]: that list would be copied to a device, which waits
+        w2c, K = (torch.stack([matrices[view] for view in chosen]) for matrices in (v.w2c, v.K))
+        return Views(w2c, K, v.width, v.height)
 
     def _adapt_density(self, stage: Stage) -> None:
         s, done, views = self.density, self.step - stage.first, self.training_images.views

@@ -151,7 +151,7 @@ class FittedModel(GaussianModel):
 
     def _render(self, view: Views, t_us: float) -> Tensor:
         """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
-        still = self._repeated.in_view(view) if len(self.background) and self.device == "cpu" else None
+        still = self._repeated.in_view(view) if len(self.background) else None
         if still is None:
             image = self.rendered(self.splats(t_us), view)
         else:

@@ -103,7 +103,7 @@ def sample_level(unit: Tensor, space: Tensor, lines: Tensor) -> Tensor:
     grid = 2 * unit - 1
     product = torch.ones((), dtype=unit.dtype, device=unit.device)
     for plane, (a, b) in zip(space, SPATIAL_AXES, strict=True):
-        product = product * _bilinear(plane, grid[:, [b, a]])  # grid_sample wants the last axis first
+        product = product * _bilinear(plane, torch.stack([grid[:, b], grid[:, a]], -1))  # it wants the last axis first
     for axis, line in enumerate(lines):
         at = torch.stack([torch.zeros_like(grid[:, axis]), grid[:, axis]], -1)
         product = product * _bilinear(line[:, None], at)

@@ -202,7 +202,9 @@ class Msdi(nn.Module):
 
 @cache
 def has_bfloat16(device: torch.device) -> bool:
-    """Return whether a device has instructions that multiply bfloat16."""
+    """Return whether a device has instructions that multiply bfloat16: a GPU from compute capability 8.0 on."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
     return device.type != "cpu" or bool(get_host_cpu_features().get("avx512bf16"))
 
 

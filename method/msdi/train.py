@@ -33,7 +33,7 @@ from spike4dgs.method.msdi.config import MsdiConfig
 from spike4dgs.method.msdi.evaluate import Scores, evaluate
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import TrainingSettings, image_loss, point_loss
-from spike4dgs.method.msdi.network import Msdi
+from spike4dgs.method.msdi.network import Msdi, has_bfloat16
 from spike4dgs.method.msdi.records import Curve, model_card, plot_calibration, plot_curves
 from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
 from spike4dgs.method.msdi.weights import WEIGHTS, Card
@@ -87,7 +87,8 @@ class Training:
         known = draws.random() >= self.settings.unknown_share
         sensors = Sensors(sensitivity, dark) if draws.random() >= self.settings.raw_share else None
         kind = device_type(self.device)
-        with torch.random.fork_rng(devices=[]), torch.autocast(kind, torch.bfloat16, enabled=kind == "cuda"):
+        half = kind == "cuda" and has_bfloat16(torch.device(self.device))
+        with torch.random.fork_rng(devices=[]), torch.autocast(kind, torch.bfloat16, enabled=half):
             torch.manual_seed(int(draws.integers(1 << 62)))  # the numbers of the views
             found = self.network(spikes, intrinsics if known else None, sensors)
         image_l1 = image_loss(found.images, rate) / batch.gain

@@ -104,7 +104,12 @@ def window_moments(phi: nn.Linear, spike: Tensor, levels: int) -> tuple[Tensor, 
     row = (spike.detach() * levels).round().long().flatten()
     step = spike - spike.detach()  # 0, with the gradient of `spike`
     average, deviation = (
-        value.index_select(0, row).view_as(spike) + slope[row].view_as(spike) * step
+        _rows(value, row).view_as(spike) + slope[row].view_as(spike) * step
         for value, slope in zip((average, deviation), slopes, strict=True)
     )
     return average, deviation
+
+
+def _rows(table: Tensor, row: Tensor) -> Tensor:
+    """Return rows of a table, differentiable in it: a device sorts their gradients and adds them up in one order."""
+    return table.index_select(0, row) if table.device.type == "cpu" else table[row]

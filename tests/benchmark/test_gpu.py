@@ -88,12 +88,15 @@ for device in ("cpu", "auto", "auto"):
 def test_networks_take_the_gpu_without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(environment, "missing_rasterizer", lambda: Missing("numba", "none", "install it"))
+    asked: list[str] = []
+    missing = Missing("numba", "none", "install it")
+    monkeypatch.setattr(environment, "missing_rasterizer", lambda *device: asked.extend(device) or missing)
     assert choose_device("auto", rasterizes=False) == "cuda"
     assert choose_device("cuda:0", rasterizes=False) == "cuda:0"
     with pytest.raises(UserError, match="--device cuda:0: expected numba, found none; install it; or use"):
         choose_device("cuda:0")
-    monkeypatch.setattr(environment, "missing_rasterizer", lambda: None)
+    assert asked == ["cuda:0"], "the trial is made on the device that is asked for"
+    monkeypatch.setattr(environment, "missing_rasterizer", lambda *device: None)
     assert choose_device("auto") == "cuda" and choose_device("cuda") == "cuda"
 
 
@@ -116,17 +119,18 @@ def test_apples_gpu_falls_back_to_the_cpu_with_one_line(capsys: pytest.CaptureFi
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """numba-cuda beside a PyTorch for CUDA 12.8, and a trial that succeeds."""
+    """numba-cuda beside a PyTorch for CUDA 12.8, both for CUDA 12, and a trial that succeeds."""
     found = environment.find_spec
     monkeypatch.setattr(environment, "find_spec", lambda name: found("numba") if name == "numba_cuda" else found(name))
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    monkeypatch.setattr(environment, "trial", lambda: "")
+    monkeypatch.setattr(environment, "_version", {"cuda-bindings": "12.9.4"}.get)
+    monkeypatch.setattr(environment, "trial", lambda device: "")
 
 
 @pytest.mark.usefixtures("installed")
 def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert missing_rasterizer() is None
-    monkeypatch.setattr(environment, "trial", lambda: "CudaAPIError: the driver is too old")
+    monkeypatch.setattr(environment, "trial", lambda device: "CudaAPIError: the driver is too old")
     missing = missing_rasterizer()
     assert missing and missing.found == "CudaAPIError: the driver is too old"
     assert missing.fix == "pip install 'spike4dgs[cuda12]', or update the driver"
@@ -136,6 +140,26 @@ def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(environment, "find_spec", lambda name: None)
     missing = missing_rasterizer()
     assert missing and missing.expected == "the package numba-cuda" and missing.fix == "pip install 'spike4dgs[cuda]'"
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("pytorch", "bindings", "fix"),
+    [
+        ("12.8", "13.1.0", "pip install 'spike4dgs[cuda12]'"),
+        ("13.0", "12.9.4", "pip install 'spike4dgs[cuda]'"),
+        ("11.8", "12.9.4", "install a PyTorch for CUDA 12 from pytorch.org"),
+    ],
+)
+def test_two_versions_of_cuda_in_one_process_are_refused(
+    pytorch: str, bindings: str, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.version, "cuda", pytorch)
+    monkeypatch.setattr(environment, "_version", {"cuda-bindings": bindings}.get)
+    missing = missing_rasterizer()
+    assert missing and missing.fix == fix
+    assert missing.expected == f"numba-cuda for CUDA {pytorch[:2]}, which PyTorch is for"
+    assert missing.found == f"that for CUDA {bindings[:2]}"
 
 
 @pytest.mark.parametrize(("cuda", "extra"), [("12.6", "cuda12"), ("13.0", "cuda"), (None, "cuda")])

@@ -44,7 +44,8 @@ def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Layer
 
 def render_over(layer: Layer, splats: Splats, chosen: Sequence[int]) -> RenderOutput:
     """Render `splats` and the background into the views `chosen`: see `Background.render`."""
-    device, pick = splats.means.device, torch.tensor(list(chosen), device=splats.means.device)
+    device = splats.means.device
+    pick = torch.tensor(list(chosen)).to(device, non_blocking=True)  # the copy is queued; nothing waits for the device
     views = Views(layer.views.w2c[pick], layer.views.K[pick], layer.views.width, layer.views.height)
     p = project_splats(splats, views, layer.pixel_filter)
     own = p.pairs

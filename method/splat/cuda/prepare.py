@@ -10,7 +10,10 @@ Gaussian), and each becomes what the kernels need: a centre and whitened coordin
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +21,7 @@ import torch
 from numba.core import config
 from torch import Tensor
 
+from spike4dgs.benchmark.environment import numba_stream
 from spike4dgs.method.splat.reference import rotation_matrices
 from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, NEAR, PixelFilter, Splats, Views
 
@@ -39,10 +43,25 @@ def launch(kernel: Any, blocks: int, threads: int, device: torch.device, *argume
         return
     from numba import cuda
 
-    with cuda.gpus[device.index or 0]:
-        stream = cuda.external_stream(torch.cuda.current_stream(device).cuda_stream)
+    with numba_stream(device) as stream:
         arrays = (cuda.as_cuda_array(a.detach(), sync=False) if isinstance(a, Tensor) else a for a in arguments)
-        kernel[blocks, threads, stream](*arrays)
+        with naming(kernel):
+            kernel[blocks, threads, stream](*arrays)
+            if os.environ.get("CUDA_LAUNCH_BLOCKING") == "1":
+                torch.cuda.synchronize(device)
+
+
+@contextmanager
+def naming(kernel: Any) -> Iterator[None]:
+    """Add a kernel's name to what fails inside.
+
+    An access out of bounds is reported by a later call, except under CUDA_LAUNCH_BLOCKING=1.
+    """
+    try:
+        yield
+    except Exception as e:
+        e.add_note(f"in the kernel {kernel.py_func.__qualname__}")
+        raise
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,22 +78,27 @@ class Seen:
 
 
 def project(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Seen:
-    """Project Gaussians into views; all tensors on one device."""
+    """Project Gaussians into views; all tensors on one device.
+
+    No constant or index list comes from the host: each such copy would wait for the device.
+    """
     eps2d, antialiased = pixel_filter.variance, pixel_filter.compensated
     means, quats, scales, opacities = (t.double() for t in splats.geometry)
     w2c, K = views.w2c.double(), views.K.double()
-    p = means @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]  # [C, N, 3]
+    turn = w2c[:, None, :3, :3]
+    p = product(turn, means[:, :, None])[..., 0] + w2c[:, None, :3, 3]  # [C, N, 3]
     exists = (quats.square().sum(-1) > 0) & (opacities >= ALPHA_MIN)
     view, index = torch.nonzero((p[..., 2] >= NEAR) & exists, as_tuple=True)
-    axes = rotation_matrices(torch.where(exists[:, None], quats, quats.new_tensor([1.0, 0, 0, 0]))) * scales[:, None]
-    p, f, c = p[view, index], K[:, [0, 1], [0, 1]][view], K[:, :2, 2][view]
+    axes = rotation_matrices(torch.where(exists[:, None], quats, _row(quats, 1, 0, 0, 0))) * scales[:, None]
+    p, f, c = p[view, index], K[:, :2, :2].diagonal(dim1=1, dim2=2)[view], K[:, :2, 2][view]
     z = p[:, 2:]
     slope = p[:, :2] / z  # [M, 2] tangent of the viewing angle
-    image = p.new_tensor([views.width, views.height])
+    image = _row(p, views.width, views.height)
     margin = FRUSTUM_MARGIN * 0.5 * image / f
     inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
-    J = torch.cat([torch.diag_embed(f / z), (-f * inside / z)[:, :, None]], -1)  # [M, 2, 3]
-    half = J @ (w2c[:, None, :3, :3] @ axes)[view, index]
+    local = product(turn, axes)[view, index]  # [M, 3, 3] the ellipsoid's axes in the view
+    # [M, 2, 3]: the Jacobian of the projection, f/z (1, 0, -slope_x) and f/z (0, 1, -slope_y), times the axes
+    half = (f / z)[:, :, None] * (local[:, :2] - inside[:, :, None] * local[:, 2:])
     b0, b1 = half.unbind(1)
     det_sharp = torch.linalg.cross(b0, b1).square().sum(-1)
     xx, xy, yy = (b0 * b0).sum(-1), (b0 * b1).sum(-1), (b1 * b1).sum(-1)
@@ -96,6 +120,24 @@ def project(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Seen:
     shape = torch.stack([xy / xx, (0.5 / xx).sqrt(), (0.5 * xx / det).sqrt(), opacity], -1)
     center, depth = center.index_select(0, keep), z[:, 0].index_select(0, keep)
     return Seen(view[keep], index[keep], center, shape, depth, box, extent[keep].amax(-1))
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Return a @ b for a [..., 3, 3] and b [..., 3, K], written out.
+
+    A library chooses how it adds up by the number of matrices: the same Gaussian would get other bits among others.
+    And it is slow for many small ones.
+    """
+    x, y, z = (a[..., :, i, None] * b[..., i, None, :] for i in range(3))
+    return x + y + z
+
+
+def _row(like: Tensor, *values: float) -> Tensor:
+    """Return numbers as a tensor of the type and on the device of another: each is filled in there."""
+    made = like.new_empty(len(values))
+    for at, value in enumerate(values):
+        made[at].fill_(value)
+    return made
 
 
 TILE = 16  # pixels

@@ -160,7 +160,7 @@ def render_cuda(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: 
     if not simulated():
         if device.type != "cuda":
             raise problem("back end cuda", "tensors on a CUDA device", str(device), "move them with .cuda()")
-        if missing := missing_rasterizer():
+        if missing := missing_rasterizer(str(device)):
             fix = f"{missing.fix}, or move the tensors to the CPU"
             raise problem("back end cuda", missing.expected, missing.found, fix)
     views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)

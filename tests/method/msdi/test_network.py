@@ -17,7 +17,7 @@ from spike4dgs.method.msdi import network as module
 from spike4dgs.method.msdi.extractor import ImageGenerator, SpikeExtractor
 from spike4dgs.method.msdi.layers import Fusion, unpack
 from spike4dgs.method.msdi.losses import image_loss, point_loss
-from spike4dgs.method.msdi.network import margins, ray_map, view_numbers
+from spike4dgs.method.msdi.network import has_bfloat16, margins, ray_map, view_numbers
 
 
 def test_output_is_unpacked_by_the_exponentials_and_bounded() -> None:
@@ -337,3 +337,13 @@ def test_training_fits_one_sample() -> None:
         sum(parts).backward()  # type: ignore[union-attr]
         optimizer.step()
     assert losses[-1][0] < losses[0][0] - 0.4 and losses[-1][1] < 0.5 * losses[0][1]
+
+
+@pytest.mark.parametrize(("capability", "units"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])
+def test_bfloat16_is_for_gpus_that_have_units_for_it(
+    capability: tuple[int, int], units: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    has_bfloat16.cache_clear()
+    assert has_bfloat16(torch.device("cuda", 0)) is units
+    has_bfloat16.cache_clear()
