@@ -6,7 +6,7 @@ STAMP  := $(VENV)/.installed
 SCENES := data/car-0-small data/turntable-0-small
 METHODS := nearest-view tfp+static tfi+4dgs tfp+4dgs spike4dgs spike4dgs-x
 
-.PHONY: benchmark test check docs wheel clean
+.PHONY: benchmark test check clients docs wheel clean
 
 # The main job: two small scenes, six recipes, table, sheets and leaderboard entries. Killed runs resume.
 benchmark: $(STAMP)
@@ -19,6 +19,11 @@ test: $(STAMP)
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+# Programs that open our files, each installed into .clients/ by its pins; the table goes to runs/clients/. One or some:
+# make clients ONLY='gsply fourdgs'. Not a part of .ci/run: the environments take gigabytes.
+clients: $(STAMP)
+	PYTHONPATH=tests/support $(BIN)/python tests/clients/run.py $(if $(ONLY),--only $(ONLY))
 
 # The docs site, into site/. The variable silences an announcement of mkdocs-material, which is no warning about the docs.
 docs: $(VENV)/.docs

@@ -1,8 +1,4 @@
-"""The published packages `lpips` and torchvision with random weights, run in a process of their own.
-
-torchvision's wheel needs compiled operators that a CPU build of torch lacks; its import refers to two of them. They are
-declared here, without being used, so that its networks (plain torch) can be imported.
-"""
+"""The published packages `lpips` and torchvision with random weights, run in a process of their own."""
 
 from __future__ import annotations
 
@@ -18,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cpu_torchvision import import_torchvision
 from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
@@ -42,18 +39,6 @@ def published_networks() -> Arrays:
         subprocess.run([sys.executable, __file__, *paths], check=True)
         with np.load(paths[1]) as found:
             return given | dict(found)
-
-
-def _import_torchvision() -> None:
-    try:
-        import torchvision  # noqa: F401
-    except RuntimeError:
-        for name in [m for m in sys.modules if m.startswith("torchvision")]:
-            del sys.modules[name]
-        operators = torch.library.Library("torchvision", "DEF")
-        for name in ("nms", "qnms"):
-            operators.define(f"{name}(Tensor boxes, Tensor scores, float threshold) -> Tensor")
-        import torchvision  # noqa: F401
 
 
 def _lpips(net: str, a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Arrays:
@@ -83,7 +68,7 @@ def _resnet(x: NDArray[np.float32]) -> Arrays:
 
 def _main(given_path: str, found_path: str) -> None:
     warnings.simplefilter("ignore")  # deprecations within the packages
-    _import_torchvision()
+    import_torchvision()
     torch.manual_seed(7)
     given = np.load(given_path)
     with torch.no_grad():
