@@ -51,11 +51,20 @@ class Finding:
 Check = Callable[[], Iterator[Finding]]
 
 
-def doctor() -> int:
+def doctor(*, gpu_receipt: Path | None = None) -> int:
     """Say what this machine has, what it lacks, and what mends it. Nothing is installed or changed.
 
     The exit code is 1 where something that every run needs is broken, and 0 otherwise.
+
+    Args:
+        gpu_receipt: Instead run the tests of the GPU and a timing, some minutes, and write both to this JSON file, for
+            you to send. It names the card and the versions of libraries, and no user, host or folder. Needs a checkout
+            with the extra `test`. The exit code is 1 if a test failed.
     """
+    if gpu_receipt is not None:
+        from spike4dgs.studies.gpu_receipt.command import gpu_receipt as make
+
+        return make(gpu_receipt)
     return report(examine())
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +25,7 @@ from spike4dgs.benchmark.reports.html_page import (
     write_page,
 )
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.studies.kit.checkout import find_checkout, pytest_options
 from spike4dgs.studies.kit.page import program_facts
 
 FORMAT = "spike4dgs-hard-cases/1"
@@ -73,14 +73,12 @@ def hard_cases(
         seed: Seed of all random inputs.
         device: cpu, cuda, or auto: cuda where there is one. Cases of CPU kernels stay on the CPU.
     """
-    root, where = _checkout(), choose_device(device)
+    root, where = find_checkout("report hard-cases"), choose_device(device)
     import pytest
 
     found, start = Cases(seed, where), utc_now()
     tests = sorted(p for p in (root / "tests").rglob("test_*.py") if "mark.hard_case" in p.read_text("utf-8"))
-    options = ["-m", "hard_case", "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist", "-o", "addopts="]
-    options += ["--import-mode=importlib", "--strict-markers", "-c", str(root / "pyproject.toml")]
-    options += ["-W", "default", "-W", "ignore::DeprecationWarning", "-W", "ignore::PendingDeprecationWarning"]
+    options = ["-m", "hard_case", *pytest_options(root)]
     code = pytest.main([*options, *(["-k", only] if only else []), *map(str, tests)], plugins=[found])
     if code == pytest.ExitCode.NO_TESTS_COLLECTED:
         raise problem("--only", "a part of the name of a test marked hard_case", repr(only), "choose another part")
@@ -96,17 +94,6 @@ def hard_cases(
     _write_page(out / "index.html", report)
     print(f"{_counted(report['cases'])}\npage: {out / 'index.html'}\nJSON: {out / 'hard_cases.json'}", flush=True)
     return int(any(c["passed"] is False for c in report["cases"]))
-
-
-def _checkout() -> Path:
-    """Return the root of the checkout whose tests are run: the folder of the command, or that of this source."""
-    for root in (Path.cwd(), Path(__file__).parents[1]):
-        if (root / "tests" / "support" / "hard_case.py").is_file():
-            if find_spec("pytest") is None:
-                raise problem("report hard-cases", "pytest", "none", 'run `pip install -e ".[test]"` in the checkout')
-            return root
-    do = 'clone the repository, run `pip install -e ".[test]"` there, and repeat the command in its folder'
-    raise problem("report hard-cases", "a checkout with its tests", f"none in {Path.cwd()}", do)
 
 
 class Cases:

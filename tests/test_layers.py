@@ -31,7 +31,7 @@ ORDER = {
     "schedule models checkpoint msdi images matching starts self_calibration trainer fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",
     "leaderboard": "tracks entry reading truth_check rank verify submit page season",
-    "studies": "kit hard_cases speed_error images recorder_runs recorder saved_models oracle_truth "
+    "studies": "kit hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models oracle_truth "
     "oracle_methods oracle_ladder faults patterns poses spike_agreement scene_noise",
 }
 FRONT = ROOT / "front" / "__init__.py"  # what `import spike4dgs` gives; no room

@@ -20,8 +20,8 @@ from hard_case import HardCase, core_counts, described, on_cores
 from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.studies import hard_cases as module
 from spike4dgs.studies.hard_cases import hard_cases
+from spike4dgs.studies.kit import checkout as checkout_module
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
 SCHEMA = load_schema("spike4dgs.studies", "hard_cases.schema.json")
@@ -161,7 +161,7 @@ def test_some_cases_are_run_by_a_pattern(checkout: Path, tmp_path: Path) -> None
 
 def test_without_tests_the_command_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "spike4dgs" / "studies" / "hard_cases.py"))
+    monkeypatch.setattr(checkout_module, "__file__", str(tmp_path / "spike4dgs" / "studies" / "kit" / "checkout.py"))
     with pytest.raises(UserError, match=r"expected a checkout with its tests, found none in .*; clone the repository"):
         hard_cases(out=tmp_path)
 
