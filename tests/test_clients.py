@@ -68,6 +68,6 @@ def test_what_cannot_be_installed_is_skipped_and_what_fails_is_not(job: Any, tmp
         (row,) = job.check(nowhere, tmp_path, tmp_path / "homes")
     assert (row.state, row.reason) == ("skipped", "ERROR: No matching distribution")
     with pytest.MonkeyPatch.context() as patch:  # this interpreter, in which the client is not installed
-        patch.setattr(job, "install", lambda client, homes: (Path(sys.executable), {}))
+        patch.setattr(job, "install", lambda client, homes, env: (Path(sys.executable), {}))
         (row,) = job.check(replace(nowhere, script="read_gsply.py"), tmp_path, tmp_path / "homes")
     assert row.state == "failed" and row.reason.startswith("ModuleNotFoundError: No module named")

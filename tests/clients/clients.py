@@ -7,6 +7,7 @@ lists of SpikeCV and nerfstudio cannot be installed everywhere, and their reader
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,6 +76,7 @@ def _clone(source: Path, env: dict[str, str]) -> Path:
     ):
         done = subprocess.run(command, env=quiet, capture_output=True, text=True, timeout=300)
         if done.returncode != 0:
+            shutil.rmtree(source, ignore_errors=True)
             raise Skipped(f"no {_SPIKECV} here; SPIKECV=FOLDER names a checkout ({done.stderr.strip()[-120:]})")
     return source
 

@@ -82,11 +82,12 @@ def compare(client: Client, version: str, theirs: Values, ours: Values) -> list[
 
 def check(client: Client, inputs: Path, homes: Path) -> list[Row]:
     """Install a client, run its script on the inputs, and compare."""
-    version = client.version
+    version, support = client.version, str(HERE.parent / "support")  # for `cpu_torchvision`, which needs torch alone
+    env = {**os.environ, "PYTHONNOUSERSITE": "1", "PYTHONPATH": support}
     try:
-        python, env = install(client, homes)
         if client.prepare:
             version, env = client.prepare(inputs, homes, env)
+        python, env = install(client, homes, env)
     except (Skipped, OSError, subprocess.SubprocessError) as e:
         return [Row(client.name, version, client.opens, "skipped", reason_of(e))]
     answer = inputs / f"{client.name}.json"
@@ -106,12 +107,11 @@ def reason_of(error: Exception) -> str:
     return (errors or lines or [type(error).__name__])[-1].strip().replace("|", "/")[:300]
 
 
-def install(client: Client, homes: Path) -> tuple[Path, dict[str, str]]:
-    """Return the interpreter for a client's script and its environment; a finished installation is used again."""
+def install(client: Client, homes: Path, env: dict[str, str]) -> tuple[Path, dict[str, str]]:
+    """Return the interpreter for a client's script, and its environment; a finished installation is used again."""
     home = homes / client.name
     pins = hashlib.sha256(json.dumps([client.packages, client.bare, client.npm, sys.version]).encode()).hexdigest()
-    support = str(HERE.parent / "support")  # for `cpu_torchvision`, which needs torch alone
-    stamp, env = home / "installed", {**os.environ, "PYTHONNOUSERSITE": "1", "PYTHONPATH": support}
+    stamp = home / "installed"
     done = stamp.is_file() and stamp.read_text() == pins
     if not done:
         shutil.rmtree(home, ignore_errors=True)
@@ -121,7 +121,7 @@ def install(client: Client, homes: Path) -> tuple[Path, dict[str, str]]:
             raise Skipped("needs Node: no npm here")
         if not done:
             run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(home), *client.npm])
-        env["PATH"] = os.pathsep.join((str(home / "node_modules/.bin"), env["PATH"]))
+        env = {**env, "PATH": os.pathsep.join((str(home / "node_modules/.bin"), env["PATH"]))}
         python = Path(sys.executable)
     else:
         python = home / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
