@@ -50,7 +50,7 @@ def claimed(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_gpu_without_kernels_means_the_cpu_and_one_line(small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     methods = ("nearest-view", "tiny")
-    arguments = ("--methods", *methods, "--metrics", "psnr", "--out", str(out))
+    arguments = ("--methods", *methods, "--metrics", "psnr", "--in-process", "--out", str(out))
     done = claimed(_RUN, "run-benchmark", str(small_scene), *arguments)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
