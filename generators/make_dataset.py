@@ -112,8 +112,8 @@ def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> li
         raise problem("--track", "a track, which has its own profile, variants and camera", "settings too", fix)
     t = TRACKS[track]
     physics = replace(settings.physics, camera=t.camera)
-    own = {"profile": t.profile, "rendering": "split", "physics": physics}
-    every = [replace(settings, variant=variant, **own) for variant in t.variants]
+    common = replace(settings, profile=t.profile, rendering="split", physics=physics)
+    every = [replace(common, variant=variant) for variant in t.variants]
     return [one.job(world) for world in worlds for one in every]
 
 

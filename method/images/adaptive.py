@@ -80,7 +80,7 @@ def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8, li
 
 def gathered(stream: SpikeStream, light: Float64 | None) -> Float64:
     """Return the light gathered up to the middle of each tick [n_ticks]; of steady light where `light` is None."""
-    return np.arange(stream.n_ticks) + 0.5 if light is None else light
+    return np.arange(0.5, stream.n_ticks) if light is None else light
 
 
 def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None = None) -> UInt8:

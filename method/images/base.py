@@ -64,11 +64,11 @@ class ImageMaker(Shown):
     name: str
     definition: str = ""  # may refer to fields of the settings by their names
     source: str = ""
-    rate: Callable[[SpikeStream, int, Any], Float32] = _no_rate  # of a stream, a tick and the settings
+    rate: Callable[..., Float32] = _no_rate  # of a stream, a tick and the settings
     settings: Settings = Settings()  # the maker's own numbers (prefix `image_maker`)
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
-    rate_over: Callable[[SpikeStream, int, Any], tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
+    rate_over: Callable[..., tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
     knows_light: bool = False  # `rate` and `rate_over` take `light`, see `images.light`; else they take it as steady
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
     label: str | None = None  # in descriptions of recipes, after "images"; None: the name
