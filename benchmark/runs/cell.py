@@ -184,7 +184,7 @@ def timed_fit(
         warm_up(request)
     reset_peak_memory(request.device)
     clock = FitClock(work / "fit_clock.json", checkpoint)
-    if clock.before > 0:
+    if clock.resumes:
         note(f"resuming after {clock.before:.0f} s of fitting")
     model = method.fit(scene, replace(request, progress=clock.watched(request.progress)))
     return model, clock.seconds()
@@ -274,7 +274,8 @@ class FitClock:
     def __init__(self, path: Path, checkpoint: Path) -> None:
         self._path, self._checkpoint = path, checkpoint
         self.before = 0.0
-        if path.is_file() and checkpoint.is_file():
+        self.resumes = path.is_file() and checkpoint.is_file()
+        if self.resumes:
             self.before = float(read_json(path, "the times of an unfinished fit")["seconds"])
         self._seen = self._version()
         self._start = time.perf_counter()
