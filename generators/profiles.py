@@ -84,11 +84,10 @@ TRACKS = {
     "paper": Track("paper", (PUBLIC_VARIANT,), IDEAL),  # the size of the paper's scenes
 }
 
-# Noise of moving objects, from pairs of renderings (van-10-small / turntable-10-small): 47.4 / 45.8 dB with 32 samples
-# of direct light and 52.8 / 51.9 with 128; that of maps alone 55 / 58 with 128 paths and 53 with 64 (van). One step
-# more of direct light for a margin. Streams and truth smooth alike, so that what smoothing changes is the same light in
-# both. Twice the pixels a metre smooth over as much of the surface with twice the sigma, less a margin, and may move
-# twice as far between two maps.
+# Noise of moving objects, from pairs of renderings of variant 10 at small: 46.4 dB (motor) to 51.1 (bird) in streams,
+# 52.1 to 59.4 in truth (docs/results/rendering.md). Streams and truth smooth alike and have maps at the same times, so
+# that what smoothing changes is the same light in both. Twice the pixels a metre smooth over as much of the surface
+# with twice the sigma, less a margin, and may move twice as far between two maps.
 SPLIT_PROFILES: dict[str, Profile] = {
     "tiny": Profile(
         (0, 2, 4, 7),
