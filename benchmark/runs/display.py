@@ -13,6 +13,8 @@ from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import Cell
 from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_text
 
+_AROUND_S = 5.0  # of a cell beside its fit: the start of its process, renders, scores
+
 
 @dataclass(frozen=True)
 class ShownCell:
@@ -75,11 +77,11 @@ class RunDisplay:
         """Return the seconds of a cell of a kind, from those of the kinds that were met."""
         if kind in means:
             return means[kind]
-        met = [k for k in means if k in self._typical_s]
-        typical = sum(self._typical_s[k] for k in met)
-        pace = sum(means[k] for k in met) / typical if typical else 1.0
+        typical = {k: s + _AROUND_S for k, s in self._typical_s.items()}
+        met = [k for k in means if k in typical]
+        pace = sum(means[k] for k in met) / sum(typical[k] for k in met) if met else 1.0
         of_other = sum(means.values()) / len(means) if means else 0.0
-        return self._typical_s[kind] * pace if kind in self._typical_s else of_other
+        return typical[kind] * pace if kind in typical else of_other
 
     @contextmanager
     def cell(self, title: str, notes: Sequence[str] = ()) -> Iterator[ShownCell]:

@@ -77,11 +77,13 @@ def test_cells_of_other_methods_take_what_their_typical_seconds_say(monkeypatch)
     typical_s = {"none": 0.0, "quick": 10.0, "slow": 60.0}
     cells = [("none", 0.0, False), ("quick", 20.0, True), ("slow", 100.0, True), ("slow", 100.0, True)]
     after_none, after_quick, after_slow = run_cells(monkeypatch, cells, typical_s)
-    assert after_none == 10.0 + 60.0 + 60.0  # nothing was measured
-    assert after_quick == 2 * (60.0 + 60.0)  # this machine takes twice as long
+    assert after_none == 15.0 + 65.0 + 65.0  # nothing was measured; 5 s for what is not the fit
+    assert after_quick == pytest.approx(20 / 15 * (65.0 + 65.0))  # this machine takes a third longer
     assert after_slow == 100.0  # as the one before
     cells = [("quick", 20.0, True), ("unknown", 30.0, True), ("slow", 100.0, True)]
-    assert run_cells(monkeypatch, cells, typical_s) == [20.0 + 120.0, 120.0]
+    assert run_cells(monkeypatch, cells, typical_s) == pytest.approx([20.0 + 20 / 15 * 65.0, 20 / 15 * 65.0])
+    cells = [("none", 4.0, True), ("slow", 60.0, True)]
+    assert run_cells(monkeypatch, cells, typical_s) == pytest.approx([4 / 5 * 65.0])  # not 4 s over no second
 
 
 def test_a_cell_of_a_known_method_does_not_end_with_its_stage(monkeypatch) -> None:
