@@ -44,7 +44,7 @@ class Light:
         Under steady light tick k has k + 1/2. Beyond the array's clip light is the mean.
         """
         n, own = len(self.factors), np.arange(n_ticks) + 0.5
-        at = (own - clock.offset_ticks) / (1 + clock.drift_ppm * 1e-6)  # in the array's ticks
+        at = np.array([clock.shared(tick) for tick in own])
         total = np.concatenate([[0.0], np.cumsum(self.factors)])
         inside = np.clip(at, 0, n)
         return np.asarray(np.interp(inside, np.arange(n + 1), total) + (at - inside) + clock.offset_ticks)

@@ -7,11 +7,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Lock
 from typing import Any
 from urllib.parse import unquote
+
+from local_server import running
 
 
 @dataclass
@@ -44,14 +46,8 @@ def serve(
     class OfThisFolder(kind):  # type: ignore[misc, valid-type]
         folder, behaviour = root, chosen
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), OfThisFolder)
-    server.daemon_threads = True
-    Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}", chosen
-    finally:
-        server.shutdown()
-        server.server_close()
+    with running(OfThisFolder) as address:
+        yield address, chosen
 
 
 class Handler(BaseHTTPRequestHandler):

@@ -11,10 +11,12 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Lock, Thread
+from http.server import BaseHTTPRequestHandler
+from threading import Lock
 from typing import Any
 from urllib.parse import unquote
+
+from local_server import running
 
 TOKEN = "secret"
 
@@ -42,14 +44,8 @@ def serve_uploads(kind: type[BaseHTTPRequestHandler]) -> Iterator[tuple[str, Hos
     class OfThisHost(kind):  # type: ignore[misc, valid-type]
         received = host
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), OfThisHost)
-    server.daemon_threads = True
-    Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}", host
-    finally:
-        server.shutdown()
-        server.server_close()
+    with running(OfThisHost) as address:
+        yield address, host
 
 
 class Server(BaseHTTPRequestHandler):
