@@ -82,5 +82,5 @@ def _plot(reports: Sequence[dict[str, Any]], path: Path) -> None:
         axes.axhline(goal, color=bars[0].get_facecolor(), lw=1, ls="--")
     axes.set(ylabel="noise where things move, dB", ylim=(30, None))
     axes.set_xticks(at, [report["scene"] for report in reports], rotation=45, ha="right", fontsize=8)
-    axes.legend(loc="upper right", fontsize=8)
+    figure.legend(loc="outside upper right", ncols=2, fontsize=8)
     save_figure(figure, path)
