@@ -12,9 +12,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from devtools import Page, browser
 from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
@@ -22,6 +24,21 @@ from small_scenes import write_small_scene
 @pytest.fixture
 def small_scene(tmp_path: Path) -> Path:
     return write_small_scene(tmp_path / "scene")
+
+
+@pytest.fixture(scope="session")
+def one_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def empty_page(one_browser: Page) -> Page:
+    """The empty page of a browser that other tests have used, without what they set."""
+    one_browser.call("Emulation.setEmulatedMedia", features=[])
+    one_browser.show("about:blank", "document.readyState == 'complete'")
+    one_browser.forget()
+    return one_browser
 
 
 @pytest.fixture(scope="session")

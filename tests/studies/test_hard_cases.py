@@ -7,14 +7,13 @@ import math
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hard_case as support
 import numpy as np
 import pytest
-from devtools import Page, browser
+from devtools import Page
 from hard_case import HardCase, core_counts, described, on_cores
 
 from spike4dgs.benchmark.environment import available_cores
@@ -166,24 +165,19 @@ def test_without_tests_the_command_says_what_to_do(tmp_path: Path, monkeypatch: 
         hard_cases(out=tmp_path)
 
 
-@pytest.fixture(scope="module")
-def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with browser(tmp_path_factory.mktemp("profile")) as shown:
-        yield shown
-
-
 @pytest.mark.parametrize("width", [390, 1400])
-def test_the_page_opens_without_errors_and_shows_every_row(opened: Page, whole: Any, width: int) -> None:
-    opened.events.clear()
-    opened.show((whole[0] / "index.html").as_uri(), "document.readyState == 'complete'", width=width)
-    assert not opened.errors() and opened.value("window.hacked") is None
-    assert opened.value("document.documentElement.scrollWidth") <= width
-    text = opened.value("document.body.innerText")
+def test_the_page_opens_without_errors_and_shows_every_row(empty_page: Page, whole: Any, width: int) -> None:
+    empty_page.show((whole[0] / "index.html").as_uri(), "document.readyState == 'complete'", width=width)
+    assert not empty_page.errors() and empty_page.value("window.hacked") is None
+    assert empty_page.value("document.documentElement.scrollWidth") <= width
+    text = empty_page.value("document.body.innerText")
     assert "5 of 9 cases passed, 3 failed, 1 not run" in text and HOSTILE in text
-    assert opened.value("document.querySelectorAll('tr.marked').length") == 6, "in the list of failures and in its part"
-    titles = opened.value("[...document.querySelectorAll('h2')].map(h => h.innerText).join('|')")
+    assert empty_page.value("document.querySelectorAll('tr.marked').length") == 6, (
+        "in the list of failures and in its part"
+    )
+    titles = empty_page.value("[...document.querySelectorAll('h2')].map(h => h.innerText).join('|')")
     assert titles == "Failed|Summary|Seeds|Interrupted and resumed|Threads|room/part|Program"
-    links = opened.value("[...document.querySelectorAll('nav a')].every(a => document.querySelector(a.hash))")
+    links = empty_page.value("[...document.querySelectorAll('nav a')].every(a => document.querySelector(a.hash))")
     assert links is True
 
 

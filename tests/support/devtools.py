@@ -75,6 +75,11 @@ class Page:
                 found.append(f"{p['entry']['text']} {p['entry'].get('url', '')}")
         return found
 
+    def forget(self) -> None:
+        """Drop what the browser has told so far."""
+        self.value("1")  # what came before this answer has been read
+        self.events.clear()
+
     def press(self, key: str) -> None:
         """Press and release a key."""
         for kind in ("keyDown", "keyUp"):
@@ -90,8 +95,8 @@ KEYS = {"End": 35, "Home": 36, "ArrowRight": 39, "Tab": 9, "Escape": 27}
 
 
 @contextmanager
-def browser(profile: Path) -> Iterator[Page]:
-    """Yield a page of a new browser. The test is skipped if there is no browser."""
+def browser(profile: Path, webgl: bool = False) -> Iterator[Page]:
+    """Yield a page of a new browser, in software alone. The test is skipped if there is no browser."""
     binary = next(filter(None, map(shutil.which, NAMES)), None)
     if binary is None:
         pytest.skip("no Chromium here")
@@ -99,8 +104,9 @@ def browser(profile: Path) -> Iterator[Page]:
 
     flags = ("--headless=new", "--no-sandbox", "--no-first-run", "--disable-extensions", "--mute-audio")
     quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
-    software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+    software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if webgl else ("--disable-gpu",)
     options = (f"--user-data-dir={profile}", f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0")
+    options += ("--disable-dev-shm-usage",)
     command = [binary, *flags, *quiet, *software, *options, "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from devtools import Page, browser
+from devtools import Page
 
 from spike4dgs.benchmark.reports import html_page as page
 from spike4dgs.benchmark.reports.html_chart import Axis, Curve, Dot, chart
@@ -79,30 +78,23 @@ def test_the_contents_lead_to_the_sections() -> None:
     assert target is not None and f'id="{target[1]}"' in page.section(title, [])
 
 
-@pytest.fixture(scope="module")
-def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with browser(tmp_path_factory.mktemp("profile")) as shown:
-        yield shown
-
-
 @pytest.mark.parametrize("width", [390, 1400])
-def test_the_page_opens_from_the_disk_and_fits_the_window(opened: Page, tmp_path: Path, width: int) -> None:
+def test_the_page_opens_from_the_disk_and_fits_the_window(empty_page: Page, tmp_path: Path, width: int) -> None:
     hostile_page(tmp_path / "page.html")
-    opened.events.clear()
-    opened.show((tmp_path / "page.html").as_uri(), "document.readyState == 'complete'", width=width)
+    empty_page.show((tmp_path / "page.html").as_uri(), "document.readyState == 'complete'", width=width)
     bad_image = "ERR_INVALID_URL"  # of bytes that are no PNG
-    assert not [e for e in opened.errors() if bad_image not in e]
-    assert opened.value("window.hacked") is None
-    assert opened.value("document.documentElement.scrollWidth") <= width
+    assert not [e for e in empty_page.errors() if bad_image not in e]
+    assert empty_page.value("window.hacked") is None
+    assert empty_page.value("document.documentElement.scrollWidth") <= width
 
 
-def test_the_page_follows_the_readers_colours(opened: Page, tmp_path: Path) -> None:
+def test_the_page_follows_the_readers_colours(empty_page: Page, tmp_path: Path) -> None:
     hostile_page(tmp_path / "page.html")
     seen = []
     for scheme in ("light", "dark"):
-        opened.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        opened.show((tmp_path / "page.html").as_uri(), "document.readyState == 'complete'")
+        empty_page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        empty_page.show((tmp_path / "page.html").as_uri(), "document.readyState == 'complete'")
         at = "getComputedStyle(document.querySelector('circle:not(.ring)')).fill"
-        seen.append((opened.value("getComputedStyle(document.body).backgroundColor"), opened.value(at)))
+        seen.append((empty_page.value("getComputedStyle(document.body).backgroundColor"), empty_page.value(at)))
     (light, dot), (dark, dark_dot) = seen
     assert light == "rgb(255, 255, 255)" and dark == "rgb(20, 23, 28)" and dot != dark_dot

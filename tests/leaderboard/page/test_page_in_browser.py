@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from devtools import Page, browser, wait_for
+from devtools import Page, wait_for
 from page_boards import board, cell, failed, large_board, row
 
 from spike4dgs.benchmark.reports.error_map import error_image
@@ -80,10 +80,10 @@ def seeds_board() -> Board:
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with browser(tmp_path_factory.mktemp("profile")) as one:
-        yield one
-        assert one.errors() == [], "nothing went wrong in any of the tests"
+def shown(one_browser: Page) -> Iterator[Page]:
+    one_browser.forget()
+    yield one_browser
+    assert one_browser.errors() == [], "nothing went wrong in any of the tests"
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import small_scenes
 import torch
-from devtools import browser
+from devtools import Page
 from PIL import Image
 from small_scenes import write_small_scene
 from toy_world import GAIN, RATE_HZ, ToyWorld
@@ -130,14 +130,14 @@ def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [320, 390, 1400])
-def test_the_report_fits_a_phone(fitted: Path, tmp_path: Path, width: int) -> None:
-    with browser(tmp_path / "profile") as page:
-        page.show((fitted / REPORT).as_uri(), "document.readyState == 'complete'", width=width, height=2000)
-        assert page.value("document.documentElement.scrollWidth") <= width
-        widest = "Math.max(...[...document.querySelectorAll('img, video')].map(e => e.getBoundingClientRect().right))"
-        assert page.value(widest) <= width
-        assert page.value("document.querySelector('.scroll').scrollWidth") > 320, "a table keeps its width and scrolls"
-        assert page.value("document.querySelector('.scroll tr:last-child').offsetHeight") < 60, "on one line a row"
+def test_the_report_fits_a_phone(fitted: Path, empty_page: Page, width: int) -> None:
+    page = empty_page
+    page.show((fitted / REPORT).as_uri(), "document.readyState == 'complete'", width=width, height=2000)
+    assert page.value("document.documentElement.scrollWidth") <= width
+    widest = "Math.max(...[...document.querySelectorAll('img, video')].map(e => e.getBoundingClientRect().right))"
+    assert page.value(widest) <= width
+    assert page.value("document.querySelector('.scroll').scrollWidth") > 320, "a table keeps its width and scrolls"
+    assert page.value("document.querySelector('.scroll tr:last-child').offsetHeight") < 60, "on one line a row"
 
 
 def test_residuals_are_those_of_the_saved_model(fitted: Path, recorded: Path) -> None:

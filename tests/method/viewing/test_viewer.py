@@ -205,7 +205,7 @@ def shows(page: Page, image: UInt8, other: UInt8) -> bool:
 
 @pytest.mark.slow
 def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp_path: Path) -> None:
-    with browser(tmp_path) as page:
+    with browser(tmp_path, webgl=True) as page:
         page.call("Page.navigate", url=viewer.url)
         wait_for("slider", lambda: page.value("!!document.querySelector('[role=slider]')"))
         wait_for("sharp image", lambda: viewer.images >= 2)

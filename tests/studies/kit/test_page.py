@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from devtools import browser
+from devtools import Page
 
 from spike4dgs.studies.kit.page import write_page_of
 
@@ -73,12 +73,11 @@ def test_a_failed_measurement_is_on_the_page_with_what_it_had(tmp_path: Path) ->
     assert "no file" in html and html.count("<svg") == 1
 
 
-def test_the_page_opens_without_an_error_on_a_phone(tmp_path: Path) -> None:
+def test_the_page_opens_without_an_error_on_a_phone(tmp_path: Path, empty_page: Page) -> None:
     many = points(*((f"setting {i}", "chosen" if i == 3 else "", 1.5**i, 2.0**-i) for i in range(20)))
     page(tmp_path, result("a", [{"name": f"series {k}", "points": many} for k in range(9)]))
-    with browser(tmp_path / "profile") as shown:
-        shown.show((tmp_path / "i.html").as_uri(), "document.readyState == 'complete'", width=390)
-        assert shown.errors() == []
-        assert shown.value("document.documentElement.scrollWidth") <= 390
-        assert shown.value("document.querySelectorAll('svg .ring').length") == 9
-        assert shown.value("document.querySelector('details').open") is False, "long tables are folded"
+    empty_page.show((tmp_path / "i.html").as_uri(), "document.readyState == 'complete'", width=390)
+    assert empty_page.errors() == []
+    assert empty_page.value("document.documentElement.scrollWidth") <= 390
+    assert empty_page.value("document.querySelectorAll('svg .ring').length") == 9
+    assert empty_page.value("document.querySelector('details').open") is False, "long tables are folded"
