@@ -5,11 +5,11 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 
 import cv2
 import numpy as np
 import pytest
+from built_worlds import built as world
 from matplotlib.path import Path
 from scipy.ndimage import binary_erosion as erode
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
@@ -21,7 +21,7 @@ from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import MultiViewRenderer, make_tracer
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS, Deforming, Part, WorldScene
+from spike4dgs.generators.worlds import Deforming, Part, WorldScene
 from spike4dgs.generators.worlds.meshes import merge, quad, rotation
 from spike4dgs.generators.worlds.surfaces import Material
 
@@ -31,9 +31,8 @@ T_S = 0.0113
 NOISE = {"car": 0.03, "turntable": 0.03}  # bound on the mean absolute error
 
 
-@cache
-def world(name: str) -> WorldScene:
-    return WORLDS[name].build(0, 0, 0.02)
+# of tests of what no world changes
+one_world = pytest.mark.parametrize("r", ["turntable"], indirect=True)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -99,6 +98,7 @@ def test_images_move_as_the_geometry(r):
     assert right < 0.5 * wrong
 
 
+@one_world
 def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     together = r
     together.keys(0.002)  # earlier renderings and other views have no influence
@@ -114,6 +114,7 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r):
     assert abs(first.mean() - other.mean()) < 0.01
 
 
+@one_world
 def test_colour_is_the_same_image(r):
     gray = r
     colour = MultiViewRenderer(r.world, gray.cameras[1:], seed=0, spp=SPP, background_spp=256, color=True)
@@ -138,6 +139,7 @@ def test_speeds_are_those_of_warped_points_and_shadows(r):
         assert 0.3 * np.median(speed[mask]) < np.median(speed[shadow]) < 1.5 * np.median(speed[mask])
 
 
+@one_world
 def test_whole_frames_are_the_exact_way(r):
     exact = MultiViewRenderer(r.world, r.cameras[1:], seed=0, spp=SPP, background_spp=SPP, whole_frames=True)
     assert np.array_equal(exact.keys(T_S)[0], r.crn_frames(T_S)[1])

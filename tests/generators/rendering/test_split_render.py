@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from built_worlds import built
 
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.profiles import SPLIT_PROFILES
@@ -14,7 +15,7 @@ from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.split_render import SplitRenderer
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS, WorldScene
+from spike4dgs.generators.worlds import WorldScene
 
 WIDTH, HEIGHT, SPP, T_S = 64, 40, 32, 0.0113
 SOFT = SPLIT_PROFILES["tiny"].soft
@@ -25,13 +26,22 @@ def renderer(world: WorldScene, views: tuple[int, ...] = (1, 4), seed: int = 0, 
     return SplitRenderer(world, rig, seed=seed, spp=SPP, background_spp=2 * SPP, **{"soft": SOFT, **others})
 
 
+# of tests of what no world changes
+one_world = pytest.mark.parametrize("r", ["turntable"], indirect=True)
+
+
 # the sun, coats and chrome; a lamp, coats and brass
 @pytest.fixture(scope="module", params=[pytest.param("motor", marks=pytest.mark.slow), "turntable"])
 def r(request) -> Iterator[SplitRenderer]:
     if load_mitsuba().variant().startswith("scalar"):
         pytest.skip("split light needs a variant that compiles kernels")
-    yield renderer(WORLDS[request.param].build(0, 10, 0.02))
+    yield renderer(built(request.param, 10))
     gc.collect()
+
+
+@pytest.fixture(scope="module")
+def other(r) -> SplitRenderer:
+    return renderer(r.world, seed=5)
 
 
 def radiances(r: SplitRenderer, where: np.ndarray, spp: int, streams: range, maps: bool | None) -> np.ndarray:
@@ -71,8 +81,8 @@ def test_maps_take_the_noise_and_leave_the_light(r):
     assert abs(np.mean(split.mean(0) - (a + b) / 2)) < 0.01 * exact.mean()
 
 
-def test_noise_is_new_at_each_key_where_objects_move_and_none_elsewhere(r):
-    other = renderer(r.world, seed=5)
+@one_world
+def test_noise_is_new_at_each_key_where_objects_move_and_none_elsewhere(r, other):
     times = (T_S, T_S + 1e-3)
     inside = r.object_masks(times[0]) & r.object_masks(times[1])
     first, second = ((r.keys(t) - other.keys(t)).astype(np.float64)[inside] for t in times)
@@ -80,15 +90,17 @@ def test_noise_is_new_at_each_key_where_objects_move_and_none_elsewhere(r):
     assert np.array_equal(r.keys(T_S)[~r.changed(T_S)], r.background[~r.changed(T_S)])
 
 
-def test_a_key_depends_on_the_seed_and_the_time_alone(r):
+@one_world
+def test_a_key_depends_on_the_seed_and_the_time_alone(r, other):
     r.keys(0.001)  # earlier renderings have no influence
     again = renderer(r.world, static=r.static)  # as another process has it
     plan = KeyPlan(400, 20_000, 0.25, (20, 10))
     arrays, others = (k.key_arrays(210, plan) for k in (again, r))
     assert arrays.keys() == others.keys() and all(np.array_equal(arrays[k], others[k]) for k in arrays)
-    assert not np.array_equal(renderer(r.world, seed=1).key_arrays(210, plan)["values1"], arrays["values1"])
+    assert not np.array_equal(other.key_arrays(210, plan)["values1"], arrays["values1"])
 
 
+@one_world
 def test_background_and_truth_of_a_view_do_not_depend_on_other_views(r):
     alone, together = (renderer(r.world, views, anchors_s=1e-3) for views in ((4,), (1, 4)))
     mask = alone.object_masks(T_S)[0]

@@ -6,9 +6,10 @@ import time
 
 import numpy as np
 import pytest
+from built_worlds import built
 
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS, turntable
+from spike4dgs.generators.worlds import turntable
 from spike4dgs.generators.worlds.parts import bird_body
 
 BEATS = [bird_body.Beat(), bird_body.Beat(20.0, 0.9, phase=2.0)]
@@ -59,7 +60,7 @@ def test_the_tip_lags_behind_the_root_and_the_wing_bends(beat):
 
 @pytest.mark.parametrize("variant", [0, 1, 2, 3])
 def test_the_bird_flies_to_the_right_above_the_deck_inside_the_image(variant):
-    world = WORLDS["bird"].build(0, variant, 0.1)
+    world = built("bird", variant, 0.1)
     assert 12 <= world.notes["wing_beats_per_s"] <= 20
     assert world.notes["speed_m_s"] >= 7.5 * world.notes["length_m"]
     times = np.linspace(0, 0.1, 21)
@@ -77,7 +78,7 @@ def test_the_bird_flies_to_the_right_above_the_deck_inside_the_image(variant):
 
 
 def test_wings_and_tail_are_attached_to_the_body():
-    world = WORLDS["bird"].build(0, 0, 0.1)
+    world = built("bird", 0, 0.1)
     skin = world.groups["bird"][0].mesh.vertices
     for t in np.linspace(0, 0.1, 9):
         for root in (left_wing(bird_body.Beat(), t)[0, 0], bird_body.tail_points(bird_body.Beat(), t)[0]):
@@ -85,7 +86,7 @@ def test_wings_and_tail_are_attached_to_the_body():
 
 
 def test_moving_the_bird_is_quick():
-    world = WORLDS["bird"].build(0, 0, 0.1)
+    world = built("bird", 0, 0.1)
     start = time.perf_counter()
     for t in np.linspace(0, 0.1, 100):
         world.moving_points(t)
@@ -94,7 +95,7 @@ def test_moving_the_bird_is_quick():
 
 @pytest.mark.parametrize("variant", range(8))
 def test_odd_turntables_are_hard(variant):
-    world = WORLDS["turntable"].build(0, variant, 0.02)
+    world = built("turntable", variant)
     turns = world.notes["turns_per_s"]
     low, high = (20, 25) if variant % 2 else (4, 5.5)
     assert low <= abs(turns) <= high and (variant or turns == 5)

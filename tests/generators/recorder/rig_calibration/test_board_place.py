@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from built_worlds import built
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import look_at
@@ -18,7 +19,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def rig_of(world, width=400, height=250):
-    return cameras(OURS[world].build(0, 0, 0.02), width, height)
+    return cameras(built(world), width, height)
 
 
 def visible(place, n=60):
