@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from devtools import Page, browser
+from filelock import FileLock
 from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
@@ -43,10 +44,17 @@ def empty_page(one_browser: Page) -> Page:
 
 @pytest.fixture(scope="session")
 def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with car-0-tiny, rendered by Mitsuba in one process of its own, and its report with the audit."""
-    out = tmp_path_factory.mktemp("tiny") / "data"
+    """A folder with car-0-tiny, rendered by Mitsuba in one process of its own, and its report with the audit.
+
+    All workers share it: the first that asks for it makes it.
+    """
+    root = tmp_path_factory.getbasetemp()
+    out = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "tiny"
     code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
     command = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), "--audit"]
-    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
+    with FileLock(out.with_suffix(".lock")):
+        if not (out / "done").exists():
+            done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
+            assert done.returncode == 0, done.stdout + done.stderr
+            (out / "done").touch()
     return out

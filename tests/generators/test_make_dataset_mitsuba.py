@@ -84,7 +84,7 @@ def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
     work = tmp_path / ".work/car-0-tiny"
     kill_when(start(tmp_path), "keys/0*.npz", work, 2)
     assert not (tmp_path / "car-0-tiny").exists()
-    kill_when(start(tmp_path, "--workers", "2"), "scene/images/*/*.exr", work, 1)
+    kill_when(start(tmp_path), "scene/images/*/*.exr", work, 1)
     output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
     found = files_in(tmp_path / "car-0-tiny")
@@ -95,7 +95,7 @@ def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
 def test_a_cluster_makes_the_same_scene(whole, tmp_path):
     from distributed import LocalCluster
 
-    quiet = {"processes": True, "n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    quiet = {"processes": True, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(**quiet, silence_logs=50) as cluster:
         output, _ = (process := start(tmp_path, "--scheduler", cluster.scheduler_address)).communicate(timeout=300)
     assert process.returncode == 0, output.decode()

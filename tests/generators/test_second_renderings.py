@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
 from spike4dgs.generators.second_renderings import second_renderings
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
@@ -16,9 +15,8 @@ def test_scenes_that_no_world_made_have_none(small_scene: Path) -> None:
 
 
 @pytest.mark.slow
-def test_second_renderings_show_the_truths_noise(tmp_path: Path) -> None:
-    make_dataset([SceneSettings("tiny").job("turntable")], tmp_path)
-    scene = open_scene(tmp_path / "turntable-0-tiny")
+def test_second_renderings_show_the_truths_noise(tiny_data: Path) -> None:
+    scene = open_scene(tiny_data / "car-0-tiny")
     found = second_renderings(scene)
     assert found is not None
     target, first, second = found

@@ -35,6 +35,7 @@ from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
 from spike4dgs.cli import main
 from spike4dgs.method import load_model
+from spike4dgs.method.recordings import fit as fit_module
 from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
 from spike4dgs.method.recordings.held_out import SHOWN
 from spike4dgs.method.recordings.recording import open_recording, own_frame
@@ -81,6 +82,12 @@ def fitted(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("fitted") / "out"
     assert main(["fit", str(recorded), "--method", "tfp+4dgs", "--out", str(out), *SHORT]) == 0
     return out
+
+
+@pytest.fixture(autouse=True)
+def _short_videos(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the frames, but in `fitted`: rendering and packing them takes longer than a fit."""
+    monkeypatch.setattr(fit_module, "FPS", 3.0)
 
 
 def tensors(out: Path) -> dict[str, torch.Tensor]:

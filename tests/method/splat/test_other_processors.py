@@ -66,7 +66,7 @@ Module = tuple[str, str, list[str], int, int]  # name, triple, intrinsics of x86
 def modules(tmp_path_factory: pytest.TempPathFactory) -> list[Module]:
     support = Path(__file__).parents[2] / "support"
     folders = {"NUMBA_CACHE_DIR": str(tmp_path_factory.mktemp("numba")), "PYTHONPATH": str(support)}
-    environment = os.environ | folders | {"NUMBA_CPU_NAME": "generic", "PYTHONWARNINGS": "ignore"}
+    environment = os.environ | folders | {"NUMBA_CPU_NAME": "generic", "NUMBA_OPT": "0", "PYTHONWARNINGS": "ignore"}
     command = [sys.executable, "-c", CHILD]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
