@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,9 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.cli import run_benchmark as command
+
+# fits in this process: to start one for each takes longer than the fit
+run_here = partial(run_benchmark, in_process=True)
 
 
 @pytest.fixture
@@ -60,7 +64,7 @@ def test_ranks_are_printed_once_and_are_the_final_ones(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = ("counts", "quick+counts", "bad")
-    assert run_benchmark((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
+    assert run_here((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
     text = capsys.readouterr().out
     shown = dict(re.findall(r"^(\S+): .*, (rank \d of 2|not ranked) .*on the local board", text, re.MULTILINE))
     rows = json.loads((tmp_path / "out/leaderboard/local.json").read_text())["boards"][0]["rows"]
@@ -75,7 +79,7 @@ def test_a_run_with_another_method_adds_to_what_is_there(
     out = tmp_path / "out"
 
     def go(*methods: str, **options: Any) -> str:
-        assert run_benchmark((small_scene,), methods=methods, out=out, device="cpu", metrics=("psnr",), **options) == 0
+        assert run_here((small_scene,), methods=methods, out=out, device="cpu", metrics=("psnr",), **options) == 0
         return capsys.readouterr().out
 
     def rows() -> list[dict[str, str]]:
@@ -110,7 +114,7 @@ def test_several_seeds_have_folders_of_their_own_and_one_row_of_the_table(
     out = tmp_path / "out"
     for methods in (("counts",), ("quick+counts",)):
         options: dict[str, Any] = {"seed": 2, "seeds": 3, "device": "cpu", "metrics": ("psnr",)}
-        assert run_benchmark((small_scene,), methods=methods, out=out, **options) == 0
+        assert run_here((small_scene,), methods=methods, out=out, **options) == 0
     table = capsys.readouterr().out.rpartition("Results")[2].partition("images:")[0]
     rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
     assert [(r["method"], r["seed"]) for r in rows] == [(m, k) for m in ("counts", "quick+counts") for k in "234"]
@@ -132,7 +136,7 @@ def test_records_that_do_not_belong_there_are_left_out_and_named(
     for scene, method in ((other, "counts"), (small_scene, "quick+counts")):
         (out / "results").mkdir(parents=True, exist_ok=True)
         (out / "results/damaged.json").write_text("{")
-        run_benchmark((scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",))
+        run_here((scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",))
     text = " ".join(capsys.readouterr().out.split())
     assert "results/counts.json: other scenes, revisions or split" in text
     assert "results/damaged.json: expected a spike4dgs-result/1 record (JSON)" in text
@@ -145,11 +149,11 @@ def test_a_method_without_its_predictions_is_in_the_table_and_not_in_the_sheet(
 ) -> None:
     out = tmp_path / "out"
     for method in ("counts", "quick+counts"):
-        assert run_benchmark((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",)) == 0
+        assert run_here((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",)) == 0
         with Image.open(out / "sheet_pattern-0.png") as image:
             height = image.height
         shutil.rmtree(out / "predictions/counts", ignore_errors=True)
-    assert run_benchmark((small_scene,), methods=("quick+counts",), out=out, device="cpu", metrics=("psnr",)) == 0
+    assert run_here((small_scene,), methods=("quick+counts",), out=out, device="cpu", metrics=("psnr",)) == 0
     with Image.open(out / "sheet_pattern-0.png") as image:
         assert image.height == height
     assert len((out / "results.csv").read_text().splitlines()) == 3
@@ -173,13 +177,14 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def go(seed: int, budget: str = "quick", replace: bool = False) -> int:
-        return run_benchmark(
+        return run_here(
             (small_scene,),
             methods=("quick+counts",),
             out=tmp_path / "out",
             seed=seed,
             device="cpu",
             budget=budget,
+            metrics=("psnr",),
             leaderboard=tmp_path / "board",
             replace=replace,
         )
@@ -223,10 +228,10 @@ def test_a_track_and_table_6_are_modes_of_their_own(
     out, measured = tmp_path / "out", list[tuple[Path, ...]]()
     monkeypatch.setattr("spike4dgs.studies.images.images", lambda scenes, **_: measured.append(scenes) or 0)
     monkeypatch.setattr(command, "track_scenes", lambda name: {small_scene.name: open_scene(small_scene).revision})
-    assert run_benchmark((small_scene,), table=6, out=out) == 0 and not out.exists()
+    assert run_here((small_scene,), table=6, out=out) == 0 and not out.exists()
     assert measured == [(small_scene,)]
     options = {"data": small_scene.parent, "methods": ("counts",), "device": "cpu", "metrics": ("psnr",)}
-    assert run_benchmark(track="moon", out=out, **options) == 0
+    assert run_here(track="moon", out=out, **options) == 0
     assert (out / "leaderboard/local").is_dir(), "the scenes of the track are those in the folder"
     with pytest.raises(UserError, match="--track: expected neither scenes nor a table beside it, found --table 1"):
         run_benchmark(track="moon", table=1)

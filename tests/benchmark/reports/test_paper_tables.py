@@ -284,7 +284,7 @@ def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
     monkeypatch.setattr(run_command, "find_methods", lambda: methods)
     monkeypatch.setattr(run_command, "submit_all", lambda results, **options: 0)
     monkeypatch.setattr(run_command, "open_scenes", lambda paths, gaps, split: [scenes[split]])
-    assert run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",)) == 1, "one method fails"
+    assert run_benchmark(table=5, out=out, device="cpu", metrics=("psnr",), in_process=True) == 1, "one method fails"
     content = json.loads((out / "table.json").read_text())
     assert content["scenes"] == {"pattern-0, views-3": "views-3", "pattern-0, views-4": "views-4"}
     assert content["dataset"]["split"] == "views-3, views-4"

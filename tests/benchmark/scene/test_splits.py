@@ -243,8 +243,9 @@ def test_run_benchmark_keeps_the_splits_apart(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("spike4dgs.cli.run_benchmark.find_methods", lambda: {"counts": CountMethod()})
+    options = {"device": "cpu", "metrics": ("psnr",), "in_process": True}
     for split in (None, "corner"):
-        assert run_benchmark((scene,), out=tmp_path / "out", split=split, device="cpu") == 0
+        assert run_benchmark((scene,), out=tmp_path / "out", split=split, **options) == 0
     records = {p.parent.parent.name: json.loads(p.read_text()) for p in (tmp_path / "out").rglob("results/counts.json")}
     assert {name: r["dataset"]["split"] for name, r in records.items()} == {"out": "center", "corner": "corner"}
     assert "Results, split corner" in capsys.readouterr().out

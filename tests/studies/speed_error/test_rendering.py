@@ -4,6 +4,7 @@ import pytest
 
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.studies.kit.measurement import Request
+from spike4dgs.studies.speed_error import rendering
 from spike4dgs.studies.speed_error.rendering import soft_light, split_light
 
 
@@ -17,10 +18,11 @@ def test_light_as_a_ratio_is_nearer_to_the_traced_light_than_none() -> None:
 
 
 @pytest.mark.slow
-def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light() -> None:
+def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
     if load_mitsuba().variant().startswith("scalar"):
         pytest.skip("maps need a variant that compiles kernels")
-    request = Request("quick", 0, lambda: pytest.fail("no scene is needed"))
+    monkeypatch.setitem(rendering.OF_SIZE, "tiny", ("car",))  # its times are of one image each
+    request = Request("tiny", 0, lambda: pytest.fail("no scene is needed"))
     for series in split_light.run(request):
         paths, exact, maps, truth = series.points
         assert [p.role for p in series.points] == ["", "exact", "chosen", ""] and exact.values["paths"] is None
