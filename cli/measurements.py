@@ -25,6 +25,11 @@ MEASUREMENTS: dict[str, Command] = {
         "tabulate the rendering noise of audited scenes, and the ceilings of their scores",
         "report scene-noise data --out runs/noise",
     ),
+    "report second-renderer": Command(
+        "spike4dgs.cli.studies:second_renderer",
+        "render one tick of three worlds with Cycles too, and tabulate by how much and why it differs",
+        "report second-renderer --out runs/second-renderer",
+    ),
     "spike-agreement": Command(
         "spike4dgs.cli.studies:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",

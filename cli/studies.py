@@ -11,5 +11,6 @@ from spike4dgs.studies.poses import poses as poses
 from spike4dgs.studies.recorder import record as record
 from spike4dgs.studies.saved_models import render as render
 from spike4dgs.studies.scene_noise import scene_noise as scene_noise
+from spike4dgs.studies.second_renderer.command import second_renderer as second_renderer
 from spike4dgs.studies.speed_error.command import speed_error as speed_error
 from spike4dgs.studies.spike_agreement import spike_agreement as spike_agreement

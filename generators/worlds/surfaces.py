@@ -43,8 +43,13 @@ def _texture(albedo: Colour | np.ndarray) -> dict[str, Any]:
 
     if not isinstance(albedo, np.ndarray):
         return {"type": "rgb", "value": [float(np.clip(c, 0.0, 0.95)) for c in albedo]}
-    image = np.ascontiguousarray(np.clip(albedo, 0.01, 0.95), np.float32)
-    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "filter_type": "bilinear", "wrap_mode": "repeat"}
+    bitmap = mi.Bitmap(np.ascontiguousarray(reflectance(albedo)))
+    return {"type": "bitmap", "bitmap": bitmap, "filter_type": "bilinear", "wrap_mode": "repeat"}
+
+
+def reflectance(albedo: np.ndarray) -> np.ndarray:
+    """Return an image of albedo as float32, clipped to the reflectance of real surfaces."""
+    return np.clip(albedo, 0.01, 0.95).astype(np.float32)
 
 
 def mesh_to_mitsuba(name: str, mesh: Mesh, material: Material) -> Any:
