@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from spike4dgs.generators.profiles import HELD_OUT_VIEW
 from spike4dgs.generators.worlds import WorldScene
@@ -17,6 +19,7 @@ from spike4dgs.studies.second_renderer.export import Coats, SkyMap
 Change = Callable[[WorldScene], WorldScene]
 _GREY = Material((0.5, 0.5, 0.5))
 _BLACK = (0.0, 0.0, 0.0)
+_APART_M = 1e-4  # far above the rounding of float32 at 10 m, far below a pixel
 _UNIFORM = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.7, 0.7, 0.7]}}}
 
 
@@ -60,13 +63,27 @@ def _flat(mesh: Mesh) -> Mesh:
     return replace(mesh, smooth=False)
 
 
+def _apart(mesh: Mesh) -> Mesh:
+    """Return flat faces of which no two connected pieces lie in one plane: each is moved by some 0.1 mm."""
+    first, second, third = mesh.faces.T
+    edges = np.concatenate([first, second]), np.concatenate([second, third])
+    count, piece = connected_components(coo_matrix((np.ones(len(edges[0])), edges), [len(mesh.vertices)] * 2))
+    shifts = np.random.default_rng([count, len(mesh.vertices)]).normal(0, _APART_M, (count, 3))
+    return replace(mesh, vertices=mesh.vertices + shifts[piece], smooth=False)
+
+
 def _bare(material: Material) -> Material:
     """Return a coat or metal without a matte part; matte surfaces stay."""
     return material if material.gloss is None or material.metal else replace(material, albedo=_BLACK)
 
 
 def plain(world: WorldScene) -> WorldScene:
-    """Return a world of grey matte flat faces."""
+    """Return a world of grey matte flat faces, of which no two lie in one plane."""
+    return dressed(world, lambda part: Part(_apart(part.mesh), _GREY))
+
+
+def flush(world: WorldScene) -> WorldScene:
+    """Return a world of grey matte flat faces in their places."""
     return dressed(world, lambda part: Part(_flat(part.mesh), _GREY))
 
 
@@ -77,17 +94,17 @@ def smooth(world: WorldScene) -> WorldScene:
 
 def textured(world: WorldScene) -> WorldScene:
     """Return a world of matte flat faces with their textures."""
-    return dressed(world, lambda part: Part(_flat(part.mesh), Material(part.material.albedo)))
+    return dressed(world, lambda part: Part(_apart(part.mesh), Material(part.material.albedo)))
 
 
 def glossy(world: WorldScene) -> WorldScene:
     """Return a world of flat faces whose coats lie over black."""
-    return dressed(world, lambda part: Part(_flat(part.mesh), _bare(part.material)))
+    return dressed(world, lambda part: Part(_apart(part.mesh), _bare(part.material)))
 
 
 def overcast(world: WorldScene) -> WorldScene:
     """Return a world of flat faces with their materials, in uniform light."""
-    flat = dressed(world, lambda part: Part(_flat(part.mesh), part.material))
+    flat = dressed(world, lambda part: Part(_apart(part.mesh), part.material))
     return replace(flat, emitters=_UNIFORM, shadow_sources=np.zeros((0, 4)))
 
 
@@ -99,9 +116,10 @@ def unchanged(world: WorldScene) -> WorldScene:
 BOTH = (HELD_OUT_VIEW, 0)  # and a corner of the array
 WHOLE, NATIVE, PLAIN = "world", "native", "grey"
 CHECKS = (
-    Check(PLAIN, "nothing: grey matte flat faces", plain),
+    Check(PLAIN, "nothing: grey matte flat faces, none in the plane of another", plain),
+    Check("flush", "faces that lie in one plane", flush),
     Check("sky", "where a texel of the sky is", plain, ours=PLAIN, sky="by texel centres"),
-    Check("normals", "shading by interpolated normals", smooth),
+    Check("normals", "interpolated normals, and faces in one plane", smooth),
     Check("textures", "filtering of textures", textured),
     Check("gloss", "gloss of coats and metal; coats over black", glossy),
     Check("uniform", "matte light under coats, uniform light", overcast),

@@ -48,7 +48,7 @@ class Study:
     @property
     def t_s(self) -> float:
         """The time of the tick."""
-        return _TICK / RATE_HZ
+        return float(_TICK / RATE_HZ)
 
     def cameras(self, views: tuple[int, ...]) -> list[Camera]:
         """Return cameras of the array."""
@@ -112,15 +112,15 @@ def measure(study: Study, blender: Blender) -> tuple[dict[str, Any], Row]:
                 "check": c.id,
                 "differs": c.differs,
                 "view": view,
-                **_compared(*(x[:, k] for x in images[c.id]), masks[view]),
+                **_compared(images[c.id][0][:, k], images[c.id][1][:, k], masks[view]),
             }
             for c in checks
             for k, view in enumerate(c.views)
         ],
         "materials": _materials(study, images[WHOLE], images[NATIVE]),
         "stored": {
-            "ours": _compared(images[WHOLE][0][:, 0], stored, masks[HELD_OUT_VIEW]),
-            "second": _compared(images[WHOLE][1][:, 0], stored, masks[HELD_OUT_VIEW]),
+            "our reference": _compared(images[WHOLE][0][:, 0], stored, masks[HELD_OUT_VIEW]),
+            "Cycles": _compared(images[WHOLE][1][:, 0], stored, masks[HELD_OUT_VIEW]),
         },
     }
     ours, second = (x[:, 0].mean(0) for x in images[WHOLE])
@@ -170,7 +170,7 @@ def _materials(study: Study, *images: tuple[Float32, Float32]) -> dict[str, Any]
 _REGIONS = ("whole", "moving", "static")
 _HEADS = (
     "world", "check", "camera", "difference: whole, moving, static, dB", "noise of ours, of Cycles, dB",
-    "mean relative error: whole, moving, static, %", "ratio of the means",
+    "mean relative difference: whole, moving, static, %", "ratio of the means",
 )  # fmt: skip
 
 
@@ -183,14 +183,14 @@ def to_markdown(records: list[dict[str, Any]]) -> str:
         stored += [[name, other, *_cells(of)] for other, of in record["stored"].items()]
         for kind, of in record["materials"].items():
             materials.append([name, kind, str(of["pixels"]), *(f"{ratio:.3f}" for ratio in of["median_ratios"])])
-    differs = {of["check"]: of["differs"] for record in records for of in record["checks"]}
+    met = {of["check"] for record in records for of in record["checks"]}
     lines = [
         "# The second renderer next to ours", "",
-        *markdown(("check", "the renderers may differ in"), [list(pair) for pair in differs.items()]), "",
+        *markdown(("check", "the renderers may differ in"), [(c.id, c.differs) for c in CHECKS if c.id in met]), "",
         *markdown(_HEADS, rows), "", "Median ratio of radiance, Cycles to ours, by material:", "",
         *markdown(("world", "material", "pixels", "nearest coat", "its own coat"), materials), "",
         "What the dataset stores, against both renderers:", "",
-        *markdown(("world", "against", *_HEADS[3:]), stored),
+        *markdown(("world", "against", _HEADS[3], "noise of that, of what is stored, dB", *_HEADS[5:]), stored),
     ]  # fmt: skip
     return "\n".join([*lines, ""])
 

@@ -93,7 +93,8 @@ def write_scene(
         "shots": [{**camera_facts(s.camera), "seed": s.seed, "out": str(s.out)} for s in shots],
     }
     with atomic_path(path) as part:
-        np.savez(part, facts=np.array(json.dumps(facts)), **arrays, **maps)
+        contents: dict[str, Any] = {"facts": np.array(json.dumps(facts)), **arrays, **maps}
+        np.savez(part, **contents)
 
 
 def surfaces_at(world: WorldScene, t_s: float) -> Iterator[Surface]:
@@ -194,7 +195,7 @@ def _towards(direction: Sequence[float]) -> list[list[float]]:
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    return pose.tolist()  # type: ignore[no-any-return]
+    return pose.tolist()
 
 
 @lru_cache

@@ -28,13 +28,13 @@ class Row:
 
 def write_picture(path: Path, rows: Sequence[Row]) -> None:
     """Write a row for each world: our renderer, Cycles, as stored, and Cycles against ours, grey and whole."""
-    figure = new_figure((14, 2.0 * len(rows) + 0.3))
+    figure = new_figure((14, 1.75 * len(rows) + 0.3))
     for axes, row in zip(figure.subplots(len(rows), 5, squeeze=False), rows, strict=True):
         images = (("ours", row.ours), ("Cycles", row.second), ("as stored", row.stored))
         for ax, (title, image) in zip(axes, images, strict=False):
             ax.imshow(encode_srgb(image))
             ax.set_title(f"{row.world}: {title}", fontsize=8)
-        maps = (("grey, Cycles / ours - 1", row.grey), ("Cycles / ours - 1", (row.ours, row.second)))
+        maps = (("grey flat faces, Cycles / ours - 1", row.grey), ("Cycles / ours - 1", (row.ours, row.second)))
         for ax, (title, pair) in zip(axes[3:], maps, strict=True):
             ours, second = map(gray, pair)
             ratio = second / np.maximum(ours, 1e-6) - 1
