@@ -74,7 +74,7 @@ def second_renderer(
 
     Args:
         worlds: Names of worlds, at development variant 10.
-        python: An interpreter that has Blender's module `bpy`; by default that of `make clients ONLY=bpy`.
+        python: An interpreter that has Blender's module `bpy`; by default that of the environment `.bpy`.
         samples: Paths per pixel of each of two renderings by both renderers.
         out: Folder for the results.
     """

@@ -25,7 +25,7 @@ from spike4dgs.studies.second_renderer.checks import Check
 from spike4dgs.studies.second_renderer.export import Shot, write_scene
 
 SEEDS = (1, 2)  # of two renderings, whose noise is independent
-INSTALLED = Path(".clients/bpy") / ("Scripts/python.exe" if os.name == "nt" else "bin/python")  # by `make clients`
+INSTALLED = Path(".bpy") / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 _SCRIPT = Path(__file__).with_name("blender_script.py")
 _ASK = "import bpy; print('Blender', bpy.app.version_string)"
 
@@ -39,7 +39,7 @@ class Blender:
 
 
 def find_blender(python: Path | None) -> Blender:
-    """Return the interpreter `python`, or else that of `make clients` or this one, if it has `bpy`.
+    """Return the interpreter `python`, or else that of the environment `.bpy` or this one, if it has `bpy`.
 
     Raises UserError with how to install it.
     """
@@ -52,7 +52,7 @@ def find_blender(python: Path | None) -> Blender:
             continue
         if found := [line for line in told.splitlines() if line.startswith("Blender ")]:
             return Blender(candidate.absolute(), found[-1].removeprefix("Blender "))
-    fix = "run `make clients ONLY=bpy`, or `pip install bpy==5.0.1` into a Python 3.11 that --python names"
+    fix = "run `python3.11 -m venv .bpy && .bpy/bin/pip install bpy==5.0.1`, or name one by --python"
     there = "none" if python is None else f"{python}, which cannot import it"
     raise problem("the second renderer", "an interpreter that has Blender's module bpy", there, fix)
 
