@@ -13,8 +13,9 @@ benchmark: $(STAMP)
 	$(BIN)/spike4dgs make-dataset car turntable --profile small --out data
 	$(BIN)/spike4dgs run-benchmark $(SCENES) --methods $(METHODS) --out runs/small
 
+# Tests start many processes: Python keeps what it compiles, whatever the shell says.
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -54,7 +54,7 @@ def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), "--audit"]
     with FileLock(out.with_suffix(".lock")):
         if not (out / "done").exists():
-            done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
+            done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=900)
             assert done.returncode == 0, done.stdout + done.stderr
             (out / "done").touch()
     return out

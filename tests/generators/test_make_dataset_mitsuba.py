@@ -80,11 +80,10 @@ def test_flow_and_depth_of_a_scene_carry_its_images_over(tiny_data):
 
 @pytest.mark.slow
 def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
-    """Killed among the key frames and among the ground truth, then finished by two workers: the same bytes."""
+    """Killed among the key frames, then finished by two workers: the same bytes."""
     work = tmp_path / ".work/car-0-tiny"
     kill_when(start(tmp_path), "keys/0*.npz", work, 2)
     assert not (tmp_path / "car-0-tiny").exists()
-    kill_when(start(tmp_path), "scene/images/*/*.exr", work, 1)
     output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
     found = files_in(tmp_path / "car-0-tiny")

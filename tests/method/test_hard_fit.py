@@ -124,7 +124,7 @@ def test_losses_gradients_and_parameters_are_numbers(
     if name == "100,000 ticks" and images == "tfstp":
         pytest.skip("TFSTP reads every tick before the image's: minutes")
     if name == "100,000 ticks" and supervision == "fixed-pattern":
-        pytest.skip("its 250 pieces are those of pixel")
+        pytest.skip("its pieces are those of pixel")
     scene, s = case(name), replace(SETTINGS, **extra)
     start = surfaces(usual(), 0)
     start, device = replace(start, cameras=scene.cameras), hard_case.device

@@ -242,12 +242,12 @@ def bits(t: dict[str, torch.Tensor]) -> bytes:
 @pytest.mark.parametrize(
     ("parts", "step"),
     [
-        *(("hexplane", s) for s in range(1, 12)),
+        *(("hexplane", s) for s in (1, 3, 4, 5, 6, 8, 11)),
         *((p, s) for p in ("spacetime", "spike-render", "fixed-pattern") for s in (3, 6, 9)),
         *(("paths", s) for s in (7, 8, 9, 15)),
         ("poses", 5),
-        *(("average", s) for s in (2, 3, 4, 5, 10, 11)),
-        *(("spans", s) for s in (8, 12, 13, 14, 16, 17, 20)),
+        *(("average", s) for s in (2, 3, 4, 10, 11)),
+        *(("spans", s) for s in (8, 12, 13, 14, 20)),
     ],
 )
 def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path, hard_case: HardCase):

@@ -71,6 +71,10 @@ class ToyWorld:
 
     def trace(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Radiance, depth z and board mask, each [H, W], at t in [0, 1]."""
+        return self._with_board(self._background(camera), t)
+
+    def _background(self, camera: Camera) -> tuple[NDArray[np.float64], ...]:
+        """Radiance and depth without the board, depth of its plane and the points [H, W, 3] there."""
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
         xy = camera.normalized(np.stack([u, v], -1))
         d = np.concatenate([xy, np.ones_like(xy[..., :1])], -1) @ camera.R
@@ -78,20 +82,27 @@ class ToyWorld:
         with np.errstate(divide="ignore", invalid="ignore"):
             to_floor, to_wall, to_board = -o[2] / d[..., 2], (1.0 - o[1]) / d[..., 1], -o[1] / d[..., 1]
         floor, wall, board = (o + s[..., None] * d for s in (to_floor, to_wall, to_board))
-        x = board[..., 0] - self.travel * (t - 0.5)
-        on_board = (np.abs(x) < 0.45) & (np.abs(board[..., 2] - 0.6) < 0.35)
         on_floor = (to_floor > 0) & (to_floor < to_wall)
         image = np.where(
             on_floor, self.texture(0, floor[..., 0], floor[..., 1]), self.texture(1, wall[..., 0], wall[..., 2])
         )
-        image = np.where(on_board, self.texture(2, x, board[..., 2]), image)
-        depth = np.where(on_board, to_board, np.where(on_floor, to_floor, to_wall))
-        return image, depth, on_board
+        return image, np.where(on_floor, to_floor, to_wall), to_board, board
+
+    def _with_board(
+        self, background: tuple[NDArray[np.float64], ...], t: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        image, depth, to_board, board = background
+        x = board[..., 0] - self.travel * (t - 0.5)
+        on_board = (np.abs(x) < 0.45) & (np.abs(board[..., 2] - 0.6) < 0.35)
+        image = image.copy()
+        image[on_board] = self.texture(2, x[on_board], board[..., 2][on_board])
+        return image, np.where(on_board, to_board, depth), on_board
 
     def stream(self, camera: Camera, index: int) -> SpikeStream:
         """Noise-free integrate-and-fire of the radiance, which is traced every 8 ticks and interpolated."""
         keys = np.arange(0, self.n_ticks + 8, 8)
-        frames = np.stack([self.trace(camera, k / self.n_ticks)[0] for k in keys])
+        background = self._background(camera)
+        frames = np.stack([self._with_board(background, k / self.n_ticks)[0] for k in keys])
         charge = np.random.default_rng([self.seed, 100 + index]).random(frames.shape[1:])
         packed = []
         for tick in range(self.n_ticks):

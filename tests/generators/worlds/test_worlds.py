@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.image_motion import KeyPlan, carried, key_plan, max_image_speed, spacings
-from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
+from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import make_tracer
 from spike4dgs.generators.rendering.scalar_tiles import load_sensor
@@ -24,6 +24,12 @@ from spike4dgs.generators.worlds import WORLDS, Part, WorldScene
 
 WIDTH, HEIGHT = 64, 40
 NAMES = sorted(WORLDS)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def name(request) -> str:
+    """A world's name; all tests of one world come after each other, and build it once."""
+    return request.param
 
 
 def all_parts(world: WorldScene) -> list[Part]:
@@ -42,7 +48,6 @@ def fingerprint(world: WorldScene) -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize("name", NAMES)
 def test_a_world_is_a_function_of_seed_and_variant(name):
     build, first = WORLDS[name].build, fingerprint(built(name))
     assert fingerprint(build(0, 0, 0.02)) == first
@@ -50,7 +55,6 @@ def test_a_world_is_a_function_of_seed_and_variant(name):
     assert fingerprint(build(0, 1, 0.02)) != first
 
 
-@pytest.mark.parametrize("name", NAMES)
 def test_meshes_and_materials_are_sound(name):
     world = built(name)
     for part in all_parts(world):
@@ -93,11 +97,10 @@ def sensor_rays(camera: Camera, sent: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.array(ray.o).T + np.zeros((len(sent), 3)), np.array(ray.d).T
 
 
-@pytest.mark.parametrize("name", NAMES)
 def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
     world = built(name)
     rig = cameras(world, WIDTH, HEIGHT)
-    scene = MitsubaScene(world)
+    scene = mitsuba_scene(world)
     scene.set_time(0.008)
     tracer = make_tracer(scene, rig, 0)
     rng = np.random.default_rng(0)
@@ -111,10 +114,9 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
         assert np.abs(uv - sent * [WIDTH, HEIGHT]).max() < 0.01
 
 
-@pytest.mark.parametrize("name", NAMES)
 def test_moving_triangles_are_where_the_world_says(name):
     world, t_s = built(name), 0.0131
-    scene = MitsubaScene(world)
+    scene = mitsuba_scene(world)
     scene.set_time(t_s)
     rig = cameras(world, WIDTH, HEIGHT, (4,))
     rng = np.random.default_rng(0)
@@ -164,7 +166,6 @@ def test_the_disc_turns_in_place_counter_clockwise_from_above():
     assert np.abs(points.mean(0) - world.moving_points(0.005).mean(0)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", NAMES)
 def test_the_speed_bound_holds_for_finite_steps(name):
     world = built(name)
     rig = cameras(world, WIDTH, HEIGHT, (0, 4))
