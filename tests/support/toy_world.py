@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,14 @@ class ToyWorld:
 
     def trace(self, camera: Camera, t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Radiance, depth z and board mask, each [H, W], at t in [0, 1]."""
-        return self._with_board(self._background(camera), t)
+        if self._last.get("camera") is not camera:
+            self._last.update(camera=camera, background=self._background(camera))
+        return self._with_board(self._last["background"], t)
+
+    @cached_property
+    def _last(self) -> dict[str, Any]:
+        """The camera that was traced last, and its background: a stream traces one camera at many times."""
+        return {}
 
     def _background(self, camera: Camera) -> tuple[NDArray[np.float64], ...]:
         """Radiance and depth without the board, depth of its plane and the points [H, W, 3] there."""
@@ -101,8 +109,7 @@ class ToyWorld:
     def stream(self, camera: Camera, index: int) -> SpikeStream:
         """Noise-free integrate-and-fire of the radiance, which is traced every 8 ticks and interpolated."""
         keys = np.arange(0, self.n_ticks + 8, 8)
-        background = self._background(camera)
-        frames = np.stack([self._with_board(background, k / self.n_ticks)[0] for k in keys])
+        frames = np.stack([self.trace(camera, k / self.n_ticks)[0] for k in keys])
         charge = np.random.default_rng([self.seed, 100 + index]).random(frames.shape[1:])
         packed = []
         for tick in range(self.n_ticks):
