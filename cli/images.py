@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.bad_pixels import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.spikes.trains import trains_bytes
 from spike4dgs.benchmark.untrusted import MAX_GAIN
 from spike4dgs.cli.options import check_names, warn_of_size
 from spike4dgs.generators.recorder.resources import free_bytes
@@ -23,8 +24,7 @@ from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_cl
 
 _WHITE = 99  # percentile of the pixels' rates that is shown white, where nothing says what white is
 _MOST_FPS = 1000.0
-_GATHERING = ("adaptive", "intervals")  # makers that hold all spikes of a clip
-_BYTES_A_SPIKE = 4
+_GATHERING = ("adaptive", "intervals")  # makers that hold the spike trains of a clip
 
 
 def images(
@@ -98,13 +98,11 @@ def _streams(
 
 
 def _check_memory(method: str, streams: Mapping[str, SpikeStream]) -> None:
-    """Raise UserError where the spikes of a stream do not fit into memory."""
+    """Raise UserError where the spike trains of a stream do not fit into memory."""
     free = free_bytes()
     for name, s in streams.items():
-        if 8 * s.packed.nbytes * _BYTES_A_SPIKE <= free:  # if every pixel fired at every tick
-            continue
-        if (need := _BYTES_A_SPIKE * int(total_counts(s).sum())) > free:
-            expected = f"{need / 1e9:.1f} GB of free memory for all spikes of {name}"
+        if (need := trains_bytes(s)) > free:
+            expected = f"{need / 1e9:.1f} GB of free memory for the spike trains of {name}"
             raise problem(
                 f"--method {method}", expected, f"{free / 1e9:.1f} GB", "take another method, or a shorter clip"
             )

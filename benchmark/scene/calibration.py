@@ -22,7 +22,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
-from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
+from spike4dgs.benchmark.spikes.stream import open_stream
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,9 +92,6 @@ def estimate(recordings: Recordings) -> Calibration:
         raise problem("calibration", "two recordings of one size and a positive radiance", found, "correct them")
     dark_rate = rates(dark)
     light = np.maximum(rates(flat) - dark_rate, 0)
-    for recording in (flat, dark):  # they are read once, and are most of a scene's bytes
-        if isinstance(recording, SpikeStream):
-            recording.release()
     if not (mean := float(light.mean())) > 0:
         raise problem("flat-field recording", "light", "no more spikes than in the dark", "record it again")
     return Calibration((light / mean).astype(np.float32), dark_rate.astype(np.float32), mean / recordings.flat_radiance)

@@ -52,6 +52,7 @@ def total_counts(stream: Recording) -> Int64:
     counts = np.zeros((stream.height, stream.width), np.int64)
     for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
         counts += stream.counts(start, min(start + _LONGEST_WINDOW, stream.n_ticks))
+    stream.release()
     return counts
 
 
@@ -76,6 +77,7 @@ def deviation(stream: Recording) -> Float64:
         own = counts - float(counts.mean())
         total += own
         square += own**2
+    stream.release()
     n = max(len(starts), 1)
     return np.asarray(np.sqrt(np.maximum(square / n - (total / n) ** 2, 0)))
 

@@ -67,6 +67,9 @@ class CountedRecording:
             return np.asarray(self.total - self.windows[:first].sum(axis=0, dtype=np.int64))
         return np.asarray(self.windows[first:last].sum(axis=0, dtype=np.int64))
 
+    def release(self) -> None:
+        """Do nothing, where a stream gives back its file's pages: the counts are no file's."""
+
     def taken(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> CountedRecording:
         """Return the recording whose pixel [i, j] has the spikes of pixel (y[i, j], x[i, j])."""
         first, last, total = (image[y, x] for image in (self.first, self.last, self.total))
@@ -95,6 +98,7 @@ def first_last_total(recording: Recording) -> tuple[Int64, Int64, Int64]:
     n = recording.width * recording.height
     first, last, total = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
     _first_last_total(rows(recording.packed), first, last, total)
+    recording.release()
     images = [x.reshape(recording.height, recording.width) for x in (first, last, total)]
     return tuple(x[::-1] if recording.rows_bottom_up else x for x in images)  # type: ignore[return-value]
 

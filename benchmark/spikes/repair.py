@@ -31,18 +31,29 @@ AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 
 def fill_gaps(stream: SpikeStream) -> SpikeStream:
-    """Return the stream with its missing ticks filled, in memory. Gaps longer than LONGEST_TICKS remain listed."""
+    """Return the stream with its missing ticks filled. Gaps longer than LONGEST_TICKS remain listed.
+
+    Of a mapped file the pages that change are in memory, and no others.
+    """
     if not stream.gaps:
         return stream
     there = present(stream.gaps, stream.n_ticks)
     edges = np.diff(np.concatenate([[1], there.astype(np.int8), [1]]))
     starts, stops = np.nonzero(edges < 0)[0], np.nonzero(edges > 0)[0]  # gaps that touch are one
-    packed, pixels = np.array(stream.packed), stream.width * stream.height
+    packed, pixels = _private(stream.packed), stream.width * stream.height
     packed[~there] = 0
-    in_threads(_fill, packed.shape[1], packed, starts, stops, pixels, small=pixels * len(starts) < _SMALL)
+    plain = packed.view(np.ndarray)
+    in_threads(_fill, packed.shape[1], plain, starts, stops, pixels, small=pixels * len(starts) < _SMALL)
     long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > LONGEST_TICKS]
     gaps = tuple(g for g in stream.gaps if any(a <= g.first_tick < b for a, b in long))
     return replace(stream, packed=packed, gaps=gaps)
+
+
+def _private(packed: UInt8) -> UInt8:
+    """Return ticks that can be written to without a change of `packed` or its file."""
+    if isinstance(packed, np.memmap) and packed.filename and not packed.flags.writeable:
+        return np.memmap(packed.filename, np.uint8, "c", packed.offset, packed.shape)
+    return np.array(packed)
 
 
 @kernel

@@ -77,9 +77,12 @@ class SpikeStream(Shown):
         return counts[::-1] if self.rows_bottom_up else counts
 
     def release(self) -> None:
-        """Give back the memory of a mapped file's pages; what is read again comes from the file again."""
+        """Give back the memory of a mapped file's pages; what is read again comes from the file again.
+
+        A stream that may be written to keeps them: what was written to a private map is nowhere else.
+        """
         mapped = self.packed.base
-        if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") and not self.packed.flags.writeable:
             mapped.madvise(mmap.MADV_DONTNEED)
 
     def _about(self) -> str:

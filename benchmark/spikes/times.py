@@ -1,6 +1,4 @@
-"""Spike times of all pixels, gathered once from a stream's bits.
-
-The intervals that a camera recorded around a few ticks: each pixel's from its last spike before to its first after.
+"""The intervals that a camera recorded around a few ticks: each pixel's from its last spike before to its first after.
 
 A span holds one or more intervals between spikes. It says how long the pixel took for so many charges, whatever charge
 it held when the window began; a count over the window does not know that charge.
@@ -9,63 +7,14 @@ it held when the window began; a count over the window does not know that charge
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.arrays import Int32, Int64, UInt8
-from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
+from spike4dgs.benchmark.arrays import Int32
+from spike4dgs.benchmark.spikes.bits import kernel, rows
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-
-_BLOCK = 64  # bytes of a tick, 512 pixels, whose spikes are gathered at a time
-
-
-@dataclass(frozen=True, eq=False)
-class SpikeTimes:
-    """The spikes of all pixels, one pixel after the other, in the stored order of pixels."""
-
-    ticks: Int32  # [N] ascending within a pixel
-    starts: Int64  # [P + 1] pixel p has ticks[starts[p]:starts[p + 1]]
-
-
-@lru_cache(maxsize=1)
-def spike_times(stream: SpikeStream) -> SpikeTimes:
-    """Return all spike times of a stream, cached for the last one: images are made stream by stream."""
-    packed, pixels = rows(stream.packed), stream.height * stream.width
-    starts = np.zeros(pixels + 1, np.int64)
-    blocks = -(-packed.shape[1] // _BLOCK)
-    in_threads(_count, blocks, packed, starts[1:])
-    np.cumsum(starts, out=starts)
-    ticks = np.empty(starts[-1], np.int32)
-    in_threads(_gather, blocks, packed, starts, ticks)
-    return SpikeTimes(ticks, starts)
-
-
-@kernel
-def _count(packed: UInt8, counts: Int64, start: int, stop: int) -> None:
-    first, end = start * _BLOCK, min(stop * _BLOCK, packed.shape[1])
-    for t in range(len(packed)):
-        for byte in range(first, end):
-            bits = packed[t, byte]
-            for k in range(8):
-                if bits >> k & 1 and 8 * byte + k < len(counts):
-                    counts[8 * byte + k] += 1
-
-
-@kernel
-def _gather(packed: UInt8, starts: Int64, ticks: Int32, start: int, stop: int) -> None:
-    first, end, pixels = start * _BLOCK, min(stop * _BLOCK, packed.shape[1]), len(starts) - 1
-    at = starts[8 * first : min(8 * end, pixels)].copy()
-    for t in range(len(packed)):
-        for byte in range(first, end):
-            bits = packed[t, byte]
-            for k in range(8):
-                p = 8 * (byte - first) + k
-                if bits >> k & 1 and p < len(at):
-                    ticks[at[p]] = t
-                    at[p] += 1
 
 
 @dataclass(frozen=True, eq=False)

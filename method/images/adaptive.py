@@ -21,16 +21,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Float64, UInt8
+from spike4dgs.benchmark.arrays import Float32, Float64, Int64, UInt8, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.spikes.times import spike_times
+from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.settings import Settings
 
@@ -71,9 +72,8 @@ def adaptive_image(
 
 def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8, light: Float64 | None = None) -> Float32:
     """Return spikes per tick [H * W] over the windows of `shared_levels`, in the stored order of pixels."""
-    spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     image = np.empty(len(levels), np.float32)
-    arguments = (spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), levels, image)
+    arguments = (*_arguments(stream, tick, s, light), levels, image)
     in_threads(_estimate, len(levels), *arguments, small=len(levels) < 1 << 12)
     return image
 
@@ -85,60 +85,69 @@ def gathered(stream: SpikeStream, light: Float64 | None) -> Float64:
 
 def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None = None) -> UInt8:
     """Return the window that each pixel takes [H * W], an index into `half_windows`, in the stored order of pixels."""
-    spikes, halves = spike_times(stream), half_windows(stream.n_ticks, s)
     pixels = stream.height * stream.width
     level = np.empty(pixels, np.uint8)
-    arguments = (spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), level)
-    in_threads(_choose, pixels, *arguments, small=pixels < 1 << 12)
+    in_threads(_choose, pixels, *_arguments(stream, tick, s, light), level, small=pixels < 1 << 12)
     square = np.ones((s.shared_px, s.shared_px), np.uint8)
     return np.asarray(cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1), np.uint8)
 
 
-@kernel
-def _around(times: NDArray[np.int32], tick: int) -> tuple[int, int]:
-    """Return the indices of the last spike before `tick` and of the first that is not; the nearest where none is."""
-    after = int(np.searchsorted(times, tick))
-    return max(after - 1, 0), min(after, len(times) - 1)
+def _arguments(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None) -> tuple[Any, ...]:
+    """Return what both kernels take: the trains, the tick, the windows' ticks [starts, stops), and the light."""
+    trains, halves = spike_trains(stream), half_windows(stream.n_ticks, s)
+    edges = np.ceil([tick - halves, tick + halves]).clip(0, stream.n_ticks).astype(np.int64)
+    return trains.words, trains.before, tick, *edges, gathered(stream, light)
 
 
 @kernel
 def _choose(
-    ticks: NDArray[np.int32],
-    starts: NDArray[np.int64],
+    words: UInt64,
+    before: UInt32,
     tick: int,
-    halves: NDArray[np.float64],
-    light: NDArray[np.float64],
+    starts: Int64,
+    stops: Int64,
+    light: Float64,
     level: UInt8,
     start: int,
     stop: int,
 ) -> None:
     """Set `level` to the longest window of each pixel up to which the bounds of all windows have a point in common."""
     for p in range(start, stop):
-        times = ticks[starts[p] : starts[p + 1]]
-        i, j = _around(times, tick)  # the first and the last spike of the window
+        level[p] = len(starts) - 1
+        total, after = count_before(words, before, p, len(light)), count_before(words, before, p, tick)
+        if total < 2:
+            continue
+        # The window's first and last spike, by number and tick: the nearest ones, until a window holds more.
+        i, j = max(after - 1, 0), min(after, total - 1)
+        first = last_before(words, p, tick) if after > 0 else first_from(words, p, tick)
+        last = first_from(words, p, tick) if after < total else last_before(words, p, tick)
         low, high = -np.inf, np.inf
-        level[p] = len(halves) - 1
-        for s in range(len(halves)):
-            while i > 0 and times[i - 1] >= tick - halves[s]:
-                i -= 1
-            while j + 1 < len(times) and times[j + 1] < tick + halves[s]:
-                j += 1
-            if j - i < 1:
-                continue
-            length = light[times[j]] - light[times[i]]
-            low, high = max(low, (j - i) / (length + 1)), min(high, (j - i) / (length - 1) if length > 1 else np.inf)
-            if low > high:
-                level[p] = s - 1
-                break
+        wider = True
+        for s in range(len(starts)):
+            k = count_before(words, before, p, starts[s]) if i > 0 else 0
+            if k < i:
+                i, first, wider = k, first_from(words, p, starts[s]), True
+            k = count_before(words, before, p, stops[s]) - 1 if j + 1 < total else j
+            if k > j:
+                j, last, wider = k, last_before(words, p, stops[s]), True
+            if wider and j > i:
+                length = light[last] - light[first]
+                low = max(low, (j - i) / (length + 1))
+                high = min(high, (j - i) / (length - 1) if length > 1 else np.inf)
+                if low > high:
+                    level[p] = s - 1
+                    break
+            wider = False
 
 
 @kernel
 def _estimate(
-    ticks: NDArray[np.int32],
-    starts: NDArray[np.int64],
+    words: UInt64,
+    before: UInt32,
     tick: int,
-    halves: NDArray[np.float64],
-    light: NDArray[np.float64],
+    starts: Int64,
+    stops: Int64,
+    light: Float64,
     level: UInt8,
     image: Float32,
     start: int,
@@ -146,16 +155,18 @@ def _estimate(
 ) -> None:
     """Set each pixel's rate over its window, or over the next longer one that has two spikes."""
     for p in range(start, stop):
-        times = ticks[starts[p] : starts[p + 1]]
-        image[p] = np.float32(len(times) / len(light))
-        if len(times) < 2:
+        total, after = count_before(words, before, p, len(light)), count_before(words, before, p, tick)
+        image[p] = np.float32(total / len(light))
+        if total < 2:
             continue
-        before, after = _around(times, tick)
-        for s in range(level[p], len(halves)):
-            i = min(before, np.searchsorted(times, tick - halves[s]))
-            j = max(after, np.searchsorted(times, tick + halves[s]) - 1)
-            if j - i >= 1:
-                image[p] = np.float32((j - i) / (light[times[j]] - light[times[i]]))
+        for s in range(level[p], len(starts)):
+            i = min(max(after - 1, 0), count_before(words, before, p, starts[s]))
+            j = max(min(after, total - 1), count_before(words, before, p, stops[s]) - 1)
+            if j > i:
+                # The spikes next to `tick` count even where the window is too short for them.
+                first = last_before(words, p, tick) if i + 1 == after else first_from(words, p, starts[s])
+                last = first_from(words, p, tick) if j == after else last_before(words, p, stops[s])
+                image[p] = np.float32((j - i) / (light[last] - light[first]))
                 break
 
 

@@ -20,13 +20,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Float64
+from spike4dgs.benchmark.arrays import Float32, Float64, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.spikes.times import spike_times
+from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.adaptive import AdaptiveSettings, gathered, half_windows, rates, shared_levels
 from spike4dgs.method.images.base import ImageMaker
 
@@ -67,47 +66,60 @@ def intervals(
     `light` [n_ticks] is what `images.light.Light.gathered` has of it; None: it is steady.
     """
     s = settings or IntervalSettings()
-    spikes, pixels = spike_times(stream), stream.height * stream.width
+    trains, pixels, changing = spike_trains(stream), stream.height * stream.width, gathered(stream, light)
     levels = shared_levels(stream, tick, s, light)
     rate, halves = rates(stream, tick, s, levels, light), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
-    in_threads(_measure, pixels, spikes.ticks, spikes.starts, tick, halves, gathered(stream, light), rate, spans)
+    in_threads(_measure, pixels, trains.words, trains.before, tick, halves, changing, rate, spans)
     image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
     return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
 
 
 @kernel
-def _nearest(times: NDArray[np.int32], instant: float) -> int:
-    """Return the index of the spike nearest to an instant; a spike of tick k is at k + 1/2."""
-    after = int(np.searchsorted(times, instant - 0.5))
-    if after == len(times) or (after > 0 and instant - 0.5 - times[after - 1] <= times[after] + 0.5 - instant):
-        return after - 1
-    return after
+def _nearest(words: UInt64, before: UInt32, pixel: int, total: int, instant: float, n_ticks: int) -> tuple[int, int]:
+    """Return number and tick of the spike nearest to an instant, of `total`; a spike of tick k is at k + 1/2."""
+    edge = min(max(int(np.ceil(instant - 0.5)), 0), n_ticks)
+    after = count_before(words, before, pixel, edge)
+    if after == total:
+        return after - 1, last_before(words, pixel, edge)
+    following = first_from(words, pixel, edge)
+    if after > 0:
+        earlier = last_before(words, pixel, edge)
+        if instant - 0.5 - earlier <= following + 0.5 - instant:
+            return after - 1, earlier
+    return after, following
 
 
 @kernel
 def _measure(
-    ticks: NDArray[np.int32],
-    starts: NDArray[np.int64],
+    words: UInt64,
+    before: UInt32,
     tick: int,
     halves: Float32,
-    light: NDArray[np.float64],
+    light: Float64,
     rate: Float32,
     spans: Float32,
     start: int,
     stop: int,
 ) -> None:
     """Set rate and span of the pixels that change, from the spikes nearest to either end."""
+    n = len(light)
     for p in range(start, stop):
-        times = ticks[starts[p] : starts[p + 1]]
-        if halves[p] == np.inf or len(times) < 2:
+        if halves[p] == np.inf:
             continue
-        i, j = _nearest(times, tick - halves[p]), _nearest(times, tick + halves[p])
+        total = count_before(words, before, p, n)
+        if total < 2:
+            continue
+        i, first = _nearest(words, before, p, total, tick - halves[p], n)
+        j, last = _nearest(words, before, p, total, tick + halves[p], n)
         if i == j:  # one spike is nearest to both: the interval on the side where the tick lies
-            i, j = (i - 1, j) if (times[i] >= tick and i > 0) or j + 1 == len(times) else (i, j + 1)
-        rate[p] = np.float32((j - i) / (light[times[j]] - light[times[i]]))
-        spans[0, p], spans[1, p] = times[i] + 0.5 - tick, times[j] + 0.5 - tick
+            if (first >= tick and i > 0) or j + 1 == total:
+                i, first = i - 1, last_before(words, p, first)
+            else:
+                j, last = j + 1, first_from(words, p, last + 1)
+        rate[p] = np.float32((j - i) / (light[last] - light[first]))
+        spans[0, p], spans[1, p] = first + 0.5 - tick, last + 0.5 - tick
 
 
 INTERVALS = ImageMaker(

@@ -92,4 +92,5 @@ def _block_counts(stream: SpikeStream, clock: Clock, starts: Sequence[int]) -> F
         counts = stream.counts(*local_window(clock, start, start + _WINDOW, stream.n_ticks))
         whole = counts[: rows * _BLOCK, : columns * _BLOCK].astype(np.float64)
         found[:, k] = whole.reshape(rows, _BLOCK, columns, _BLOCK).sum(axis=(1, 3)).ravel()
+    stream.release()
     return found

@@ -13,6 +13,7 @@ from spike4dgs.benchmark.arrays import Float32, Half
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.trains import spike_trains
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.light import Light
 from spike4dgs.method.settings import Settings
@@ -83,19 +84,21 @@ def _make(
     """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
     make = make.on(device)
     ticks = choose_ticks(scene.n_ticks, settings)
-    images: list[Float32] = []
+    height, width = scene.streams[0].height, scene.streams[0].width
+    images = np.empty((len(ticks), len(scene.cameras), height, width), np.float32)
     spans: list[Half] = []
-    for camera, stream in zip(scene.cameras, scene.streams, strict=True):  # one by one: a stream's spikes are kept
+    for c, (camera, stream) in enumerate(zip(scene.cameras, scene.streams, strict=True)):
         state = scene.state(camera.id)
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
-        calibration = scene.calibrations[len(images)] if settings.flat_field and scene.calibrations else None
+        calibration = scene.calibrations[c] if settings.flat_field and scene.calibrations else None
         gain = scene.radiance_gain * (1.0 if calibration else state.gain)
         lit = make.in_light(light.gathered(state.clock, stream.n_ticks)) if light else make
-        image, over = lit.with_spans(stream, own, gain, calibration)
-        images.append(image)
+        images[:, c], over = lit.with_spans(stream, own, gain, calibration)
         if over is not None:
             spans.append(over.astype(np.float16))
-    return ticks, np.stack(images, axis=1), spans or None
+        spike_trains.cache_clear()  # else two streams' trains would be in memory
+        stream.release()
+    return ticks, images, spans or None
 
 
 def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:

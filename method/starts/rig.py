@@ -104,11 +104,7 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
     mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
     windows = _windows(scene.n_ticks, settings.window_ticks)
-    counts = [
-        [s.counts(*local_window(clock, a, b, s.n_ticks)).astype(np.int64) for a, b in windows]
-        for s, clock in zip(scene.streams, _clocks(scene), strict=True)
-    ]
-    moving = _moving_pixels(scene, [np.stack(c) for c in counts])
+    moving = _moving_pixels(scene, windows)
     planes = find_range(scene.cameras, mean, settings)
     maps = sweep_all(scene.cameras, mean, planes, settings=settings)
     seen = seen_pixels(scene)
@@ -118,8 +114,8 @@ def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> 
     for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
         start, stop = windows[at]
         images = _marked(scene, window_means(scene, start, stop, flat_field))
-        near = slice(max(0, at - 1), at + 2)
-        quiet = [~m | (at == middle) for m in _moving_pixels(scene, [np.stack(c[near]) for c in counts])]
+        near = windows[max(0, at - 1) : at + 2]
+        quiet = [~m | (at == middle) for m in _moving_pixels(scene, near)]
         short = sweep_all(scene.cameras, images, planes, moving, settings)
         pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
         clouds.append(_points(scene.cameras, short, images, pixels, settings))
@@ -159,6 +155,7 @@ def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
     """Return mean spikes per tick [H, W]; clips of any length are counted in parts."""
     parts = range(start, stop, 65535)
     total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
+    stream.release()
     return np.asarray(total / (stop - start), np.float32)
 
 
@@ -167,11 +164,23 @@ def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
     return [(i * length, min((i + 1) * length, n_ticks)) for i in range(count)]
 
 
-def _moving_pixels(scene: TrainingScene, counts: Sequence[NDArray[np.int64]]) -> list[Mask]:
-    """Return the moving pixels of each view [h, w] from its counts [windows, H, W]; a pixel not seen does not move."""
+def _moving_pixels(scene: TrainingScene, windows: Sequence[tuple[int, int]]) -> list[Mask]:
+    """Return the pixels [h, w] of each view that move from one window to another; a pixel not seen does not move."""
+    counts = [_extremes(s, clock, windows) for s, clock in zip(scene.streams, _clocks(scene), strict=True)]
     moving = nearest_pixels(scene, [_moving(c) for c in counts])
     seen = seen_pixels(scene)
     return [m & s for m, s in zip(moving, seen, strict=True)] if seen else moving
+
+
+def _extremes(stream: SpikeStream, clock: Clock, windows: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+    """Return the fewest and the most spikes [2, H, W] of each pixel in a window: all windows' would fill the memory."""
+    found = np.array([np.full((stream.height, stream.width), value) for value in (np.iinfo(np.int64).max, 0)])
+    for a, b in windows:
+        counts = stream.counts(*local_window(clock, a, b, stream.n_ticks))
+        np.minimum(found[0], counts, out=found[0])
+        np.maximum(found[1], counts, out=found[1])
+    stream.release()
+    return found
 
 
 def _moving(counts: NDArray[np.int64]) -> Mask:

@@ -179,13 +179,13 @@ def test_a_network_without_weights_says_what_it_needs(
 def test_a_clip_whose_spikes_do_not_fit_into_memory(
     dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:
-    monkeypatch.setattr("spike4dgs.cli.images.free_bytes", lambda: 50_000)
+    monkeypatch.setattr("spike4dgs.cli.images.free_bytes", lambda: 10_000)
     arguments = ["images", str(dat), *SIZE, "--method", method, "--out", str(tmp_path / "out")]
     if method == "tfi":
         assert main(arguments) == 0
         return
     assert main(arguments) == 2
-    assert f"--method {method}: expected 0.0 GB of free memory for all spikes of clip" in capsys.readouterr().err
+    assert f"--method {method}: expected 0.0 GB of free memory for the spike trains of clip" in capsys.readouterr().err
 
 
 def test_import_dat_warns_of_a_swapped_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

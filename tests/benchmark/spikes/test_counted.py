@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from memory import STATUS, resident_bytes
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.held_out_spikes import response_of
@@ -171,12 +172,8 @@ def test_a_foreign_file_is_named(tmp_path: Path) -> None:
         open_counted(path, WIDTH, HEIGHT, 260)
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="Linux says how much of a file is in memory")
+@pytest.mark.skipif(not STATUS.is_file(), reason="Linux says how much of a file is in memory")
 def test_a_calibration_leaves_no_pages_of_its_recordings_in_memory(tmp_path: Path) -> None:
-    def in_memory() -> int:
-        status = Path("/proc/self/status").read_text().splitlines()
-        return 1024 * int(next(line for line in status if line.startswith("RssFile")).split()[1])
-
     width, height, ticks = 256, 128, 4000  # 16 MB each
     paths = tmp_path / "flat.dat", tmp_path / "dark.dat"
     size = ticks * width * height // 8
@@ -184,8 +181,10 @@ def test_a_calibration_leaves_no_pages_of_its_recordings_in_memory(tmp_path: Pat
     paths[1].write_bytes(bytes(size))
     flat, dark = (open_stream(path, width, height, 20000.0) for path in paths)
     first = estimate(Recordings(flat, dark, 0.5))  # compiles, too
-    before = in_memory()
+    before = resident_bytes("RssFile")
     again = estimate(Recordings(flat, dark, 0.5))
-    assert in_memory() - before < 4_000_000
+    assert resident_bytes("RssFile") - before < 4_000_000
     assert np.array_equal(first.gain, again.gain) and np.array_equal(first.dark, again.dark)
-    assert int(flat.packed.sum(dtype=np.int64)) and in_memory() - before > 12_000_000, "what is read counts"
+    assert int(flat.packed.sum(dtype=np.int64)) and resident_bytes("RssFile") - before > 12_000_000, (
+        "what is read counts"
+    )

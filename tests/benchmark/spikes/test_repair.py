@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from memory import STATUS, resident_bytes
 
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.repair import INTERVALS, NEAR_TICKS, fill_gaps, fill_pixels
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 
 WIDTH, HEIGHT, TICKS = 21, 6, 400
 
@@ -136,3 +137,21 @@ def test_a_bad_pixel_fires_as_its_neighbour(bottom_up):
     for y, x in np.argwhere(bad):
         near = [(a, b) for a in range(y - 1, y + 2) for b in range(x - 1, x + 2) if 0 <= a < HEIGHT and 0 <= b < WIDTH]
         assert any((found[:, y, x] == spikes[:, a, b]).all() for a, b in near if not bad[a, b])
+
+
+def test_gaps_of_a_mapped_file_are_filled_next_to_it(tmp_path):
+    """The file stays as it is, and of its pages the few that change are in memory."""
+    width, height, ticks = 256, 128, 4000  # a page a tick
+    gaps = tuple(Gap("cam_00", first, 2, "overflow") for first in range(100, 3900, 400))
+    path = tmp_path / "lost.dat"
+    path.write_bytes(np.random.default_rng(0).bytes(ticks * width * height // 8))
+    stream = open_stream(path, width, height, 20000.0, gaps=gaps)
+    in_memory = replace(stream, packed=np.array(stream.packed))
+    expected, content = fill_gaps(in_memory).packed, path.read_bytes()
+    before = resident_bytes("RssAnon") if STATUS.is_file() else 0
+    filled = fill_gaps(stream)
+    if STATUS.is_file():
+        assert resident_bytes("RssAnon") - before < len(content) / 4
+    filled.release()
+    np.testing.assert_array_equal(filled.packed, expected)
+    assert path.read_bytes() == content and (filled.packed[100] != stream.packed[100]).any()

@@ -47,7 +47,7 @@ def test_a_flicker_is_found_next_to_motion(depth, moving):
     assert np.sqrt(np.mean((light.factors - true / true.mean()) ** 2)) < 0.006
 
 
-@given(moving=st.sampled_from([0.0, 0.3, 0.7, 1.0]), seed=st.integers(0, 2**31))
+@given(moving=st.sampled_from([0.0, 0.3, 0.7]), seed=st.integers(0, 2**31))
 @settings(max_examples=12, deadline=None)
 def test_steady_light_is_left_alone_whatever_moves(moving, seed):
     assert estimate_light([stream_in(np.ones(N), moving, seed)], [Clock()]) is None

@@ -1,0 +1,52 @@
+"""Spike trains against a plain loop, and the memory that they take."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from memory import peak_bytes
+
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains, trains_bytes
+
+
+def stream_of(spikes: np.ndarray) -> SpikeStream:
+    return SpikeStream(pack(spikes, rows_bottom_up=False), spikes.shape[2], spikes.shape[1], 20_000.0, False)
+
+
+@settings(max_examples=40, deadline=None)
+@example(128, 8, 0.5, 0)
+@example(1, 1, 1.0, 0)
+@given(st.integers(1, 700), st.integers(1, 21), st.sampled_from([0.0, 0.003, 0.3, 1.0]), st.integers(0, 2**31))
+def test_numbers_and_ticks_of_spikes_are_those_of_a_plain_loop(n: int, width: int, rate: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spikes = rng.random((n, 1, width)) < rate
+    trains = spike_trains(stream_of(spikes))
+    for pixel in range(width):
+        fired = np.flatnonzero(spikes[:, 0, pixel])
+        for tick in {0, n, *rng.integers(0, n + 1, 20).tolist(), *range(0, n + 1, 64)}:
+            before, after = fired[fired < tick], fired[fired >= tick]
+            assert count_before(trains.words, trains.before, pixel, tick) == len(before)
+            if len(before):
+                assert last_before(trains.words, pixel, tick) == before[-1]
+            if len(after):
+                assert first_from(trains.words, pixel, tick) == after[0]
+
+
+def test_padding_bits_of_the_last_byte_are_no_pixels() -> None:
+    spikes = np.random.default_rng(0).random((100, 3, 3)) < 0.4
+    stream = stream_of(spikes)
+    stream.packed[:, -1] |= 0b11111110  # nine pixels: seven bits are nobody's
+    trains = spike_trains(stream)
+    found = [count_before(trains.words, trains.before, pixel, 100) for pixel in range(9)]
+    assert found == spikes.sum(axis=0).reshape(-1).tolist()
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.9])
+def test_trains_take_little_more_than_the_stream_whatever_it_holds(rate: float) -> None:
+    stream = stream_of(np.random.default_rng(0).random((6400, 16, 16)) < rate)
+    spike_trains(stream_of(np.zeros((1, 1, 1))))  # compiles, and what is cached is small
+    assert trains_bytes(stream) < 1.2 * stream.packed.nbytes
+    assert peak_bytes(lambda: spike_trains(stream)) < trains_bytes(stream) + 100_000
