@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
@@ -51,7 +52,7 @@ def show(
         console.print(text if runs else f"{text}; --runs OUT adds your own", markup=False)
     for board in [find_board(boards, track)] if track else boards:
         if track or any(row.ranked for row in board.rows):
-            console.print(ranking_table(board, metric))
+            console.print(ranking_table(board, metric, console.width))
     for item in refused:
         console.print(f"not listed: {item['entry']}: {item['reason']}", markup=False)
     return 0
@@ -91,8 +92,8 @@ def build(
     return 0
 
 
-def ranking_table(board: Board, metric: str) -> Table:
-    """Return a board's ranking by a metric as a table; rows without a rank come last, with the reason."""
+def ranking_table(board: Board, metric: str, width: int) -> Table:
+    """Return a board's ranking as a table for `width` characters; rows without a rank come last, with the reason."""
     scores = image_scores(board, metric)
     comparison = compare_rows(scores, metric)
     m = METRICS[metric]
@@ -112,7 +113,7 @@ def ranking_table(board: Board, metric: str) -> Table:
         table.add_column(
             title.replace(", ", "\n"), justify="left" if left else "right", no_wrap=title == "method", overflow="fold"
         )
-    numbers = list(scores.values)
+    numbers, rows = list(scores.values), list[tuple[str, ...]]()
     if comparison is not None:
         for k in np.argsort(-comparison.means if m.higher_is_better else comparison.means, kind="stable"):
             best, worst = comparison.best_ranks[k], comparison.worst_ranks[k]
@@ -122,10 +123,19 @@ def ranking_table(board: Board, metric: str) -> Table:
             shown = ", ".join(names) if len(tied) <= 3 else f"{len(tied)} methods"
             name = board.rows[numbers[k]].name
             cells = (rank, name, m.format(comparison.means[k]), shown, *_costs(board.rows[numbers[k]].records))
-            table.add_row(*map(Text, cells))
-    for i, why in scores.left_out.items():
-        table.add_row(*map(Text, ("-", board.rows[i].name, "", why, *_costs(board.rows[i].records))))
+            rows.append(cells)
+    rows += [("-", board.rows[i].name, "", why, *_costs(board.rows[i].records)) for i, why in scores.left_out.items()]
+    _add_rows(table, rows, width)
     return table
+
+
+def _add_rows(table: Table, rows: Sequence[tuple[str, ...]], width: int) -> None:
+    """Add rows to a table for `width` characters: as one with many lines if no cell breaks, which takes less time."""
+    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+    heads = [max(map(cell_len, str(column.header).split("\n"))) for column in table.columns]
+    fits = sum(map(max, widths, heads)) + len(widths) <= width
+    for cells in [tuple(map("\n".join, zip(*rows, strict=True)))] if rows and fits else rows:
+        table.add_row(*map(Text, cells))
 
 
 def _costs(records: tuple[Mapping[str, Any], ...]) -> list[str]:

@@ -32,7 +32,7 @@ from spike4dgs.leaderboard.entry import (
     read_ledger,
 )
 
-FEWEST = 50  # entries of a leaderboard whose checks are kept: fewer are checked in less than half a second
+FEWEST = 10  # entries of a leaderboard whose checks are kept: fewer are checked in less than a tenth of a second
 _HEAVY = {  # what boards do not need
     "cell": ("computed", "notes", "error", "predictions_sha256"),
     "record": ("environment", "command", "created"),

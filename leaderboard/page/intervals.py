@@ -113,7 +113,7 @@ class Comparison:
         """Return the methods that cannot be told from method `i`."""
         tied = ~(self.better[i] | self.better[:, i])
         tied[i] = False
-        return [int(j) for j in np.flatnonzero(tied)]
+        return list(np.flatnonzero(tied).tolist())
 
 
 def resampled_means(
