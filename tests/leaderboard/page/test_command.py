@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.cli import main
+from spike4dgs.cli.leaderboard import ranking_table
 from spike4dgs.leaderboard.entry import add_line
+from spike4dgs.leaderboard.page.rows import find_board, gather
+from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
+from spike4dgs.leaderboard.tracks import SHIPPED
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
@@ -89,3 +95,20 @@ def test_a_run_without_its_scenes_gives_a_page_without_images(
     out = capsys.readouterr().out
     assert "left out: no images of pattern-0" in out and str(tmp_path / "page/index.html") in out
     assert (tmp_path / "page/data/boards.js").is_file() and not (tmp_path / "page/pictures").exists()
+
+
+@pytest.mark.parametrize("width", [48, 60, 240])
+def test_a_row_stays_on_its_lines_whatever_the_width(width: int) -> None:
+    """Rows that fit are laid out together; where a cell breaks, what follows it must not move up."""
+    boards, _ = gather(SHIPPED, (), brief=True)
+    board = find_board(boards, "outdoor-small")
+    table = ranking_table(board, "psnr", width)
+    console = Console(file=io.StringIO(), width=width, highlight=False)
+    console.print(table)
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    scores = compare_rows(image_scores(board, "psnr"), "psnr")
+    assert scores is not None
+    for number, mean in zip(image_scores(board, "psnr").values, scores.means, strict=True):
+        (cells,) = (line.split() for line in lines if board.rows[number].name in line.split()[:2])
+        value = cells[cells.index(board.rows[number].name) + 1]
+        assert f"{mean:.2f}".startswith(value) and (value == f"{mean:.2f}" or width < 60)
