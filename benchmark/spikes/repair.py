@@ -11,6 +11,7 @@ spike's place.
 
 from __future__ import annotations
 
+import mmap
 from dataclasses import replace
 from typing import TypeVar
 
@@ -51,7 +52,8 @@ def fill_gaps(stream: SpikeStream) -> SpikeStream:
 
 def _private(packed: UInt8) -> UInt8:
     """Return ticks that can be written to without a change of `packed` or its file."""
-    if isinstance(packed, np.memmap) and packed.filename and not packed.flags.writeable:
+    whole = isinstance(packed, np.memmap) and isinstance(packed.base, mmap.mmap)  # a part keeps the whole's offset
+    if whole and packed.filename and not packed.flags.writeable:
         return np.memmap(packed.filename, np.uint8, "c", packed.offset, packed.shape)
     return np.array(packed)
 

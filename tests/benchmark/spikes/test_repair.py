@@ -155,3 +155,6 @@ def test_gaps_of_a_mapped_file_are_filled_next_to_it(tmp_path):
     filled.release()
     np.testing.assert_array_equal(filled.packed, expected)
     assert path.read_bytes() == content and (filled.packed[100] != stream.packed[100]).any()
+    part = replace(stream, packed=stream.packed[50:], gaps=(replace(gaps[0], first_tick=50),))
+    expected = fill_gaps(replace(part, packed=np.array(part.packed))).packed
+    np.testing.assert_array_equal(fill_gaps(part).packed, expected, err_msg="a part of a file's ticks")
