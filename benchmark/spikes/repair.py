@@ -52,8 +52,8 @@ def fill_gaps(stream: SpikeStream) -> SpikeStream:
 
 def _private(packed: UInt8) -> UInt8:
     """Return ticks that can be written to without a change of `packed` or its file."""
-    whole = isinstance(packed, np.memmap) and isinstance(packed.base, mmap.mmap)  # a part keeps the whole's offset
-    if whole and packed.filename and not packed.flags.writeable:
+    whole = isinstance(packed.base, mmap.mmap)  # a part of a map keeps the offset of the whole
+    if whole and isinstance(packed, np.memmap) and packed.filename and not packed.flags.writeable:
         return np.memmap(packed.filename, np.uint8, "c", packed.offset, packed.shape)
     return np.array(packed)
 

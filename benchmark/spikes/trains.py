@@ -119,7 +119,7 @@ def count_before(words: UInt64, before: UInt32, pixel: int, tick: int) -> int:
     count = np.int64(before[last // _COUNTED, pixel])
     for w in range(last // _COUNTED * _COUNTED, last):
         count += _ones(words[w, pixel])
-    return count + _ones(words[last, pixel] & ((np.uint64(1) << np.uint64(tick & 63)) - np.uint64(1)))
+    return int(count + _ones(words[last, pixel] & ((np.uint64(1) << np.uint64(tick & 63)) - np.uint64(1))))
 
 
 @kernel
@@ -130,7 +130,7 @@ def first_from(words: UInt64, pixel: int, tick: int) -> int:
     while found == 0:
         w += 1
         found = words[w, pixel]
-    return 64 * w + _zeros_below(found)
+    return int(64 * w + _zeros_below(found))
 
 
 @kernel
@@ -141,4 +141,4 @@ def last_before(words: UInt64, pixel: int, tick: int) -> int:
     while found == 0:
         w -= 1
         found = words[w, pixel]
-    return 64 * w + 63 - _zeros_above(found)
+    return int(64 * w + 63 - _zeros_above(found))
