@@ -45,8 +45,9 @@ root = pathlib.Path(sys.argv[2])
 for room in ("benchmark", "method", "baselines", "generators", "leaderboard", "studies", "cli"):
     for path in sorted((root / room).rglob("*.py")):
         name = ".".join(("spike4dgs", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
-        # Mitsuba's variant comes first there; `__main__` runs.
-        if not name.endswith(("rendering.wavefront", "rendering.soft_map", "rendering.split_tracer", "__main__")):
+        # Mitsuba's variant comes first there; Blender's interpreter runs its script; `__main__` runs.
+        skipped = "rendering.wavefront", "rendering.soft_map", "rendering.split_tracer", "blender_script", "__main__"
+        if not name.endswith(skipped):
             importlib.import_module(name)
 
 import numpy as np

@@ -199,7 +199,8 @@ def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on_with_i
 def caller(out: Path, scene: Path, folder: Path) -> subprocess.Popen[bytes]:
     """Start a run in a process group whose method waits in its fit."""
     code = (
-        "import sys; sys.path[:0] = sys.argv[4:]\n"
+        "import signal, sys; sys.path[:0] = sys.argv[4:]\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs ignore it
         "from pathlib import Path; from dummy_methods import WaitingMethod, run\n"
         "from spike4dgs.benchmark.runs.apart.fit import Apart\n"
         "out, scene, folder = map(Path, sys.argv[1:4])\n"
