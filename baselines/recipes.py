@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from spike4dgs.baselines.images.published.makers import MAKERS
@@ -26,6 +27,7 @@ from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
 from spike4dgs.method.recipes import FLAT, MSDI_SETTINGS
 from spike4dgs.method.starts.base import Initialization
+from spike4dgs.method.tuned import tuned
 
 INITIALIZATIONS = {
     **ours.PARTS.initialization,
@@ -112,12 +114,13 @@ POSED = (
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
+TUNED = tuned((*RECIPES, *CALIBRATED, *PUBLISHED), Path(__file__).with_name("tuned.json"))
 METHODS: dict[str, Method] = Table(
     "methods",
     {
         **{
             recipe.name: RecipeMethod(recipe, PARTS)
-            for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED)
+            for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED, *TUNED)
         },
         "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
     },

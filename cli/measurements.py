@@ -30,6 +30,11 @@ MEASUREMENTS: dict[str, Command] = {
         "render one tick of three worlds with Cycles too, and tabulate by how much and why it differs",
         "report second-renderer --out runs/second-renderer",
     ),
+    "report tuning": Command(
+        "spike4dgs.cli.studies:tuning",
+        "search for better settings of recipes, every row by the same search on development scenes",
+        "report tuning data/van-10-small data/turntable-10-small --rows tfp+stg spike4dgs-x --out runs/tuning",
+    ),
     "spike-agreement": Command(
         "spike4dgs.cli.studies:spike_agreement",
         "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",

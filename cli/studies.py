@@ -14,3 +14,4 @@ from spike4dgs.studies.scene_noise import scene_noise as scene_noise
 from spike4dgs.studies.second_renderer.command import second_renderer as second_renderer
 from spike4dgs.studies.speed_error.command import speed_error as speed_error
 from spike4dgs.studies.spike_agreement import spike_agreement as spike_agreement
+from spike4dgs.studies.tuning.search import tuning as tuning

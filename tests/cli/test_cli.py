@@ -49,7 +49,8 @@ def test_help_fits_the_terminal(
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= columns
     assert [heading for heading in GROUPS if f"\n\n{heading}:\n" in text] == list(GROUPS)
-    assert text.count("\n  report ") == 5 and " ".join(COMMANDS["import-dat"].summary.split()) in " ".join(text.split())
+    assert text.count("\n  report ") == sum(name.startswith("report ") for name in COMMANDS)
+    assert " ".join(COMMANDS["import-dat"].summary.split()) in " ".join(text.split())
 
 
 def test_no_arguments_and_help_say_the_same(capsys: pytest.CaptureFixture[str]) -> None:

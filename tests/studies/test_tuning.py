@@ -1,0 +1,138 @@
+"""`report tuning`: knobs that leave a recipe's work and knowledge alone, and a search that resumes and finds."""
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spike4dgs.baselines import recipes as theirs
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import get_method
+from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
+from spike4dgs.method import recipes as ours
+from spike4dgs.method.settings import override
+from spike4dgs.method.tuned import read_tuned, tuned
+from spike4dgs.studies.tuning.knobs import STEPS_OF_TWO, as_settings, knobs_of, start_of
+from spike4dgs.studies.tuning.search import TRIALS, best_of, gain_of, publish, search, tuning, variant, write_results
+
+ROWS = ("tfp+stg", "tfi+4dgs", "spk2img+d3dgs", "dy-spikenerf", "spike4dgs", "spike4dgs-x", "tfp+rig-flat+4dgs")
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_the_first_trial_is_the_recipe_as_it_is(name):
+    method = get_method(name)
+    assert (
+        override(method.settings, as_settings(start_of(method.settings), method.settings), "start") == method.settings
+    )
+    assert variant(method, start_of(method.settings)) is method
+
+
+@pytest.mark.parametrize("name", ["tfp+stg", "spike4dgs", "spike4dgs-x", "tfi+4dgs"])
+@settings(max_examples=20, deadline=None)
+@given(data=st.data())
+def test_no_knob_gives_more_work_or_knowledge(name, data):
+    method = get_method(name)
+    knobs = {
+        k.name: data.draw(st.sampled_from(k.choices) if k.choices else st.floats(k.low, k.high), label=k.name)
+        for k in knobs_of(method.settings)
+    }
+    changed = variant(method, knobs)
+
+    def work(m):
+        trainer = m.settings["trainer"]
+        return (trainer.coarse_steps + trainer.fine_steps) * {2: 1.0, 4: STEPS_OF_TWO}[trainer.views_per_step]
+
+    assert work(changed) == pytest.approx(work(method), abs=STEPS_OF_TWO)
+    assert changed.given == method.given
+    assert changed.settings["images"] == method.settings["images"]  # as many images
+    own, new = method.settings["trainer"], changed.settings["trainer"]
+    assert new.lr_means / own.lr_means == pytest.approx(knobs["rates"])
+    assert new.lr_means_last / own.lr_means_last == pytest.approx(knobs["rates"])
+    assert (new.lr_last, new.lr_poses) == (knobs["last_rate"], own.lr_poses)
+
+
+def test_the_times_of_tracking_share_the_same_steps():
+    method = get_method("tfp+d3dgs")
+    found = as_settings({**start_of(method.settings), "times": 24}, method.settings)
+    later, own = found["motion.later_steps"], method.settings["motion"].later_steps
+    assert later / found["images.time_spacing_ticks"] == pytest.approx(own / 16, rel=0.02)
+
+
+class _Scene:
+    """All that the search itself reads of a scene."""
+
+    def __init__(self, name):
+        self.id = name
+
+
+def _fit(method, scene):
+    """Return scores with one best rate, so that the search has something to find."""
+    off = math.log(method.settings["trainer"].lr_means / 4.8e-4)  # three times tfp+stg's own
+    level = 30 if scene.id == "a" else 35
+    return {"psnr": level - off**2, "psnr_dynamic": level - 4 - off**2}
+
+
+ABOUT = {"row": "tfp+stg", "scenes": {"a": "1", "b": "2"}, "budget": 0.25, "seed": 0}
+SCENES = [_Scene("a"), _Scene("b")]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A search of one row, and its folder."""
+    pytest.importorskip("optuna")
+    out = tmp_path_factory.mktemp("tuning")
+    return search(get_method("tfp+stg"), SCENES, out / "tfp+stg.json", ABOUT, TRIALS, _fit, print), out
+
+
+def test_a_search_finds_the_better_rate(whole):
+    done = whole[0]["trials"]
+    assert gain_of(done[0], done[0]) == 0
+    best = best_of(done, 2)
+    assert gain_of(best, done[0]) > 0.9 * math.log(3) ** 2
+    assert 1.8 < best["knobs"]["rates"] < 5
+    assert any(len(trial["scores"]) == 1 for trial in done[8:])  # those that fell behind ended early
+
+
+def test_a_killed_search_goes_on_as_if_nothing_had_happened(whole, tmp_path):
+    path = tmp_path / "tfp+stg.json"
+    for trials in (3, 11, TRIALS):
+        found = search(get_method("tfp+stg"), SCENES, path, ABOUT, trials, _fit, print)
+    same = ("number", "knobs", "scores")
+    assert [[t[k] for k in same] for t in found["trials"]] == [[t[k] for k in same] for t in whole[0]["trials"]]
+    with pytest.raises(UserError, match="another"):
+        search(get_method("tfp+stg"), SCENES, path, {**ABOUT, "seed": 1}, 24, _fit, print)
+
+
+def test_the_best_settings_become_a_row(whole, tmp_path):
+    record, out = whole
+    for folder in ("method", "baselines"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tuned.json").write_text("{}")
+    page = tmp_path / "docs" / "results" / "tuning.md"
+    page.parent.mkdir(parents=True)
+    page.write_text("before\n<!-- searches -->\nold\n<!-- end searches -->\nafter\n")
+    write_results(out)
+    publish(out, tmp_path)
+    assert read_tuned(tmp_path / "method" / "tuned.json") == {}
+    (row,) = tuned(theirs.RECIPES, tmp_path / "baselines" / "tuned.json")
+    best = best_of(record["trials"], 2)
+    assert row.name == "tfp+stg.tuned"
+    assert row.settings["trainer.lr_means"] == pytest.approx(1.6e-4 * best["knobs"]["rates"])
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "| `tfp+stg` |" in text and "old" not in text
+    assert (page.parent / "tables" / "tuning" / "tfp+stg.csv").read_text().count("\n") == TRIALS + 1
+
+
+def test_scenes_of_tables_are_refused(small_scene):
+    with pytest.raises(UserError, match="development variant"):
+        tuning((small_scene,), rows=("tfp+stg",))
+
+
+@pytest.mark.parametrize("recipes", [theirs, ours])
+def test_every_tuned_row_had_the_whole_search(recipes):
+    for name, row in read_tuned(Path(recipes.__file__).with_name("tuned.json")).items():
+        assert row["trials"] >= TRIALS, name
+        assert {int(scene.split("-")[1]) for scene in row["scenes"]} <= set(DEVELOPMENT_VARIANTS), name
+        assert f"{name}.tuned" in recipes.METHODS
