@@ -29,12 +29,12 @@ ORDER = {
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth held_frames previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
-    "schedule models checkpoint msdi images matching starts self_calibration trainer fit recipes viewing recordings",
+    "schedule models checkpoint msdi images matching starts self_calibration trainer fit tuned recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render starts tracking spacetime recipes",
     "leaderboard": "tracks entry reading truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models oracle_truth "
     "oracle_methods oracle_ladder faults patterns poses spike_agreement scene_noise "
-    "second_renderer",
+    "second_renderer tuning",
 }
 FRONT = ROOT / "front" / "__init__.py"  # what `import spike4dgs` gives; no room
 MOST_MODULES = 13  # in a folder; `__init__` does not count
