@@ -138,14 +138,15 @@ _PLACES = {
 }
 
 
-def _choice(
-    name: str, *choices: Any
-) -> tuple[Knob, Callable[[SettingsByPart], bool], Callable[[Any, SettingsByPart], dict[str, Any]]]:
+# A knob, whether a recipe with some settings has it, and the settings that a value of it gives.
+_Entry = tuple[Knob, Callable[[SettingsByPart], bool], Callable[[Any, SettingsByPart], dict[str, Any]]]
+
+
+def _choice(name: str, *choices: Any) -> _Entry:
     return Knob(name, choices), _has(*_PLACES[name]), _set(*_PLACES[name])
 
 
-# Each with the recipes that have it and the settings that it gives. `views_per_step` comes before the steps.
-_KNOBS = (
+_KNOBS: tuple[_Entry, ...] = (
     (Knob("rates", low=0.5, high=8), _has("trainer", "lr_means"), _scaled_rates("trainer")),
     (
         Knob("motion_rates", low=0.25, high=8),

@@ -142,7 +142,7 @@ def propose(method: RecipeMethod, done: Sequence[Trial], seed: int) -> dict[str,
     knobs = knobs_of(method.settings)
     if not done:
         return start_of(method.settings)
-    space = {
+    space: dict[str, optuna.distributions.BaseDistribution] = {
         k.name: optuna.distributions.CategoricalDistribution(k.choices)
         if k.choices
         else optuna.distributions.FloatDistribution(k.low, k.high, log=True)
