@@ -34,6 +34,7 @@ from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.tuned import read_tuned
 from spike4dgs.studies.kit.checkout import find_checkout
 from spike4dgs.studies.kit.timing import markdown, write_csv
+from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import Values, as_settings, knobs_of, start_of
 
 TRIALS = 24
@@ -75,16 +76,16 @@ def tuning(
         if (variant := scene.meta["source"].get("variant")) not in DEVELOPMENT_VARIANTS:
             expected = f"a development variant ({', '.join(map(str, DEVELOPMENT_VARIANTS))})"
             raise problem(scene.id, expected, f"variant {variant}", "tune on scenes that no table has")
-    methods = [_recipe(name) for name in rows]
-    chosen = choose_device_for(methods, device)
-    for method in methods:
-        kept = {
+    chosen = choose_device_for([_recipe(name) for name in rows], device)
+    for name in rows:
+        method = keeping(_recipe(name), chosen)
+        about = {
             "row": method.name,
             "scenes": {scene.id: scene.revision for scene in opened},
             "budget": make_budget(budget).label,
             "seed": seed,
         }
-        search(method, opened, out / f"{method.name}.json", kept, trials, _fit_by(seed, chosen, budget), print)
+        search(method, opened, out / f"{method.name}.json", about, trials, _fit_by(seed, chosen, budget), print)
         write_results(out)
     print(f"table: {out / 'tuning.md'}")
     if write:

@@ -1,19 +1,27 @@
 """`report tuning`: knobs that leave a recipe's work and knowledge alone, and a search that resumes and finds."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import get_method
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
 from spike4dgs.method import recipes as ours
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.images.training import make_training_images
 from spike4dgs.method.settings import override
+from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.tuned import read_tuned, tuned
+from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import STEPS_OF_TWO, as_settings, knobs_of, start_of
 from spike4dgs.studies.tuning.search import TRIALS, best_of, gain_of, publish, search, tuning, variant, write_results
 
@@ -51,6 +59,23 @@ def test_no_knob_gives_more_work_or_knowledge(name, data):
     assert new.lr_means / own.lr_means == pytest.approx(knobs["rates"])
     assert new.lr_means_last / own.lr_means_last == pytest.approx(knobs["rates"])
     assert (new.lr_last, new.lr_poses) == (knobs["last_rate"], own.lr_poses)
+
+
+def test_images_and_starts_are_made_once_and_stay_the_same(small_scene):
+    scene, calls = open_scene(small_scene).training, []
+    method = get_method("tfp+rig-flat+stg")
+    rate = method.images.rate
+    counted = replace(method.images, rate=lambda *args: (calls.append(args[1]), rate(*args))[1])
+    parts = replace(method.parts, images={**method.parts.images, "tfp": counted})
+    kept = keeping(RecipeMethod(method.recipe, parts), "cpu")
+    made = [make_training_images(scene, scene.cameras, kept.images, method.settings["images"], "cpu") for _ in range(2)]
+    own = make_training_images(scene, scene.cameras, method.images, method.settings["images"], "cpu")
+    assert torch.equal(made[0].images, own.images) and torch.equal(made[1].images, own.images)
+    assert len(calls) == own.images.shape[0] * own.images.shape[1]
+    request = StartRequest(scene, 0, method.settings["initialization"])
+    first = kept.initialization.start(request)
+    assert kept.initialization.start(request) is first
+    assert np.array_equal(first.points, method.initialization.start(request).points)
 
 
 def test_the_times_of_tracking_share_the_same_steps():
