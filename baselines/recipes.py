@@ -69,10 +69,24 @@ RECIPES = (
     Recipe("tfp+static", "tfp", "rig", "static", "pixel", {"trainer.coarse_steps": 1500}),
 )
 
-# The same given what `spike4dgs-x` is given: images and first points corrected by the cameras' calibrations.
+# The same given what `spike4dgs-x` is given: images and first points corrected by the cameras' calibrations. Spk2ImgNet
+# still sees raw spikes; its images are corrected. `adaptive` with 4DGS is in `method.recipes`.
 CALIBRATED = (
-    Recipe("tfp+rig-flat+stg", "tfp", "rig", "spacetime", "pixel", FLAT),
-    Recipe("tfp+rig-flat+4dgs", "tfp", "rig", "hexplane", "pixel", FLAT),
+    *(
+        Recipe(
+            f"{images}+rig-flat+{name}",
+            images,
+            "rig",
+            motion,
+            "pixel",
+            {**FLAT, **(_SPK2IMG[name] if images == "spk2img" else {})},
+        )
+        for (name, motion), images in product(_MOTIONS.items(), ("tfi", "tfp", "spk2img"))
+    ),
+    *(
+        Recipe(f"adaptive+rig-flat+{name}", "adaptive", "rig", _MOTIONS[name], "pixel", FLAT)
+        for name in ("d3dgs", "stg")
+    ),
 )
 
 # Images by networks that other people trained, with their weights.

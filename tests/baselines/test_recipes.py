@@ -13,7 +13,9 @@ from spike4dgs.baselines.recipes import CALIBRATED, PARTS, POSED, RECIPES, SUPER
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods
 from spike4dgs.benchmark.reports.paper_tables import published
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.recipes import RECIPES as OURS
 
@@ -83,6 +85,35 @@ def test_images_and_first_points_are_corrected_as_the_recipe_says(name: str) -> 
     assert settings["images"]["flat_field"] == corrected
     first = settings["initialization"].get("flat_field", corrected)
     assert first == (corrected and name != "msdi+colmap+4dgs")
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda r: r.name)
+def test_a_two_stage_row_has_a_twin_that_only_the_calibration_tells_from_it(recipe: Recipe) -> None:
+    if recipe.name.startswith("dy-") or recipe.motion == "static":
+        return
+    twin = METHODS[recipe.name.replace("+", "+rig-flat+")]
+    assert isinstance(twin, RecipeMethod) and twin.given == ("poses", "flat-field")
+    own, calibrated = METHODS[recipe.name].params["settings"], twin.params["settings"]
+    changed = {(part, key) for part in own for key in own[part] if own[part][key] != calibrated[part][key]}
+    assert changed == {("images", "flat_field"), ("initialization", "flat_field")}
+    assert own.keys() == calibrated.keys() and twin.params["supervision"] == recipe.supervision
+
+
+@pytest.mark.parametrize("images", ["tfi", "tfp", "spk2img", "adaptive"])
+def test_images_of_calibrated_rows_show_even_light_as_even(images: str) -> None:
+    """Integrate-and-fire pixels, those on the right twice as sensitive as those on the left."""
+    radiance_gain, light, n = 0.6, 0.5, 400
+    gain = np.where(np.arange(40) < 20, 2 / 3, 4 / 3) * np.ones((24, 1))
+    ticks = np.arange(1, n + 1)[:, None, None]
+    charge = np.random.default_rng(0).random((24, 40)) + ticks * gain * radiance_gain * light
+    stream = SpikeStream(pack(np.diff(np.floor(charge), axis=0, prepend=0) > 0), 40, 24, 20_000.0)
+    camera = Calibration(gain.astype(np.float32), np.zeros((24, 40), np.float32), radiance_gain)
+    raw = PARTS.images[images](stream, [n // 2], radiance_gain)[0]
+    corrected = PARTS.images[images](stream, [n // 2], radiance_gain, camera)[0]
+    sides = slice(0, 16), slice(24, 40)  # a network looks at neighbours
+    left, right = (float(raw[:, side].mean()) for side in sides)
+    assert right / left == pytest.approx(2, rel=0.1)
+    assert [float(corrected[:, side].mean()) for side in sides] == pytest.approx([light, light], rel=0.1)
 
 
 def test_a_recipe_holds_settings_of_its_own_parts_only() -> None:
