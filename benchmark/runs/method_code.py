@@ -1,11 +1,11 @@
-"""The code of other people's methods, by whose hash a run notices that it changed."""
+"""The code of methods, by whose hash a run notices that it changed."""
 
 from __future__ import annotations
 
 import hashlib
 import inspect
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,6 +31,14 @@ def code_of(method: Any) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def sources_sha256(packages: Sequence[ModuleType]) -> str:
+    """Return the SHA-256 of the Python sources of packages, with their names."""
+    digest = hashlib.sha256()
+    for package in packages:
+        _add_files(digest, sorted(_files(package)), f"{package.__name__}/")
+    return digest.hexdigest()
+
+
 def _name(package: str) -> str:
     """Return a package's name, and that of the file for a program that was started."""
     file = getattr(sys.modules.get(package), "__file__", None)
@@ -42,15 +50,19 @@ def _sha256(package: str, cls: type) -> str:
     digest = hashlib.sha256()
     module = sys.modules.get(package)
     files = sorted(_files(module)) if module else []
-    for name, path in files:
-        digest.update(f"{name}\0".encode())
-        digest.update(path.read_bytes())
+    _add_files(digest, files)
     if not files:
         try:
             digest.update(inspect.getsource(cls).encode())
         except (OSError, TypeError):  # compiled, or typed in
             digest.update(cls.__qualname__.encode())
     return digest.hexdigest()
+
+
+def _add_files(digest: Any, files: Sequence[tuple[str, Path]], prefix: str = "") -> None:
+    for name, path in files:
+        digest.update(f"{prefix}{name}\0".encode())
+        digest.update(path.read_bytes())
 
 
 def _files(module: ModuleType) -> Iterator[tuple[str, Path]]:

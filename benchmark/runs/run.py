@@ -137,7 +137,7 @@ def run_matrix(
     for method in methods:
         check_method_name(method.name)
     for scene in scenes:
-        _check_inputs(scene)
+        check_inputs(scene)
     selection = select_metrics(settings.metrics)
     jobs = [
         JobFiles(
@@ -157,7 +157,7 @@ def run_matrix(
         RunDisplay(console, len(jobs), [files.job.method.name for files in jobs], settings.typical_s) as display,
     ):
         remove_parts(settings.out)
-        for k, cells in _run_cells(jobs, settings, selection, display):
+        for k, cells in run_cells(jobs, settings, selection, display):
             found[k] = cells
             first = k - k % len(scenes)  # of the cells of one record
             if all(n in found for n in range(first, first + len(scenes))):
@@ -166,7 +166,7 @@ def run_matrix(
     return [record for first in sorted(records) for record in records[first]]
 
 
-def _run_cells(
+def run_cells(
     jobs: Sequence[JobFiles], settings: Settings, selection: Selection, display: RunDisplay
 ) -> Iterator[tuple[int, list[Cell]]]:
     """Run or resume the cells, here or by workers. Yield their positions and the cells of their variants."""
@@ -258,7 +258,7 @@ def _write_records(
     return records
 
 
-def _check_inputs(scene: Scene) -> None:
+def check_inputs(scene: Scene) -> None:
     """Hash every file that the run will read. Raises UserError at the first damaged one."""
     if not scene.targets:
         raise problem(scene.root, "a scene with targets", "none in targets.json", "use a scene that has ground truth")
