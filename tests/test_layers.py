@@ -35,7 +35,7 @@ ORDER = {
     "leaderboard": "tracks entry reading truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models oracle_truth "
     "oracle_methods oracle_ladder faults patterns poses spike_agreement scene_noise "
-    "second_renderer tuning",
+    "second_renderer tuning results",
 }
 FRONT = ROOT / "front" / "__init__.py"  # what `import spike4dgs` gives; no room
 MOST_MODULES = 13  # in a folder; `__init__` does not count

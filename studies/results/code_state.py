@@ -1,0 +1,61 @@
+"""Which code makes the numbers: the checkout's commit, whether code was changed since, and a digest of it."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+from spike4dgs import baselines, benchmark, method
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.runs.method_code import sources_sha256
+from spike4dgs.method.recipes import METHODS as OURS
+from spike4dgs.studies.results.records import DIGITS
+
+ROOT = Path(__file__).resolve().parents[2]
+# What decides about a number. Records, pages and tests may change while a sweep runs.
+CODE = ("benchmark", "method", "baselines", "studies/results/*.py", "pyproject.toml", "constraints.txt")
+_DO = "clone the repository, and run `pip install -e .` there"
+
+
+@dataclass(frozen=True)
+class CodeState:
+    """The commit of a checkout, and whether its code differs from it."""
+
+    commit: str
+    dirty: bool
+
+
+def find_root() -> Path:
+    """Return the root of the checkout that this code runs from. Raises UserError where it is installed without one."""
+    if not (ROOT / "docs" / "results").is_dir():
+        raise problem("report results", "a checkout with its docs", f"an installation in {ROOT}", _DO)
+    return ROOT
+
+
+def code_state(root: Path) -> CodeState:
+    """Return the state of the code of a checkout. Raises UserError where git does not tell it."""
+    commit, changes = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--", *CODE)
+    return CodeState(commit.strip()[:DIGITS], bool(changes.strip()))
+
+
+def check_clean(state: CodeState, allow_dirty: bool) -> None:
+    """Raise UserError where code was changed since the commit, unless that is allowed."""
+    if state.dirty and not allow_dirty:
+        fix = "commit it, or pass --allow-dirty: then the records say so"
+        raise problem("the checkout", f"the code of commit {state.commit}", "changes that are not committed", fix)
+
+
+def code_digest(row: str) -> str:
+    """Return a digest of the sources that a row's method and its scores come from."""
+    return sources_sha256([benchmark, method, *([] if row in OURS else [baselines])])[:DIGITS]
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired) as e:
+        raise problem(root, "a git checkout", f"{type(e).__name__} of git", _DO) from None
+    if done.returncode:
+        raise problem(root, "a git checkout", done.stderr.strip()[:200] or "an error of git", _DO)
+    return done.stdout

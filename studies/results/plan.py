@@ -1,0 +1,136 @@
+"""What the sweep measures: groups of scenes and rows, in the order in which their cells are fitted.
+
+A row's name is a method's. What a row was tuned on is a fact of its history, and stands here; what it is given follows
+from its recipe (`knowledge_of`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, DEFAULT_GIVEN, Method
+from spike4dgs.benchmark.reports.paper_tables import published
+from spike4dgs.generators.profiles import TRACKS
+
+CALIBRATED, UNCALIBRATED = "calibrated", "uncalibrated"
+KNOWLEDGE = {  # the blocks of a table, in their order -> what its rows are given
+    CALIBRATED: "given the poses, and each camera's flat field and dark recording",
+    UNCALIBRATED: "given the poses alone",
+}
+
+# What a row's numbers were chosen on. Public variants are those that tables report.
+OUR_TRIALS = "release 1, variants 0"
+FEW_TRIALS = "release 1, variants 0, few trials"  # motions of other people: steps for the budget, rates to match
+NOT_TUNED = "not tuned"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of tables: a method, how many seeds it is fitted with, and what it was tuned on. `ours`: it may lead."""
+
+    name: str
+    seeds: int = 1
+    tuned_on: str = FEW_TRIALS
+    ours: bool = False
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows on scenes, with a budget and a split."""
+
+    name: str
+    title: str
+    scenes: tuple[str, ...]
+    rows: tuple[Row, ...]
+    budget: str = DEFAULT_BUDGET
+    split: str = "center"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A fit of the plan: a row on a scene with a seed."""
+
+    row: Row
+    scene: str
+    seed: int
+    budget: str
+    split: str
+
+
+def track_scenes(track: str, worlds: Iterable[str]) -> tuple[str, ...]:
+    """Return the ids of a track's scenes of some worlds, as `make-dataset --track` names them.
+
+    >>> track_scenes("ideal", ["car", "van"])
+    ('car-0-small', 'van-0-small')
+    """
+    made = TRACKS[track]
+    return tuple(f"{world}-{variant}-{made.profile}" for world in worlds for variant in made.variants)
+
+
+# The most important first: what a reader compares with, then what is far behind or costs most.
+ROWS = (
+    Row("spike4dgs-x", 3, OUR_TRIALS, ours=True),
+    Row("tfp+rig-flat+stg", 3),
+    Row("tfp+stg", 3),
+    Row("tfp+4dgs", 3),
+    Row("spk2img+stg", 3),
+    Row("spike4dgs", 3, OUR_TRIALS, ours=True),
+    Row("adaptive+rig-flat+stg", 3),
+    Row("tfp+rig-flat+4dgs", 3),
+    Row("spk2img+rig-flat+stg", 3),
+    Row("spike4dgs-x+self-calibrated", 3, OUR_TRIALS, ours=True),
+    Row("adaptive+rig-flat+4dgs"),
+    Row("spk2img+rig-flat+4dgs"),
+    Row("tfi+rig-flat+stg"),
+    Row("tfi+rig-flat+4dgs"),
+    Row("spk2img+4dgs"),
+    Row("tfi+stg"),
+    Row("tfi+4dgs"),
+    Row("dy-spikegs"),
+    Row("tfp+rig-flat+d3dgs"),
+    Row("spk2img+rig-flat+d3dgs"),
+    Row("adaptive+rig-flat+d3dgs"),
+    Row("tfi+rig-flat+d3dgs"),
+    Row("tfp+d3dgs"),
+    Row("spk2img+d3dgs"),
+    Row("tfi+d3dgs"),
+    Row("nearest-view", tuned_on=NOT_TUNED),
+    Row("tfp+static"),
+    Row("dy-spikenerf"),
+    # Networks with their authors' weights, which a user fetches.
+    *(Row(f"{images}+stg") for images in ("ssml", "ssir", "spikeclip", "scflow-tfp")),
+    *(Row(f"{images}+4dgs") for images in ("ssml", "ssir", "spikeclip", "scflow-tfp")),
+)
+
+TABLE1 = Group("table1", "Table 1: outdoor scenes", track_scenes("ideal", published(1).worlds), ROWS)
+TABLE2 = Group("table2", "Table 2: objects", track_scenes("ideal", published(2).worlds), ROWS)
+PLAN = (TABLE1, TABLE2)  # what pages show
+
+# For trials of the machinery: seconds a cell. No page shows it.
+TRIAL = Group(
+    "trial",
+    "Two tiny scenes",
+    ("car-0-tiny", "turntable-0-tiny"),
+    (Row("nearest-view", 2, NOT_TUNED), Row("tfp+stg"), Row("tfp+rig-flat+stg"), Row("spike4dgs-x", 2, OUR_TRIALS)),
+    budget="0.1",
+)
+
+
+def cells_of(groups: Sequence[Group]) -> list[Cell]:
+    """Return the cells of groups, each once, in the order in which they are fitted.
+
+    First comes seed 0 of every row, row by row, each over all scenes of all groups that have it.
+    """
+    found: dict[Cell, tuple[int, int]] = {}
+    for group in groups:
+        for place, row in enumerate(group.rows):
+            for seed in range(row.seeds):
+                for scene in group.scenes:
+                    found.setdefault(Cell(row, scene, seed, group.budget, group.split), (seed, place))
+    return sorted(found, key=found.__getitem__)
+
+
+def knowledge_of(method: Method) -> str:
+    """Return the block of tables that a method belongs to, by what it is given of a scene."""
+    return CALIBRATED if "flat-field" in getattr(method, "given", DEFAULT_GIVEN) else UNCALIBRATED

@@ -1,0 +1,73 @@
+"""The plan has every row and cell once, what matters most first, and knowledge by recipe."""
+
+from __future__ import annotations
+
+import pytest
+
+from spike4dgs.baselines.images.published.makers import MAKERS
+from spike4dgs.benchmark.method import find_methods, make_budget
+from spike4dgs.benchmark.reports.paper_tables import published
+from spike4dgs.generators.make_dataset import SceneSettings, track_jobs
+from spike4dgs.studies.results.plan import (
+    CALIBRATED,
+    PLAN,
+    TABLE1,
+    TABLE2,
+    TRIAL,
+    UNCALIBRATED,
+    Group,
+    cells_of,
+    knowledge_of,
+)
+
+METHODS = find_methods()
+MOTIONS = ("4dgs", "stg", "d3dgs")
+ABOUT = {
+    CALIBRATED: {"spike4dgs", "spike4dgs-x"}
+    | {f"{images}+rig-flat+{motion}" for images in ("tfi", "tfp", "spk2img", "adaptive") for motion in MOTIONS},
+    UNCALIBRATED: {"dy-spikegs", "dy-spikenerf", "tfp+static", "nearest-view", "spike4dgs-x+self-calibrated"}
+    | {f"{images}+{motion}" for images in ("tfi", "tfp", "spk2img") for motion in MOTIONS}
+    | {f"{maker.name}+{motion}" for maker in MAKERS for motion in ("stg", "4dgs")},
+}
+
+
+@pytest.mark.parametrize("group", [*PLAN, TRIAL], ids=lambda g: g.name)
+def test_every_row_is_a_method_and_stands_once(group: Group) -> None:
+    names = [row.name for row in group.rows]
+    assert len(names) == len(set(names)) and set(names) <= set(METHODS)
+    assert all(row.seeds in (1, 2, 3) and row.tuned_on for row in group.rows)
+    make_budget(group.budget)
+
+
+@pytest.mark.parametrize("group", PLAN, ids=lambda g: g.name)
+def test_the_blocks_of_the_tables_follow_from_the_recipes(group: Group) -> None:
+    for knowledge, names in ABOUT.items():
+        assert {row.name for row in group.rows if knowledge_of(METHODS[row.name]) == knowledge} == names
+
+
+def test_a_calibrated_row_is_one_whose_recipe_is_given_flat_fields() -> None:
+    assert knowledge_of(METHODS["tfp+rig-flat+stg"]) == CALIBRATED
+    assert knowledge_of(METHODS["tfp+stg"]) == UNCALIBRATED
+    assert knowledge_of(METHODS["tfp+4dgs+spike"]) == CALIBRATED, "its loss knows the cameras' response"
+
+
+def test_the_scenes_are_those_of_the_track() -> None:
+    for group, number in ((TABLE1, 1), (TABLE2, 2)):
+        jobs = track_jobs("ideal", published(number).worlds, SceneSettings())
+        assert group.scenes == tuple(job.id for job in jobs)
+    assert len({*TABLE1.scenes, *TABLE2.scenes}) == 9
+
+
+def test_cells_stand_once_and_what_matters_most_comes_first() -> None:
+    cells, nine = cells_of(PLAN), {*TABLE1.scenes, *TABLE2.scenes}
+    assert len(cells) == len(set(cells)) == 9 * sum(row.seeds for row in TABLE1.rows)
+    assert cells_of([*PLAN, *PLAN]) == cells
+    order = [(cells[k].row.name, cells[k].seed) for k in range(0, len(cells), 9)]
+    for k in range(0, len(cells), 9):
+        assert {cell.scene for cell in cells[k : k + 9]} == nine
+        assert len({(cell.row, cell.seed) for cell in cells[k : k + 9]}) == 1
+    first = ["spike4dgs-x", "tfp+rig-flat+stg", "tfp+stg", "tfp+4dgs", "spk2img+stg", "spike4dgs"]
+    first += ["adaptive+rig-flat+stg", "tfp+rig-flat+4dgs", "spk2img+rig-flat+stg"]
+    assert [name for name, _ in order[:9]] == first
+    assert [seed for _, seed in order] == sorted(seed for _, seed in order)
+    assert {name for name, seed in order if seed == 2} >= {"spike4dgs-x", "spike4dgs", "tfp+rig-flat+stg", "tfp+stg"}
