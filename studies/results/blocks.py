@@ -1,0 +1,215 @@
+"""The text of pages that is made of records: tables, leads, and what stands behind them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+from spike4dgs.benchmark.files import sha256_json
+from spike4dgs.benchmark.method import make_budget
+from spike4dgs.method.recipes import METHODS as OURS
+from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
+from spike4dgs.studies.results.plan import KNOWLEDGE, ROWS, TABLE1, TABLE2, Group, cells_of
+from spike4dgs.studies.results.records import DIGITS, Record
+
+NOTHING = "No cell of this table has been measured yet."
+NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ROWS)
+_HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
+_LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
+_LEGEND = (
+    "Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a "
+    "95 % interval of the paired difference over scenes, which holds for all rows of a block at once. Times in "
+    "parentheses were measured beside other programs."
+)
+
+
+def table_block(group: Group, records: Sequence[Record]) -> list[str]:
+    """Return the lines of a group's table: a block for each knowledge, means over scenes, ranks with ties."""
+    own = of_group(group, records)
+    if not own:
+        return [NOTHING]
+    lines = []
+    for knowledge, rows, ranking in _blocks(group, own):
+        lines += [f"**{knowledge.capitalize()}**: {KNOWLEDGE[knowledge]}. Means of {len(group.scenes)} scenes.", ""]
+        if ranking.rows:
+            lines += [*markdown(_HEADS, _cells(ranking)), ""]
+        lines += _incomplete(rows, own)
+    return [*lines, _LEGEND, "", provenance(group, own)]
+
+
+def scenes_block(group: Group, records: Sequence[Record]) -> list[str]:
+    """Return the lines of a group's table scene by scene: PSNR where things move, and of the whole image."""
+    own = of_group(group, records)
+    if not own:
+        return [NOTHING]
+    lines = []
+    for knowledge, rows, ranking in _blocks(group, own):
+        ranked = [*ranking.rows, *(row for row in rows if not row.is_complete)]
+        texts = [[f"`{row.name}`", *(_of_scene(row, scene) for scene in group.scenes)] for row in ranked]
+        heads = ("row", *(scene.partition("-")[0] for scene in group.scenes))
+        title = f"**{knowledge.capitalize()}**: PSNR where things move / of the whole image, dB, means over seeds."
+        lines += [title, "", *markdown(heads, texts), ""]
+    return [*lines, provenance(group, own)]
+
+
+def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
+    """Return a sentence for each row of ours: its lead over the best other row that is given as much."""
+    own = of_group(group, records)
+    ours = {row.name for row in group.rows if row.ours}
+    sentences = []
+    for knowledge, rows, _ in _blocks(group, own):
+        rivals = [row for row in rows if row.is_complete and row.name not in ours]
+        for row in rows:
+            if row.is_complete and row.name in ours and rivals:
+                sentences.append(f"- `{row.name}`, {knowledge}: {_lead_text(row, rivals)}.")
+    if not sentences:
+        return [NOTHING]
+    intro = (
+        f"Against the best row of others with equal knowledge, in the mean of {len(group.scenes)} scenes. After ± is "
+        "half of a 95 % interval of the paired difference over scenes:"
+    )
+    return [intro, "", *sentences, "", provenance(group, own)]
+
+
+BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
+    "lead": lambda records: lead_block(NINE, records),
+    "nine-scenes": lambda records: table_block(NINE, records),
+    "table1": lambda records: table_block(TABLE1, records),
+    "table1-scenes": lambda records: scenes_block(TABLE1, records),
+    "table2": lambda records: table_block(TABLE2, records),
+    "table2-scenes": lambda records: scenes_block(TABLE2, records),
+}
+
+
+def of_group(group: Group, records: Iterable[Record]) -> list[Record]:
+    """Return the records of a group's cells, failed ones too."""
+    budget, names = make_budget(group.budget).label, {row.name for row in group.rows}
+    return [
+        r
+        for r in records
+        if r["row"] in names and r["scene"] in group.scenes and (r["budget"], r["split"]) == (budget, group.split)
+    ]
+
+
+def _blocks(group: Group, own: Sequence[Record]) -> list[tuple[str, list[MeasuredRow], Ranking]]:
+    """Return each knowledge with its rows, in the plan's order, and the ranking of the complete ones."""
+    found = []
+    for knowledge in KNOWLEDGE:
+        records = [r for r in own if r["knowledge"] == knowledge]
+        there = {r["row"] for r in records}
+        rows = rows_of([row.name for row in group.rows if row.name in there], group.scenes, records)
+        if rows:
+            found.append((knowledge, rows, rank([row for row in rows if row.is_complete])))
+    return found
+
+
+def _cells(ranking: Ranking) -> list[list[str]]:
+    parts = zip(ranking.rows, ranking.behind, ranking.half_widths, ranking.ranks, strict=True)
+    return [
+        [
+            ranks,
+            f"`{row.name}`",
+            _text(row.mean(RANKED_BY), 2),
+            "" if row is ranking.rows[0] else _interval(behind, half),
+            _text(row.mean("psnr"), 2),
+            _text(row.mean("ssim"), 4),
+            _text(row.mean("flip"), 3),
+            _time(row, "fit_seconds"),
+            _time(row, "render_fps"),
+            str(len(row.seeds)),
+        ]
+        for row, behind, half, ranks in parts
+    ]
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _interval(value: float, half: float) -> str:
+    return f"{value:.2f} ± {half:.2f}" if math.isfinite(half) else f"{value:.2f}"
+
+
+def _time(row: MeasuredRow, name: str) -> str:
+    text = _text(row.mean_cost(name), 0)
+    return text if row.is_quiet or text == "-" else f"({text})"
+
+
+def _of_scene(row: MeasuredRow, scene: str) -> str:
+    cells = [r["metrics"] for (s, _), r in row.cells.items() if s == scene]
+    means = []
+    for metric in (RANKED_BY, "psnr"):
+        known = [m[metric] for m in cells if metric in m]
+        means.append(_text(sum(known) / len(known) if known else None, 2))
+    return " / ".join(means) if cells else "-"
+
+
+def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:
+    parts = []
+    for metric, where in _LEADS:
+        if (found := lead(row, rivals, metric)) is not None:
+            size = _interval(abs(found.difference), found.half_width)
+            if not found.is_significant:
+                parts.append(f"even with `{found.rival}` {where} ({_interval(found.difference, found.half_width)} dB)")
+            else:
+                side = "ahead of" if found.difference > 0 else "behind"
+                parts.append(f"{size} dB {side} `{found.rival}` {where}")
+    return ", and ".join(parts)
+
+
+def _incomplete(rows: Sequence[MeasuredRow], own: Iterable[Record]) -> list[str]:
+    """Return a paragraph about the rows that are not ranked."""
+    reasons = {r["row"]: r["error"] for r in own if r["error"] is not None}
+    texts = []
+    for row in rows:
+        if not row.is_complete:
+            reason = f": {reasons[row.name]}" if row.name in reasons else ""
+            texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{reason})")
+    return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
+
+
+def provenance(group: Group, own: Sequence[Record]) -> str:
+    """Return one paragraph: commits, scenes, processors, seeds, budget, how many of the planned cells, tuning."""
+    measured = [r for r in own if r["error"] is None]
+    seeds = sorted({r["seed"] for r in measured})
+    scenes = {r["scene"]: r["revision"] for r in own}
+    planned = len(cells_of([group]))
+    commits = sorted({_commit(r) for r in own})
+    facts = [
+        f"Commit{'s' * (len(commits) > 1)} {', '.join(commits)}",
+        f"revisions of {len(scenes)} scenes {sha256_json(scenes)[:DIGITS]}",
+        " and ".join(sorted({r["cpu"] for r in own})),
+        f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds)) or '-'}",
+        f"budget {group.budget}",
+        f"{len(measured)} of {planned} planned cells",
+    ]
+    return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own)])
+
+
+def _commit(record: Record) -> str:
+    return f"{record['commit']}{' with changes' if record.get('dirty') else ''}"
+
+
+def _mixed_code(own: Iterable[Record]) -> list[str]:
+    """Return a sentence that names the rows of each commit where the methods' code differs between them."""
+    codes: dict[bool, set[str]] = {True: set(), False: set()}
+    by_commit: dict[str, dict[str, None]] = {}
+    for r in own:
+        codes[r["row"] in OURS].add(r["code"])  # digests of methods in `method` leave the baselines out
+        by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
+    if all(len(found) <= 1 for found in codes.values()):
+        return []
+    texts = [f"{commit}: {', '.join(rows)}" for commit, rows in by_commit.items()]
+    return [f"**The methods' code differs**: {'; '.join(texts)}."]
+
+
+def _tuning(own: Iterable[Record]) -> str:
+    """Return a sentence on what the rows were tuned on; those of the most common answer are "the others"."""
+    rows: dict[str, list[str]] = {}
+    for name, on in sorted({(r["row"], r["tuned_on"]) for r in own}):
+        rows.setdefault(on, []).append(f"`{name}`")
+    common = max(rows, key=lambda on: len(rows[on]))
+    order = sorted(rows, key=lambda on: (on == common, on))
+    texts = [f"{on} ({'the others' if on == common and len(rows) > 1 else ', '.join(rows[on])})" for on in order]
+    return f"Tuned on: {'; '.join(texts)}."

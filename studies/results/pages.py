@@ -1,0 +1,53 @@
+"""The pages with generated blocks: what stands between `<!-- records: NAME -->` and `<!-- end records -->`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import write_text
+from spike4dgs.studies.results.blocks import BLOCKS
+from spike4dgs.studies.results.records import Record
+
+BLOCK = re.compile(r"^<!-- records: (?P<name>[a-z0-9-]+) -->\n.*?^<!-- end records -->$", re.MULTILINE | re.DOTALL)
+_MARKER = re.compile(r"^<!-- (?:records: .*|end records) -->$", re.MULTILINE)
+
+
+def pages_of(root: Path) -> list[Path]:
+    """Return the pages of a checkout that figures of quality stand on."""
+    return [root / "README.md", *sorted((root / "docs" / "results").glob("*.md"))]
+
+
+def with_blocks(text: str, records: Sequence[Record], where: Path | str) -> str:
+    """Return the text of a page with every block made of the records.
+
+    Raises UserError for a block that is not known, and for a marker without its partner.
+    """
+
+    def made(found: re.Match[str]) -> str:
+        name = found["name"]
+        if name not in BLOCKS:
+            raise problem(where, f"a block among {', '.join(BLOCKS)}", repr(name), "correct the marker")
+        return "\n".join([f"<!-- records: {name} -->", *BLOCKS[name](records), "<!-- end records -->"])
+
+    replaced = BLOCK.sub(made, text)
+    if len(_MARKER.findall(text)) != 2 * len(BLOCK.findall(text)):
+        raise problem(where, "a marker `end records` below each marker `records`", "another number", "correct the page")
+    return replaced
+
+
+def outdated(root: Path, records: Sequence[Record]) -> list[Path]:
+    """Return the pages whose blocks are not what the records give."""
+    return [
+        page for page in pages_of(root) if with_blocks(text := page.read_text("utf-8"), records, page) != text
+    ]  # fmt: skip
+
+
+def write_pages(root: Path, records: Sequence[Record]) -> list[Path]:
+    """Write the blocks of all pages anew, and return the pages that changed."""
+    changed = outdated(root, records)
+    for page in changed:
+        write_text(page, with_blocks(page.read_text("utf-8"), records, page))
+    return changed
