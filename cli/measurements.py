@@ -20,6 +20,11 @@ MEASUREMENTS: dict[str, Command] = {
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
         "report oracle-ladder data/car-0-small --out runs/oracle",
     ),
+    "report results": Command(
+        "spike4dgs.cli.studies:results",
+        "measure what the published tables show, and write them from the records",
+        "report results --scenes-of data/ideal",
+    ),
     "report scene-noise": Command(
         "spike4dgs.cli.studies:scene_noise",
         "tabulate the rendering noise of audited scenes, and the ceilings of their scores",

@@ -9,6 +9,7 @@ from spike4dgs.studies.oracle_ladder import oracle_ladder as oracle_ladder
 from spike4dgs.studies.patterns import patterns as patterns
 from spike4dgs.studies.poses import poses as poses
 from spike4dgs.studies.recorder import record as record
+from spike4dgs.studies.results.command import results as results
 from spike4dgs.studies.saved_models import render as render
 from spike4dgs.studies.scene_noise import scene_noise as scene_noise
 from spike4dgs.studies.second_renderer.command import second_renderer as second_renderer

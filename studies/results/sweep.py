@@ -1,0 +1,184 @@
+"""Fit and score the cells of the plan, and keep a record of each.
+
+OUT/CODE/predictions/METHOD/SCENE/, OUT/CODE/work/ and so on are as `run-benchmark` keeps them, for each digest CODE of
+the methods' code: what a killed sweep had fitted is found again by the same code alone. Cells with a record are done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from spike4dgs.benchmark.environment import cpu_name
+from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import locked, remove_parts
+from spike4dgs.benchmark.method import Method, get_method, make_budget
+from spike4dgs.benchmark.metrics.measure import select_metrics
+from spike4dgs.benchmark.runs.apart.fit import Apart
+from spike4dgs.benchmark.runs.cell import Job
+from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_cells
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
+from spike4dgs.leaderboard.entry import typical_fit_seconds
+from spike4dgs.studies.results.code_state import CodeState, code_digest
+from spike4dgs.studies.results.plan import Cell, knowledge_of
+from spike4dgs.studies.results.records import (
+    DIGITS,
+    METRICS,
+    Key,
+    Record,
+    key_of,
+    read_records,
+    scores_of,
+    write_row,
+)
+
+DEVICE = "cpu"  # of every published number
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """Where a sweep reads and writes, and how long it goes on."""
+
+    scenes_of: Path  # the folder that holds the scene folders
+    records: Path
+    out: Path
+    workers: int = 1
+    limit_hours: float | None = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Cells that a sweep left: without a record, and with one that has no metrics."""
+
+    left: int
+    failed: tuple[str, ...]
+
+
+def sweep(
+    cells: Sequence[Cell], methods: Mapping[str, Method], state: CodeState, settings: SweepSettings, console: Console
+) -> Outcome:
+    """Measure the cells that have no record yet, in their order.
+
+    In a quiet pass those whose record is of a busy one are fitted again, for their times. A cell that fails has a
+    record that says why, and is tried again by the next sweep. Raises UserError for damaged scenes, where another sweep
+    runs, and where the code changes meanwhile.
+    """
+    if settings.quiet and settings.workers > 1:
+        raise problem("--quiet", "one worker, which has the machine to itself", "--workers", "leave one of them out")
+    scenes = _open(cells, settings.scenes_of, console)
+    with ExitStack() as held:
+        for folder in (settings.records, settings.out):
+            lock = folder / ".lock"
+            held.enter_context(locked(lock, folder, "a folder that no other sweep uses", temporary=True))
+            remove_parts(folder)
+        records = read_records(settings.records)
+        _check_revisions(scenes.values(), records.values())
+        here = [cell for cell in cells if cell.scene in scenes]
+        todo = [cell for cell in here if not _is_done(records.get(_key(cell)), settings.quiet)]
+        console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
+        codes = {name: code_digest(name) for name in dict.fromkeys(cell.row.name for cell in here)}
+        _say_other_code(here, records, codes, console)
+        _measure(todo, scenes, methods, codes, state, settings, records, console)
+        failed = [r for r in map(records.get, map(_key, here)) if r and r["error"] is not None]
+        left = sum(_key(cell) not in records for cell in cells)
+        return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
+
+
+def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[str, Scene]:
+    """Open the scenes of the plan that are there, and check what a fit reads of them."""
+    scenes: dict[str, Scene] = {}
+    wanted = {cell.scene: cell.split for cell in cells}
+    for name, split in wanted.items():
+        if (folder / name).is_dir():
+            scenes[name] = open_scene(folder / name, split=split)
+            check_inputs(scenes[name])
+    missing = [name for name in wanted if name not in scenes]
+    if not scenes:
+        fix = "spike4dgs make-dataset --track ideal --out DIR, and --scenes-of DIR"
+        raise problem(folder, f"scenes of the plan, such as {next(iter(wanted), 'car-0-small')}", "none", fix)
+    if missing:
+        console.print(f"not in {folder}, left out: {', '.join(missing)}")
+    return scenes
+
+
+def _check_revisions(scenes: Iterable[Scene], records: Iterable[Record]) -> None:
+    known = {record["scene"]: record["revision"] for record in records}
+    for scene in scenes:
+        if known.get(scene.id, scene.revision[:DIGITS]) != scene.revision[:DIGITS]:
+            fix = "use that scene, or move the records elsewhere and measure every row anew"
+            raise problem(scene.root, f"revision {known[scene.id]}, as in the records", scene.revision[:DIGITS], fix)
+
+
+def _key(cell: Cell) -> Key:
+    return cell.row.name, cell.scene, cell.seed, make_budget(cell.budget).label, cell.split
+
+
+def _is_done(record: Record | None, quiet: bool) -> bool:
+    return record is not None and record["error"] is None and (record["quiet"] or not quiet)
+
+
+def _say_other_code(
+    cells: Iterable[Cell], records: Mapping[Key, Record], codes: Mapping[str, str], console: Console
+) -> None:
+    kept = {r["row"] for r in map(records.get, map(_key, cells)) if r and r["code"] != codes[r["row"]]}
+    if kept:
+        names = ", ".join(sorted(kept))
+        console.print(f"kept, measured by other code: {names}; remove a row's file to measure it anew", markup=False)
+
+
+def _measure(
+    todo: Sequence[Cell],
+    scenes: Mapping[str, Scene],
+    methods: Mapping[str, Method],
+    codes: Mapping[str, str],
+    state: CodeState,
+    settings: SweepSettings,
+    records: dict[Key, Record],
+    console: Console,
+) -> None:
+    """Fit and score the cells, and write each into its row's file and into `records` at once."""
+    jobs = [
+        JobFiles(
+            Job(get_method(cell.row.name, methods), scenes[cell.scene], cell.seed, DEVICE, make_budget(cell.budget)),
+            settings.out / codes[cell.row.name] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
+            settings.quiet,  # its times are of one whole fit
+            Apart(),
+        )
+        for cell in todo
+    ]
+    start, selection = time.monotonic(), select_metrics().among(METRICS)
+    shared = Settings(settings.out, workers=settings.workers)
+    with RunDisplay(console, len(jobs), [cell.row.name for cell in todo], typical_fit_seconds()) as display:
+        for k, scored in run_cells(jobs, shared, selection, display):
+            cell, job = todo[k], jobs[k].job
+            if (found := code_digest(cell.row.name)) != codes[cell.row.name]:
+                fix = "start again; a sweep needs a checkout that nobody edits"
+                raise problem("the methods' code", codes[cell.row.name], f"{found}: it changed meanwhile", fix)
+            record: Record = {
+                "row": cell.row.name,
+                "scene": cell.scene,
+                "revision": job.scene.revision[:DIGITS],
+                "seed": cell.seed,
+                "budget": job.budget.label,
+                "split": cell.split,
+                "commit": state.commit,
+                **({"dirty": True} if state.dirty else {}),
+                "code": found,
+                "tuned_on": cell.row.tuned_on,
+                "knowledge": knowledge_of(job.method),
+                **scores_of(scored[0]),
+                "quiet": settings.quiet,
+                "cpu": cpu_name(),
+            }
+            records[key_of(record)] = record
+            write_row(settings.records, cell.row.name, records.values())
+            if settings.limit_hours is not None and time.monotonic() - start > 3600 * settings.limit_hours:
+                display.say(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
+                return

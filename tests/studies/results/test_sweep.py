@@ -1,0 +1,178 @@
+"""The sweep: a killed one goes on where it was, failed cells are tried again, times count in quiet passes alone."""
+
+from __future__ import annotations
+
+import io
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import dummy_methods
+import pytest
+from dummy_methods import CountMethod, FailingMethod, WaitingMethod, wait_for
+from rich.console import Console
+from small_scenes import write_small_scene
+
+from spike4dgs import baselines, benchmark, method
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Method
+from spike4dgs.benchmark.runs.method_code import sources_sha256
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.studies.results import code_state as states
+from spike4dgs.studies.results.code_state import CodeState, check_clean, code_digest, code_state
+from spike4dgs.studies.results.command import results
+from spike4dgs.studies.results.plan import Cell, Group, Row, cells_of
+from spike4dgs.studies.results.records import key_of, read_records, write_row
+from spike4dgs.studies.results.sweep import Outcome, SweepSettings, sweep
+
+STATE = CodeState("0123456789ab", False)
+
+
+def cells(*rows: str, scenes: tuple[str, ...] = ("pattern-0",), seeds: int = 1) -> list[Cell]:
+    group = Group("made", "Made", scenes, tuple(Row(name, seeds, "not tuned") for name in rows))
+    return cells_of([group])
+
+
+def swept(
+    folder: Path, planned: list[Cell], methods: Mapping[str, Method], **settings: Any
+) -> tuple[Outcome, dict[Any, Any], str]:
+    """Sweep in a folder that holds the scenes; return the outcome, the records and what was said."""
+    said = io.StringIO()
+    where = SweepSettings(folder, folder / "records", folder / "out", **settings)
+    outcome = sweep(planned, methods, STATE, where, Console(file=said, width=200, highlight=False))
+    return outcome, read_records(folder / "records"), said.getvalue()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_small_scene(tmp_path / "pattern-0")
+    return tmp_path
+
+
+KILLED = """
+import sys; sys.path[:0] = sys.argv[1:3]
+from pathlib import Path
+from dummy_methods import CountMethod, WaitingMethod
+from test_sweep import cells, swept
+folder = Path(sys.argv[3])
+swept(folder, cells("quick", "waits"), {"quick": CountMethod("quick"), "waits": WaitingMethod("waits", folder)})
+"""
+
+
+def test_a_killed_sweep_goes_on_where_it_was_and_repeats_nothing(folder: Path) -> None:
+    here, support = Path(__file__).parent, Path(dummy_methods.__file__).parent
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(support), str(here), str(folder)])
+    wait_for(lambda: (folder / "begun").exists() or process.poll() is not None)
+    process.kill()
+    assert process.wait(60) == -signal.SIGKILL
+    kept = read_records(folder / "records")
+    assert [key[0] for key in kept] == ["quick"]
+    assert not list((folder / "records").glob("*.part*"))
+    (folder / "go").touch()
+    planned, waits = cells("quick", "waits"), WaitingMethod("waits", folder)
+    outcome, records, said = swept(folder, planned, {"quick": CountMethod("quick"), "waits": waits})
+    assert "2 cells planned, 1 measured, 1 to measure" in said
+    assert outcome == Outcome(0, ())
+    assert records.items() >= kept.items() and [key[0] for key in records] == ["quick", "waits"]
+    assert not (folder / "records" / ".lock").exists()
+    before = (folder / "records/quick.json").stat().st_mtime_ns
+    assert "0 to measure" in swept(folder, planned, {"quick": CountMethod("quick"), "waits": waits})[2]
+    assert (folder / "records/quick.json").stat().st_mtime_ns == before
+
+
+def test_a_record_says_what_was_measured_of_what(folder: Path) -> None:
+    where = SweepSettings(folder, folder / "records", folder / "out")
+    changed = CodeState(STATE.commit, True)
+    sweep(cells("counts"), {"counts": CountMethod("counts")}, changed, where, Console(file=io.StringIO()))
+    (record,) = read_records(folder / "records").values()
+    assert record["dirty"] is True
+    scene = open_scene(folder / "pattern-0")
+    assert key_of(record) == ("counts", "pattern-0", 0, 1.0, "center")
+    assert scene.revision.startswith(record["revision"]) and record["commit"] == STATE.commit
+    assert (record["tuned_on"], record["knowledge"], record["quiet"]) == ("not tuned", "calibrated", False)
+    assert {"psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip", "temporal_error"} <= set(record["metrics"])
+    predictions = list((folder / "out").rglob("*.exr"))
+    assert len(predictions) == 3 and predictions[0].is_relative_to(folder / "out" / record["code"])
+
+
+def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
+    planned = cells("bad", "good")
+    methods = {"bad": FailingMethod("bad", ValueError("no luck")), "good": CountMethod("good")}
+    outcome, records, _ = swept(folder, planned, methods)
+    assert outcome.left == 0 and "bad on pattern-0, seed 0: ValueError: no luck" in outcome.failed[0]
+    failed = next(r for r in records.values() if r["row"] == "bad")
+    assert failed["metrics"] == {} and "no luck" in failed["error"]
+    outcome, records, said = swept(folder, planned, {**methods, "bad": CountMethod("bad")})
+    assert "1 to measure" in said and not outcome.failed
+    assert all(r["error"] is None for r in records.values())
+
+
+def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -> None:
+    (planned,), methods = cells("counts"), {"counts": CountMethod("counts")}
+    _, busy, _ = swept(folder, [planned], methods)
+    _, quiet, said = swept(folder, [planned], methods, quiet=True)
+    (before,), (after,) = busy.values(), quiet.values()
+    assert "1 to measure" in said and "fitted anew" in said and after["quiet"] and not before["quiet"]
+    assert after["metrics"] == before["metrics"]
+    assert "0 to measure" in swept(folder, [planned], methods, quiet=True)[2]
+    with pytest.raises(UserError, match="--quiet: expected one worker"):
+        swept(folder, [planned], methods, quiet=True, workers=2)
+
+
+def test_a_limit_of_time_begins_no_further_cell_and_scenes_may_be_missing(folder: Path) -> None:
+    planned = cells("a", "b", scenes=("pattern-0", "pattern-1"))
+    methods = {"a": CountMethod("a"), "b": CountMethod("b")}
+    outcome, records, said = swept(folder, planned, methods, limit_hours=0.0)
+    assert [key[0] for key in records] == ["a"] and outcome.left == 3
+    assert "left out: pattern-1" in said and "no further cell" in said
+    with pytest.raises(UserError, match="expected scenes of the plan, such as pattern-7, found none"):
+        swept(folder, cells("a", scenes=("pattern-7",)), methods)
+
+
+def test_records_of_other_code_are_kept_and_named_and_those_of_another_scene_refused(folder: Path) -> None:
+    (planned,), methods = cells("a"), {"a": CountMethod("a"), "b": CountMethod("b")}
+    _, records, _ = swept(folder, [planned], methods)
+    write_row(folder / "records", "a", [{**r, "code": "ffffffffffff"} for r in records.values()])
+    assert "kept, measured by other code: a;" in swept(folder, [planned], methods)[2]
+    write_row(folder / "records", "a", [{**r, "revision": "ffffffffffff"} for r in records.values()])
+    with pytest.raises(UserError, match="expected revision ffffffffffff, as in the records"):
+        swept(folder, cells("b"), methods)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A git checkout with a page and a module of a method."""
+    for name in ("docs/results/page.md", "method/a.py", "studies/results/plan.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("1\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@example.org"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
+        subprocess.run([*git, *command], check=True)
+    return tmp_path
+
+
+def test_code_that_is_not_committed_is_refused_unless_told(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_clean(code_state(checkout), False)
+    (checkout / "docs/results/page.md").write_text("2\n")
+    (checkout / "studies/results/records").mkdir()
+    (checkout / "studies/results/records/a.json").write_text("{}")
+    assert not code_state(checkout).dirty, "records and pages are no code"
+    for name in ("method/a.py", "method/new.py", "studies/results/plan.py"):
+        before = (checkout / name).read_text() if (checkout / name).exists() else None
+        (checkout / name).write_text("3\n")
+        assert code_state(checkout).dirty, name
+        (checkout / name).unlink() if before is None else (checkout / name).write_text(before)
+    (checkout / "method/a.py").write_text("3\n")
+    monkeypatch.setattr(states, "ROOT", checkout)
+    with pytest.raises(UserError, match="found changes that are not committed; commit it, or pass --allow-dirty"):
+        results()
+    check_clean(code_state(checkout), True)
+
+
+def test_a_method_of_ours_does_not_change_with_the_baselines() -> None:
+    ours, rooms = code_digest("spike4dgs-x"), [benchmark, method, baselines]
+    assert sources_sha256(rooms[:2]).startswith(ours) and ours != code_digest("tfp+stg")
+    assert sources_sha256(rooms).startswith(code_digest("tfp+stg")) and len(ours) == 12
