@@ -87,16 +87,16 @@ def _cells(choice: Choice) -> list[Cell]:
     if unknown := [name for name in choice.only if name not in known]:
         raise problem("--only", f"groups among {', '.join(known)}", ", ".join(unknown), "correct the names")
     cells = cells_of([known[name] for name in choice.only] or PLAN)
-    rows = dict.fromkeys(cell.row.name for cell in cells)
+    rows = dict.fromkeys(cell.row for cell in cells)
     if unknown := [name for name in choice.rows if name not in rows]:
         raise problem("--rows", f"rows among {', '.join(rows)}", ", ".join(unknown), "correct the names")
-    return [cell for cell in cells if not choice.rows or cell.row.name in choice.rows]
+    return [cell for cell in cells if not choice.rows or cell.row in choice.rows]
 
 
 def _write(root: Path, records: list[Record]) -> None:
     for page in write_pages(root, records):
         print(f"written: {page.relative_to(root)}")
-    tighten(counts(root))
+    tighten(root, counts(root))
 
 
 def _check(root: Path, records: list[Record]) -> int:
@@ -104,7 +104,7 @@ def _check(root: Path, records: list[Record]) -> int:
     for page in pages_of(root):
         for line, figure in loose_figures(page.read_text("utf-8")):
             print(f"{page.relative_to(root)}:{line}: {figure}")
-    found, most = counts(root), read_ratchet()
+    found, most = counts(root), read_ratchet(root)
     for name, count in found.items():
         print(f"{name}: {count} figures outside generated blocks, {most.get(name, 0)} allowed")
     wrong = [f"{page.relative_to(root)}: its blocks are not what the records give" for page in outdated(root, records)]

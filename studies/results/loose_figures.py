@@ -12,7 +12,7 @@ from pathlib import Path
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.studies.results.pages import BLOCK, pages_of
 
-RATCHET = Path(__file__).with_name("loose_figures.json")
+_RATCHET = Path("studies", "results", "loose_figures.json")  # in a checkout
 _FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 _NUMBER = r"\d+(?:\.\d+)?"
 _DECIBELS = re.compile(rf"(?:{_NUMBER}(?:\s*(?:,|/|-|and|to|or)\s*))*{_NUMBER}\s+dB\b")  # "7.8 and 7.1 dB" are two
@@ -58,14 +58,14 @@ def risen(found: Mapping[str, int], most: Mapping[str, int]) -> list[str]:
     ]
 
 
-def read_ratchet() -> dict[str, int]:
-    """Return the most loose figures that each page may have."""
-    return read_json(RATCHET, "the ratchet of loose figures")
+def read_ratchet(root: Path) -> dict[str, int]:
+    """Return the most loose figures that each page of a checkout may have."""
+    return read_json(root / _RATCHET, "the ratchet of loose figures")
 
 
-def tighten(found: Mapping[str, int]) -> None:
+def tighten(root: Path, found: Mapping[str, int]) -> None:
     """Write the counts into the ratchet where they have fallen."""
-    most = read_ratchet()
+    most = read_ratchet(root)
     lower = {page: min(count, found.get(page, 0)) for page, count in most.items()}
     if (kept := {page: count for page, count in lower.items() if count}) != most:
-        write_json(RATCHET, kept)
+        write_json(root / _RATCHET, kept)

@@ -7,7 +7,7 @@ from its recipe (`knowledge_of`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, DEFAULT_GIVEN, Method
 from spike4dgs.benchmark.reports.paper_tables import published
@@ -51,11 +51,12 @@ class Group:
 class Cell:
     """A fit of the plan: a row on a scene with a seed."""
 
-    row: Row
+    row: str
     scene: str
     seed: int
     budget: str
     split: str
+    tuned_on: str = field(compare=False)
 
 
 def track_scenes(track: str, worlds: Iterable[str]) -> tuple[str, ...]:
@@ -127,7 +128,8 @@ def cells_of(groups: Sequence[Group]) -> list[Cell]:
         for place, row in enumerate(group.rows):
             for seed in range(row.seeds):
                 for scene in group.scenes:
-                    found.setdefault(Cell(row, scene, seed, group.budget, group.split), (seed, place))
+                    cell = Cell(row.name, scene, seed, group.budget, group.split, row.tuned_on)
+                    found.setdefault(cell, (seed, place))
     return sorted(found, key=found.__getitem__)
 
 

@@ -18,6 +18,7 @@ FORMAT = "spike4dgs-cells/1"
 METRICS = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip", "lpips_alex", "lpips_vgg", "temporal_error")
 COSTS = ("fit_seconds", "render_fps", "peak_memory_mb")
 DIGITS = 12  # of hashes in records
+FAILED = "failed"  # the beginning of an error; the other is "skipped", such as for weights that are not there
 _MOST_ERROR = 300  # characters
 
 
@@ -32,7 +33,7 @@ def scores_of(cell: Scored) -> Record:
     return {
         "metrics": {name: _short(value) for name, value in metrics.items()},
         **{name: None if (value := cell[name]) is None else _short(value) for name in COSTS},
-        "error": None if cell["error"] is None else str(cell["error"])[:_MOST_ERROR],
+        "error": None if cell["status"] == "ok" else f"{cell['status']}: {cell['error']}"[:_MOST_ERROR],
     }
 
 

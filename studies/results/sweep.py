@@ -29,6 +29,7 @@ from spike4dgs.studies.results.code_state import CodeState, code_digest
 from spike4dgs.studies.results.plan import Cell, knowledge_of
 from spike4dgs.studies.results.records import (
     DIGITS,
+    FAILED,
     METRICS,
     Key,
     Record,
@@ -55,7 +56,7 @@ class SweepSettings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Cells that a sweep left: without a record, and with one that has no metrics."""
+    """Cells that a sweep left: how many have no record, and a line for each that failed. Skipped ones are neither."""
 
     left: int
     failed: tuple[str, ...]
@@ -83,10 +84,10 @@ def sweep(
         here = [cell for cell in cells if cell.scene in scenes]
         todo = [cell for cell in here if not _is_done(records.get(_key(cell)), settings.quiet)]
         console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
-        codes = {name: code_digest(name) for name in dict.fromkeys(cell.row.name for cell in here)}
+        codes = {name: code_digest(name) for name in dict.fromkeys(cell.row for cell in here)}
         _say_other_code(here, records, codes, console)
         _measure(todo, scenes, methods, codes, state, settings, records, console)
-        failed = [r for r in map(records.get, map(_key, here)) if r and r["error"] is not None]
+        failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
 
@@ -117,7 +118,7 @@ def _check_revisions(scenes: Iterable[Scene], records: Iterable[Record]) -> None
 
 
 def _key(cell: Cell) -> Key:
-    return cell.row.name, cell.scene, cell.seed, make_budget(cell.budget).label, cell.split
+    return cell.row, cell.scene, cell.seed, make_budget(cell.budget).label, cell.split
 
 
 def _is_done(record: Record | None, quiet: bool) -> bool:
@@ -146,8 +147,8 @@ def _measure(
     """Fit and score the cells, and write each into its row's file and into `records` at once."""
     jobs = [
         JobFiles(
-            Job(get_method(cell.row.name, methods), scenes[cell.scene], cell.seed, DEVICE, make_budget(cell.budget)),
-            settings.out / codes[cell.row.name] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
+            Job(get_method(cell.row, methods), scenes[cell.scene], cell.seed, DEVICE, make_budget(cell.budget)),
+            settings.out / codes[cell.row] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
             settings.quiet,  # its times are of one whole fit
             Apart(),
         )
@@ -155,14 +156,14 @@ def _measure(
     ]
     start, selection = time.monotonic(), select_metrics().among(METRICS)
     shared = Settings(settings.out, workers=settings.workers)
-    with RunDisplay(console, len(jobs), [cell.row.name for cell in todo], typical_fit_seconds()) as display:
+    with RunDisplay(console, len(jobs), [cell.row for cell in todo], typical_fit_seconds()) as display:
         for k, scored in run_cells(jobs, shared, selection, display):
             cell, job = todo[k], jobs[k].job
-            if (found := code_digest(cell.row.name)) != codes[cell.row.name]:
+            if (found := code_digest(cell.row)) != codes[cell.row]:
                 fix = "start again; a sweep needs a checkout that nobody edits"
-                raise problem("the methods' code", codes[cell.row.name], f"{found}: it changed meanwhile", fix)
+                raise problem("the methods' code", codes[cell.row], f"{found}: it changed meanwhile", fix)
             record: Record = {
-                "row": cell.row.name,
+                "row": cell.row,
                 "scene": cell.scene,
                 "revision": job.scene.revision[:DIGITS],
                 "seed": cell.seed,
@@ -171,14 +172,14 @@ def _measure(
                 "commit": state.commit,
                 **({"dirty": True} if state.dirty else {}),
                 "code": found,
-                "tuned_on": cell.row.tuned_on,
+                "tuned_on": cell.tuned_on,
                 "knowledge": knowledge_of(job.method),
                 **scores_of(scored[0]),
                 "quiet": settings.quiet,
                 "cpu": cpu_name(),
             }
             records[key_of(record)] = record
-            write_row(settings.records, cell.row.name, records.values())
+            write_row(settings.records, cell.row, records.values())
             if settings.limit_hours is not None and time.monotonic() - start > 3600 * settings.limit_hours:
                 display.say(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
                 return

@@ -19,6 +19,7 @@ from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.weights import WeightsError
 
 
 class CountModel:
@@ -113,6 +114,13 @@ class FailingMethod(CountMethod):
 
     def render(self, camera: Camera, t_us: float) -> Any:
         return self._result
+
+
+class WeightlessMethod(CountMethod):
+    """Lacks the weights that it would fit with."""
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> CountModel:
+        raise WeightsError("net.safetensors: expected weights, found no such file; fetch them", "no weights")
 
 
 # Also the state of the checkout, which somebody may change while the tests run.

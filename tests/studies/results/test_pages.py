@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 from made_records import record
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.studies.results import code_state, loose_figures
+from spike4dgs.studies.results import code_state
 from spike4dgs.studies.results.blocks import NOTHING
-from spike4dgs.studies.results.code_state import ROOT
 from spike4dgs.studies.results.command import results
-from spike4dgs.studies.results.loose_figures import counts, read_ratchet, risen
+from spike4dgs.studies.results.loose_figures import counts, loose_figures, read_ratchet, risen
 from spike4dgs.studies.results.pages import outdated, with_blocks, write_pages
 from spike4dgs.studies.results.plan import TABLE1
 from spike4dgs.studies.results.records import read_records, write_row
 
+ROOT = Path(__file__).resolve().parents[3]
 PAGE = "Words.\n\n<!-- records: table1 -->\nanything\n<!-- end records -->\n\nIt is 3 dB better.\n"
 
 
@@ -27,7 +26,7 @@ def test_every_block_of_the_checkout_is_what_the_records_give() -> None:
 
 
 def test_no_page_has_more_loose_figures_than_it_had() -> None:
-    assert risen(counts(ROOT), read_ratchet()) == [], "make the figures from records, or take them out of the text"
+    assert risen(counts(ROOT), read_ratchet(ROOT)) == [], "make the figures from records, or take them out of the text"
 
 
 def test_blocks_are_replaced_and_nothing_else() -> None:
@@ -65,39 +64,37 @@ def test_broken_markers_are_refused(text: str, message: str) -> None:
     ],
 )
 def test_loose_figures_are_decibels_and_two_decimals_in_tables(text: str, expected: list[tuple[int, str]]) -> None:
-    assert list(loose_figures.loose_figures(text)) == expected
+    assert list(loose_figures(text)) == expected
 
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with one page, and a ratchet of its own."""
+    """A checkout with one page and a ratchet."""
     (tmp_path / "docs" / "results").mkdir(parents=True)
     (tmp_path / "docs/results/page.md").write_text(PAGE)
     (tmp_path / "README.md").write_text("Nothing.\n")
-    shutil.copy(loose_figures.RATCHET, tmp_path / "ratchet.json")
+    (tmp_path / "studies" / "results").mkdir(parents=True)
+    (tmp_path / "studies/results/loose_figures.json").write_text('{"docs/results/page.md": 2, "README.md": 1}')
     monkeypatch.setattr(code_state, "ROOT", tmp_path)
-    monkeypatch.setattr(loose_figures, "RATCHET", tmp_path / "ratchet.json")
     return tmp_path
 
 
 def test_the_command_checks_and_writes_and_its_ratchet_only_falls(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ratchet, page = checkout / "ratchet.json", checkout / "docs/results/page.md"
-    ratchet.write_text('{"docs/results/page.md": 2, "README.md": 1}')
-    records = checkout / "records"
+    page, records = checkout / "docs/results/page.md", checkout / "records"
     write_row(records, "spike4dgs-x+self-calibrated", [record(scene=scene) for scene in TABLE1.scenes])
     assert results(check=True, records=records) == 1
     shown = capsys.readouterr()
     assert "docs/results/page.md:7: 3\n" in shown.out and "page.md: 1 figures outside generated blocks, 2" in shown.out
     assert "docs/results/page.md: its blocks are not what the records give" in shown.err
     assert results(write=True, records=records) == 0 and "`spike4dgs-x+self-calibrated`" in page.read_text()
-    assert read_ratchet() == {"docs/results/page.md": 1}
+    assert read_ratchet(checkout) == {"docs/results/page.md": 1}
     assert results(check=True, records=records) == 0
     page.write_text(page.read_text() + "And 4 dB.\n")
     assert results(check=True, write=True, records=records) == 1
     assert "more figures outside generated blocks: docs/results/page.md: 2, 1 allowed" in capsys.readouterr().err
-    assert read_ratchet() == {"docs/results/page.md": 1}
+    assert read_ratchet(checkout) == {"docs/results/page.md": 1}
 
 
 def test_pages_are_written_where_they_change_alone(checkout: Path) -> None:

@@ -11,8 +11,9 @@ from made_records import record
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.record import missing_cell
-from spike4dgs.studies.results.code_state import ROOT
 from spike4dgs.studies.results.records import key_of, measured, read_records, scores_of, write_row
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_records_come_back_and_a_row_has_one_file(tmp_path: Path) -> None:
@@ -28,10 +29,11 @@ def test_records_come_back_and_a_row_has_one_file(tmp_path: Path) -> None:
 
 
 def test_a_failed_cell_has_its_reason_and_no_metrics(tmp_path: Path) -> None:
-    scores = scores_of(missing_cell("failed", "no weights " * 100))
+    scores = scores_of(missing_cell("skipped", "no weights " * 100))
     failed = record(**scores)
     write_row(tmp_path, failed["row"], [failed])
     assert scores["metrics"] == {} and scores["fit_seconds"] is None and len(scores["error"]) == 300
+    assert scores["error"].startswith("skipped: no weights no")
     assert measured(read_records(tmp_path)) == []
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import dummy_methods
 import pytest
-from dummy_methods import CountMethod, FailingMethod, WaitingMethod, wait_for
+from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, wait_for
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -99,15 +99,16 @@ def test_a_record_says_what_was_measured_of_what(folder: Path) -> None:
 
 
 def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
-    planned = cells("bad", "good")
-    methods = {"bad": FailingMethod("bad", ValueError("no luck")), "good": CountMethod("good")}
+    planned = cells("bad", "weightless")
+    methods = {"bad": FailingMethod("bad", ValueError("no luck")), "weightless": WeightlessMethod("weightless")}
     outcome, records, _ = swept(folder, planned, methods)
-    assert outcome.left == 0 and "bad on pattern-0, seed 0: ValueError: no luck" in outcome.failed[0]
+    assert len(outcome.failed) == 1, "a cell that lacks weights is skipped"
+    assert outcome.left == 0 and "bad on pattern-0, seed 0: failed: ValueError: no luck" in outcome.failed[0]
     failed = next(r for r in records.values() if r["row"] == "bad")
     assert failed["metrics"] == {} and "no luck" in failed["error"]
     outcome, records, said = swept(folder, planned, {**methods, "bad": CountMethod("bad")})
-    assert "1 to measure" in said and not outcome.failed
-    assert all(r["error"] is None for r in records.values())
+    assert "2 to measure" in said and not outcome.failed
+    assert {r["row"]: (r["error"] or "ok")[:7] for r in records.values()} == {"bad": "ok", "weightless": "skipped"}
 
 
 def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -> None:
