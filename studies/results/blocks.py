@@ -14,6 +14,7 @@ from spike4dgs.studies.results.plan import KNOWLEDGE, ROWS, TABLE1, TABLE2, Grou
 from spike4dgs.studies.results.records import DIGITS, Record
 
 NOTHING = "No cell of this table has been measured yet."
+NO_LEAD = "No row of ours and another with equal knowledge have been measured on all scenes yet."
 NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ROWS)
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
@@ -64,7 +65,7 @@ def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
             if row.is_complete and row.name in ours and rivals:
                 sentences.append(f"- `{row.name}`, {knowledge}: {_lead_text(row, rivals)}.")
     if not sentences:
-        return [NOTHING]
+        return [NO_LEAD if own else NOTHING]
     intro = (
         f"Against the best row of others with equal knowledge, in the mean of {len(group.scenes)} scenes. After ± is "
         "half of a 95 % interval of the paired difference over scenes:"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from spike4dgs.studies.results.blocks import BLOCKS, NINE, NOTHING, lead_block, scenes_block, table_block
+from spike4dgs.studies.results.blocks import BLOCKS, NINE, NO_LEAD, NOTHING, lead_block, scenes_block, table_block
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.plan import TABLE2, Group, Row
 
@@ -107,7 +107,7 @@ def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
     assert "calibrated: 1.05 ± 0.18 dB behind `a` where things move, and" in sentence(-6)
     assert "`c`" not in sentence(0) and "tfp+stg" not in sentence(0)
     nobody = [r for r in made() if r["row"] in (OURS, "tfp+stg", "c")]
-    assert lead_block(GROUP, nobody) == [NOTHING]
+    assert lead_block(GROUP, nobody) == [NO_LEAD] and lead_block(GROUP, []) == [NOTHING]
 
 
 @pytest.mark.parametrize("scenes", [4, 9])

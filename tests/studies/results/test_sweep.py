@@ -23,7 +23,7 @@ from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.studies.results import code_state as states
 from spike4dgs.studies.results.code_state import CodeState, check_clean, code_digest, code_state
-from spike4dgs.studies.results.command import results
+from spike4dgs.studies.results.command import Choice, results
 from spike4dgs.studies.results.plan import Cell, Group, Row, cells_of
 from spike4dgs.studies.results.records import key_of, read_records, write_row
 from spike4dgs.studies.results.sweep import Outcome, SweepSettings, sweep
@@ -62,6 +62,7 @@ swept(folder, cells("quick", "waits"), {"quick": CountMethod("quick"), "waits": 
 """
 
 
+@pytest.mark.slow  # three runs, each with processes that fit
 def test_a_killed_sweep_goes_on_where_it_was_and_repeats_nothing(folder: Path) -> None:
     here, support = Path(__file__).parent, Path(dummy_methods.__file__).parent
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(support), str(here), str(folder)])
@@ -141,6 +142,32 @@ def test_records_of_other_code_are_kept_and_named_and_those_of_another_scene_ref
     write_row(folder / "records", "a", [{**r, "revision": "ffffffffffff"} for r in records.values()])
     with pytest.raises(UserError, match="expected revision ffffffffffff, as in the records"):
         swept(folder, cells("b"), methods)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (Choice(only=("table9",)), "--only: expected groups among table1, table2, trial, found table9"),
+        (Choice(only=("trial",), rows=("tfi+stg", "tfp+stg")), "--rows: expected rows among nearest-view, .*tfi.stg;"),
+        (
+            Choice(only=("trial",), scenes_of=Path("nowhere")),
+            "nowhere: expected scenes of the plan, such as car-0",
+        ),
+    ],
+)
+def test_what_is_not_there_is_named_before_anything_is_fitted(
+    choice: Choice, message: str, checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(states, "ROOT", checkout)
+    with pytest.raises(UserError, match=message):
+        results(choice=choice)
+    assert not (checkout / "studies/results/records").exists()
+
+
+def test_an_installation_without_a_checkout_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(states, "ROOT", tmp_path)
+    with pytest.raises(UserError, match="expected a checkout with its docs"):
+        results()
 
 
 @pytest.fixture
