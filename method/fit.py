@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import DEFAULT_GIVEN, FitRequest, Model, Recipe, no_progress
@@ -21,14 +18,21 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.light import Light, light_of
-from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.images.recorded import Recorded, RecordedImages, warm_up_images, without_spikes
+from spike4dgs.method.images.training import (
+    ImageSettings,
+    choose_ticks,
+    make_training_images,
+    recorded_training_images,
+    wanted_images,
+)
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.dark_drift import in_todays_dark
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
-from spike4dgs.method.starts.base import Initialization, Start, StartRequest
+from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, measure
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
@@ -110,7 +114,11 @@ class RecipeMethod(Shown):
             self.params["refinement"] = asdict(REFINEMENT)
         corrected = [getattr(self.settings[part], FLAT_FIELD, False) for part in ("images", "initialization")]
         calibrated = any(corrected) or self.initialization.calibrated or self.algorithm.calibrated
-        self.given = tuple(name for name, used in zip(DEFAULT_GIVEN, (not posed, calibrated), strict=True) if used)
+        given = [name for name, used in zip(DEFAULT_GIVEN, (not posed, calibrated), strict=True) if used]
+        self.given = (*given, *self.images.given)
+        if isinstance(self.images, RecordedImages) and (calibrated or not self.initialization.from_recorded):
+            expected, named = "parts that take nothing of spikes", f"{recipe.initialization}, {recipe.supervision}"
+            raise problem(f"recipe {self.name}", expected, named, "change them, or the images")
         self.description = description or describe(recipe, parts, self.algorithm)
         self.trained_on: tuple[str, ...] = ()
         if learned := self.images.learned():
@@ -140,9 +148,14 @@ class RecipeMethod(Shown):
         check_device(request.device)
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
+        recorded = None
+        if isinstance(self.images, RecordedImages):
+            scene = without_spikes(scene)
+            recorded = self.images.read(scene, choose_ticks(scene.n_ticks, settings["images"]))
         scene = as_pinholes(in_todays_dark(scene))
-        start = self.initialization.start(StartRequest(scene, request.seed, settings["initialization"], request.device))
-        return self._fit(scene, start, settings, request)
+        own = settings["initialization"]
+        start = self.initialization.start(StartRequest(scene, request.seed, own, request.device, recorded))
+        return self._fit(scene, start, settings, request, recorded)
 
     def warm_up(self, request: FitRequest) -> None:
         """Compile what the images, the fit and the rendering of this recipe run, on a made scene; once a process."""
@@ -152,22 +165,43 @@ class RecipeMethod(Shown):
         request.progress(0, 1, "compilation")
         scene, *points = warm_up_scene()
         start = Start(scene.cameras, *points)
+        recorded = warm_up_images(scene) if isinstance(self.images, RecordedImages) else None
+        quiet = FitRequest(device=request.device, progress=no_progress)
         with kept_random_state(request.device):
-            model = self._fit(
-                scene, start, short(self.settings), FitRequest(device=request.device, progress=no_progress)
-            )
+            model = self._fit(scene, start, short(self.settings), quiet, recorded)
             model.render(scene.cameras[0], scene.duration_us / 2)
         self._warm.add(request.device)
 
-    def _fit(self, scene: TrainingScene, start: Start, settings: Mapping[str, Any], request: FitRequest) -> Model:
-        """Fit from given cameras and points."""
+    def _fit(
+        self,
+        scene: TrainingScene,
+        start: Start,
+        settings: Mapping[str, Any],
+        request: FitRequest,
+        recorded: Recorded | None = None,
+    ) -> Model:
+        """Fit from given cameras and points, and images of other sensors where the recipe has these."""
         request.progress(0, 1, "images")
-        maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
-        light = light_of(scene) if maker.knows_light else None
-        images = make_training_images(scene, start.cameras, maker, settings["images"], request.device, light)
+        light, algorithm = None, self.algorithm
+        if recorded:
+            images = recorded_training_images(scene, start.cameras, recorded, request.device)
+            if len(images.ticks) == 1 and self.recipe.motion not in self.parts.algorithms:
+                print(f"{scene.id}: one image of each camera shows no motion: a static model", file=sys.stderr)
+                algorithm, settings = self._static(settings)
+        else:
+            maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
+            light = light_of(scene) if maker.knows_light else None
+            images = make_training_images(scene, start.cameras, maker, settings["images"], request.device, light)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
         extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
-        return self.algorithm.fit(FitJob(scene, start, images, extent, settings, request, key, light))
+        return algorithm.fit(FitJob(scene, start, images, extent, settings, request, key, light))
+
+    def _static(self, settings: Mapping[str, Any]) -> tuple[Algorithm, Mapping[str, Any]]:
+        """Return the recipe's algorithm with the motion `static`, and settings with as many steps in all."""
+        trainer, algorithm = settings["trainer"], trainer_algorithm(replace(self.recipe, motion="static"), self.parts)
+        steps = trainer.coarse_steps + trainer.fine_steps
+        own = {"motion": algorithm.settings["motion"], "trainer": replace(trainer, coarse_steps=steps)}
+        return algorithm, {**settings, **own}
 
     def _for(self, request: FitRequest) -> dict[str, Settings]:
         """Return the settings with the step counts of a request's budget."""
@@ -257,37 +291,9 @@ def fit_gaussians(
     )
 
 
-def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
-    """Return the points [N, 3] and gray values [N] of a start, or a random choice of as many as a fit may have."""
-    points, values = start.points, start.values
-    if len(points) <= count:
-        return points, values
-    kept = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
-    return points[kept], values[kept]
-
-
 def _part(table: Mapping[str, T], recipe: Recipe, part: str) -> T:
     """Return the entry that a recipe names for a part. Raises UserError with the table's names."""
     name = getattr(recipe, part)
     if name not in table:
         raise problem(f"recipe {recipe.name}", f"{part} among {', '.join(sorted(table))}", repr(name), "correct it")
     return table[name]
-
-
-def measure(start: Start, scene: TrainingScene) -> Extent:
-    """Return the scene's box and size, from the points seen and not only from the array, small beside the scene.
-
-    The box holds 98 % of the points on each axis and a margin of a tenth. Size: the larger of 1.1 x the array's radius
-    (3DGS) and half the points' median distance.
-    """
-    centers = np.stack([c.center for c in start.cameras])
-    middle = centers.mean(axis=0)
-    low, high = np.quantile(start.points, [0.01, 0.99], axis=0)
-    margin = 0.1 * (high - low) + 1e-3 * float((high - low).max())
-    distance = float(np.median(np.linalg.norm(start.points - middle, axis=1)))
-    scale = max(1.1 * float(np.linalg.norm(centers - middle, axis=1).max()), 0.5 * distance)
-
-    def tensor(a: NDArray[np.float64]) -> Tensor:
-        return torch.as_tensor(a, dtype=torch.float32)
-
-    return Extent(tensor(low - margin), tensor(high + margin), scale, scene.n_ticks, start.cameras[0].width)

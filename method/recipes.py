@@ -25,7 +25,9 @@ from spike4dgs.method.tuned import tuned
 PARTS = Parts(
     images={maker.name: maker for maker in (ADAPTIVE, INTERVALS, MSDI)},
     initialization={
-        "rig": Initialization(lambda r: rig(r.scene, r.settings), RigSettings(), label=""),
+        "rig": Initialization(
+            lambda r: rig(r.scene, r.settings, r.recorded), RigSettings(), label="", from_recorded=True
+        ),
         "msdi": Initialization(
             lambda r: msdi(r.scene, r.settings, r.device), MsdiSettings(), label="points by MSDI", calibrated=True
         ),

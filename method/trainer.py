@@ -137,7 +137,7 @@ class Trainer:
         tick, images = training.ticks[index], training.measured(index)[views]
         if self.corrections:
             images = images + self.corrections.at(index, views)
-        return Sample(tick / training.n_ticks, tick, tuple(views), images, self.step)
+        return Sample(tick / training.n_ticks, tick, tuple(views), images, self.step, training.exposure_ticks)
 
     def _choose(self, stage: Stage, step: int) -> tuple[int, list[int]]:
         times, count = self.training_images.images.shape[:2]

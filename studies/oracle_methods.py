@@ -32,7 +32,8 @@ from spike4dgs.method.images.training import choose_ticks
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.paths import Paths
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
-from spike4dgs.method.starts.rig import Cloud, CloudSettings, cells_of, filled, window_means
+from spike4dgs.method.starts.clip import window_means
+from spike4dgs.method.starts.rig import Cloud, CloudSettings, cells_of, filled
 from spike4dgs.method.training_views.pinholes import as_pinholes
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.studies.oracle_truth import Surfaces, Truth

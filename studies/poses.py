@@ -20,9 +20,10 @@ from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.msdi.pose import solve_poses
+from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.matching import match_and_solve
 from spike4dgs.method.starts.msdi import DEFAULTS, infer, matched_poses
-from spike4dgs.method.starts.rig import rig, window_means
+from spike4dgs.method.starts.rig import rig
 from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
 from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
 from spike4dgs.studies.kit.timing import show_table

@@ -21,7 +21,8 @@ import numpy as np
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.starts.base import Start
-from spike4dgs.method.starts.rig import RigSettings, rig, swept, window_means
+from spike4dgs.method.starts.clip import SpikeClip, window_means
+from spike4dgs.method.starts.rig import RigSettings, rig, swept
 from spike4dgs.method.starts.structure_from_motion import FeatureSettings, clip_means, map_views
 
 WHO = "COLMAP"
@@ -48,5 +49,6 @@ def colmap(scene: TrainingScene, seed: int, settings: ColmapSettings = DEFAULTS)
         return rig(replace(scene, cameras=found.cameras), settings)
     found = map_views(scene, clip_means(scene), seed, settings).of_all(scene, WHO)
     if len(found.points) < settings.min_points:
-        return swept(replace(scene, cameras=found.cameras), settings, flat_field=False)
+        posed = replace(scene, cameras=found.cameras)
+        return swept(posed, settings, SpikeClip(posed, settings.window_ticks, flat_field=False))
     return Start(found.cameras, found.points.astype(np.float32), found.values)

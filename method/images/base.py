@@ -72,6 +72,7 @@ class ImageMaker(Shown):
     knows_light: bool = False  # `rate` and `rate_over` take `light`, see `images.light`; else they take it as steady
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
     label: str | None = None  # in descriptions of recipes, after "images"; None: the name
+    given: tuple[str, ...] = ()  # of `benchmark.method.GIVEN`, what the images are made of if not of spikes
 
     def _about(self) -> str:
         return f"{self.name}: {self.definition}"

@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.trains import spike_trains
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.light import Light
+from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
@@ -66,6 +67,15 @@ def make_training_images(
     return TrainingImages(
         Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, spans
     )
+
+
+def recorded_training_images(
+    scene: TrainingScene, cameras: Sequence[Camera], recorded: Recorded, device: str
+) -> TrainingImages:
+    """Return images of other sensors as `cameras` see them; `cameras` are pinholes."""
+    images = torch.from_numpy(undistorted(scene, recorded.images)).to(device)
+    views = Views.from_cameras(cameras, device=device)
+    return TrainingImages(views, recorded.ticks, images, scene.n_ticks, exposure_ticks=recorded.exposure_ticks)
 
 
 def make_images(

@@ -19,6 +19,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.starts.clip import SpikeClip
 from spike4dgs.method.starts.rig import PointSettings, look_up, matched
 
 LEAST_RADIANCE = 0.02  # of a point, white is 1: a few spikes say little of a ratio
@@ -37,7 +38,8 @@ def from_recordings(scene: TrainingScene) -> Float64 | None:
 
 def between_views(scene: TrainingScene) -> Float64 | None:
     """Return the gains [C], mean 1, from what the cameras show of the same points; None where they share too few."""
-    cloud, means = matched(scene, PointSettings(), flat_field=False)
+    settings = PointSettings()
+    cloud, means = matched(scene, settings, SpikeClip(scene, settings.window_ticks, flat_field=False))
     smooth = [cv2.blur(image, (3, 3)) for image in means]  # a pose that is off by a pixel matters less
     seen = np.stack([look_up(c, m, cloud.points) for c, m in zip(scene.cameras, smooth, strict=True)])
     bright = np.nanmin(np.where(np.isfinite(seen), seen, np.inf), axis=0) > LEAST_RADIANCE

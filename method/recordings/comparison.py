@@ -45,9 +45,9 @@ def compare(
 ) -> Comparison:
     """Return the model's images of the training cameras beside those made from their spikes.
 
-    Those are the recipe's own; `other` makes them for a method that is no recipe.
+    Those are the recipe's own; `other` makes them for a method that is no recipe, or one of other sensors.
     """
-    recipe = method if isinstance(method, RecipeMethod) else None
+    recipe = method if isinstance(method, RecipeMethod) and not method.images.given else None
     maker = recipe.recipe.images if recipe else other.name
     make = recipe.images if recipe else other
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]

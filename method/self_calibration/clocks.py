@@ -28,8 +28,8 @@ from spike4dgs.method.self_calibration.clock_fit import (
 )
 from spike4dgs.method.self_calibration.clock_search import SearchSettings, search_offsets
 from spike4dgs.method.self_calibration.patches import viewers
+from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.plane_sweep import find_range
-from spike4dgs.method.starts.rig import window_means
 from spike4dgs.method.training_views.pinholes import as_pinholes
 
 LEAST_CAMERAS = 3  # with two, another depth looks like another time

@@ -12,7 +12,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.self_calibration.clocks import with_camera
 from spike4dgs.method.self_calibration.pose_adjustment import Adjusted, AdjustSettings, adjust, find_tracks
-from spike4dgs.method.starts.rig import window_means
+from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 
 Float32 = np.typing.NDArray[np.float32]

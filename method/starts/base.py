@@ -1,4 +1,4 @@
-"""The initialisation part of a recipe, as a fit sees it: a request, and a start."""
+"""The initialisation part of a recipe, as a fit sees it: a request, a start, and what a fit takes of it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.images.recorded import Recorded
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.settings import Settings
 
 
@@ -29,6 +36,7 @@ class StartRequest:
     seed: int
     settings: Any  # the initialisation's own, as the recipe overrides them
     device: str = "cpu"  # of the fit
+    recorded: Recorded | None = None  # images of other sensors, of recipes that take nothing of the spikes
 
 
 @dataclass(frozen=True)
@@ -43,3 +51,32 @@ class Initialization:
     label: str | None = None  # in descriptions of recipes; None: the name
     estimates_poses: bool = False  # those given serve for nothing but the frame
     calibrated: bool = False  # takes the cameras' calibrations, whether `flat_field` or not
+    from_recorded: bool = False  # takes images of other sensors where a recipe has some
+
+
+def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:
+    """Return the points [N, 3] and gray values [N] of a start, or a random choice of as many as a fit may have."""
+    points, values = start.points, start.values
+    if len(points) <= count:
+        return points, values
+    kept = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
+    return points[kept], values[kept]
+
+
+def measure(start: Start, scene: TrainingScene) -> Extent:
+    """Return the scene's box and size, from the points seen and not only from the array, small beside the scene.
+
+    The box holds 98 % of the points on each axis and a margin of a tenth. Size: the larger of 1.1 x the array's radius
+    (3DGS) and half the points' median distance.
+    """
+    centers = np.stack([c.center for c in start.cameras])
+    middle = centers.mean(axis=0)
+    low, high = np.quantile(start.points, [0.01, 0.99], axis=0)
+    margin = 0.1 * (high - low) + 1e-3 * float((high - low).max())
+    distance = float(np.median(np.linalg.norm(start.points - middle, axis=1)))
+    scale = max(1.1 * float(np.linalg.norm(centers - middle, axis=1).max()), 0.5 * distance)
+
+    def tensor(a: NDArray[np.float64]) -> Tensor:
+        return torch.as_tensor(a, dtype=torch.float32)
+
+    return Extent(tensor(low - margin), tensor(high + margin), scale, scene.n_ticks, start.cameras[0].width)

@@ -35,8 +35,9 @@ from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.clip import SpikeClip, window_means
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
-from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched, window_means
+from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched
 from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
@@ -85,7 +86,7 @@ def msdi(scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = 
 
 
 def _given(scene: TrainingScene, estimate: Estimate, settings: MsdiSettings) -> Start:
-    cloud, mean = matched(scene, settings, flat_field=True)
+    cloud, mean = matched(scene, settings, SpikeClip(scene, settings.window_ticks, flat_field=True))
     return filled(scene, completed(cloud, estimate, settings), mean, settings)
 
 

@@ -4,7 +4,8 @@ Static pixels are matched on the mean of the whole clip, where the spikes' quant
 that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
 ends those that are quiet just then, which is the background that something moving hides in the middle.
 
-With `flat_field` every image is corrected by its camera's calibrated gain and dark rate, where a scene has them.
+With `flat_field` every image is corrected by its camera's calibrated gain and dark rate, where a scene has them. A
+recipe of other sensors has their images in the place of spikes (`clip`).
 """
 
 from __future__ import annotations
@@ -12,20 +13,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from spike4dgs.benchmark.arrays import Float32, Mask
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.clip import Clip, ImageClip, SpikeClip
 from spike4dgs.method.starts.plane_sweep import (
     DepthMap,
     SweepSettings,
@@ -38,8 +37,7 @@ from spike4dgs.method.starts.plane_sweep import (
     widest_baseline,
 )
 from spike4dgs.method.starts.surrounding import looked_at, points_inside
-from spike4dgs.method.training_views.changes import COUNTS, changing, without_specks
-from spike4dgs.method.training_views.pinholes import nearest_pixels, seen_pixels, undistorted
+from spike4dgs.method.training_views.pinholes import seen_pixels
 
 
 @dataclass(frozen=True)
@@ -77,45 +75,43 @@ class Cloud:
     values: Float32
 
 
-def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS) -> Start:
-    """Return the calibrated poses and first points of a scene; see the module.
+def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS, recorded: Recorded | None = None) -> Start:
+    """Return the calibrated poses and first points of a scene, from `recorded` images where a recipe has some.
 
     Raises UserError where all cameras have one centre.
     """
-    return swept(scene, settings, settings.flat_field)
+    length = settings.window_ticks
+    clip = ImageClip(scene, recorded, length) if recorded else SpikeClip(scene, length, settings.flat_field)
+    return swept(scene, settings, clip)
 
 
-def swept(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> Start:
-    """Return the same, with corrected images or not; for cameras around their subject see `surrounding`."""
+def swept(scene: TrainingScene, settings: PointSettings, clip: Clip) -> Start:
+    """Return the same from a clip; for cameras around their subject see `surrounding`."""
     if (ball := looked_at(scene.cameras)) is not None:
-        mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
+        mean = clip.mean()
         points = points_inside(ball, scene.cameras)
         seen = np.stack([look_up(c, m, points) for c, m in zip(scene.cameras, mean, strict=True)])
         known = np.isfinite(seen).any(axis=0)
         values = np.nanmedian(seen[:, known], axis=0)
         return Start(scene.cameras, points[known].astype(np.float32), values.astype(np.float32))
-    return filled(scene, *matched(scene, settings, flat_field), settings)
+    return filled(scene, *matched(scene, settings, clip), settings)
 
 
-def matched(scene: TrainingScene, settings: PointSettings, flat_field: bool) -> tuple[Cloud, Float32]:
+def matched(scene: TrainingScene, settings: PointSettings, clip: Clip) -> tuple[Cloud, Float32]:
     """Return the points on which views agree, thinned, and the means of the clip [C, H, W]; raises as `rig`."""
     if len(scene.cameras) < 2 or widest_baseline(scene.cameras) == 0:
         found = f"{len(scene.cameras)} at one position"
         raise problem(f"scene {scene.id}", "training cameras apart from each other", found, "use another split")
-    mean = _marked(scene, window_means(scene, 0, scene.n_ticks, flat_field))
-    windows = _windows(scene.n_ticks, settings.window_ticks)
-    moving = _moving_pixels(scene, windows)
+    mean, moving = clip.mean(), clip.moving()
     planes = find_range(scene.cameras, mean, settings)
     maps = sweep_all(scene.cameras, mean, planes, settings=settings)
     seen = seen_pixels(scene)
     static = [~m & s for m, s in zip(moving, seen, strict=True)] if seen else [~m for m in moving]
     clouds = [_points(scene.cameras, maps, mean, static, settings)]
-    middle, last = len(windows) // 2, len(windows) - 1
+    middle, last = len(clip) // 2, len(clip) - 1
     for at in sorted({0, middle, last}) if any(m.any() for m in moving) else ():
-        start, stop = windows[at]
-        images = _marked(scene, window_means(scene, start, stop, flat_field))
-        near = windows[max(0, at - 1) : at + 2]
-        quiet = [~m | (at == middle) for m in _moving_pixels(scene, near)]
+        images = clip.mean(at)
+        quiet = [~m | (at == middle) for m in clip.moving(slice(max(0, at - 1), at + 2))]
         short = sweep_all(scene.cameras, images, planes, moving, settings)
         pixels = [m & q for m, q in zip(moving, quiet, strict=True)]
         clouds.append(_points(scene.cameras, short, images, pixels, settings))
@@ -127,66 +123,6 @@ def filled(scene: TrainingScene, cloud: Cloud, mean: Float32, settings: CloudSet
     """Return the start from a cloud, filled where the image is empty, with gray of the clip's means [C, H, W]."""
     cloud = fill(scene.cameras, mean, cloud, settings)
     return Start(scene.cameras, cloud.points.astype(np.float32), cloud.values.astype(np.float32))
-
-
-def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) -> Float32:
-    """Return the mean radiance [C, H, W] of all views in a window."""
-    clocks = zip(scene.streams, _clocks(scene), strict=True)
-    rates = np.stack([_rate(s, *local_window(clock, start, stop, s.n_ticks)) for s, clock in clocks])
-    if flat_field and scene.calibrations:
-        means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
-    else:
-        means = rates / np.float32(scene.radiance_gain)
-    return undistorted(scene, means, unseen=None)
-
-
-def _marked(scene: TrainingScene, images: Float32) -> Float32:
-    """Return images [C, H, W] with -1 where a view sees nothing: the plane sweep takes that as outside of the image."""
-    if seen := seen_pixels(scene):
-        images[~np.stack(seen)] = -1
-    return images
-
-
-def _clocks(scene: TrainingScene) -> list[Clock]:
-    return [scene.state(camera.id).clock for camera in scene.cameras]
-
-
-def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
-    """Return mean spikes per tick [H, W]; clips of any length are counted in parts."""
-    parts = range(start, stop, 65535)
-    total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
-    stream.release()
-    return np.asarray(total / (stop - start), np.float32)
-
-
-def _windows(n_ticks: int, length: int) -> list[tuple[int, int]]:
-    count = max(1, n_ticks // length)
-    return [(i * length, min((i + 1) * length, n_ticks)) for i in range(count)]
-
-
-def _moving_pixels(scene: TrainingScene, windows: Sequence[tuple[int, int]]) -> list[Mask]:
-    """Return the pixels [h, w] of each view that move from one window to another; a pixel not seen does not move."""
-    counts = [_extremes(s, clock, windows) for s, clock in zip(scene.streams, _clocks(scene), strict=True)]
-    moving = nearest_pixels(scene, [_moving(c) for c in counts])
-    seen = seen_pixels(scene)
-    return [m & s for m, s in zip(moving, seen, strict=True)] if seen else moving
-
-
-def _extremes(stream: SpikeStream, clock: Clock, windows: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """Return the fewest and the most spikes [2, H, W] of each pixel in a window: all windows' would fill the memory."""
-    found = np.array([np.full((stream.height, stream.width), value) for value in (np.iinfo(np.int64).max, 0)])
-    for a, b in windows:
-        counts = stream.counts(*local_window(clock, a, b, stream.n_ticks))
-        np.minimum(found[0], counts, out=found[0])
-        np.maximum(found[1], counts, out=found[1])
-    stream.release()
-    return found
-
-
-def _moving(counts: NDArray[np.int64]) -> Mask:
-    """Return the pixels [H, W] whose counts [windows, H, W] differ by more than a constant radiance's can."""
-    changed = changing(torch.from_numpy(counts)[:, None], COUNTS)[0].numpy()
-    return cv2.dilate(without_specks(changed), np.ones((3, 3), np.uint8)).astype(bool)
 
 
 def _points(

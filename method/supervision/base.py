@@ -24,6 +24,7 @@ class Sample:
     views: tuple[int, ...]  # indices into the scene's training cameras
     images: Tensor  # [V, H, W] made from the spikes around the tick, 1.0 = white
     step: int  # of the fit: seeds what is random in a loss
+    exposure_ticks: int = 0  # that the images are means over, from tick - exposure_ticks // 2 on; 0: an instant
 
 
 Render = Callable[[float], Tensor]  # t in [0, 1] -> the sample's views at that time, [V, H, W]

@@ -46,6 +46,9 @@ RAYS = ChangeSettings(limit=0.04)
 # Spike counts of the plane sweep's windows. Those of a pixel that sees constant radiance differ by 1.
 COUNTS = ChangeSettings(limit=2, statistic="range")
 
+# The same for images of other sensors, with white = 1: 2 of the 24 spikes of white in such a window.
+RECORDED = ChangeSettings(limit=0.08, statistic="range")
+
 
 def variation(images: Tensor, s: ChangeSettings) -> Tensor:
     """Return how much each pixel varies over time, [C, H, W], from images [T, C, H, W]."""

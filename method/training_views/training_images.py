@@ -41,6 +41,7 @@ class TrainingImages:
     bad: Tensor | None = None  # bool [C, H, W], bad pixels, whose values are a neighbour's; None: there are none
     missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
     spans: Spans | None = None  # of [T, C]; None: the images show instants
+    exposure_ticks: int = 0  # that images of another sensor are means over, from tick - exposure_ticks // 2 on
 
     def measured(self, index: int) -> Tensor:
         """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""

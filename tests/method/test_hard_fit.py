@@ -17,12 +17,12 @@ from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import render
+from spike4dgs.method.starts.base import measure
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 

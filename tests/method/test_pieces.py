@@ -13,7 +13,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import Parts, RecipeMethod, at_most, measure
+from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
@@ -25,7 +25,7 @@ from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.schedule import TrainerSettings, choose_time, stages
 from spike4dgs.method.splat.reference import rotation_matrices
-from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.starts.base import Initialization, Start, at_most, measure
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded

@@ -13,7 +13,6 @@ from toy_fits import SMALL_PLANES, WORLD, images, method, request, silent, surfa
 
 from spike4dgs.baselines.recipes import PARTS as BASELINE_PARTS
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images
@@ -21,6 +20,7 @@ from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
 from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.splat import render
+from spike4dgs.method.starts.base import measure
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.instants import Corrections, correction, node

@@ -11,13 +11,13 @@ from torch import Tensor
 from toy_fits import WORLD, images, method, request, silent, surfaces
 
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.method.fit import measure
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference
+from spike4dgs.method.starts.base import measure
 from spike4dgs.method.supervision.base import Render, Sample
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded

@@ -21,10 +21,10 @@ from spike4dgs.baselines.radiance_field.model import RadianceModel
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest, Progress
-from spike4dgs.method.fit import FitJob, measure
+from spike4dgs.method.fit import FitJob
 from spike4dgs.method.settings import override, scaled
 from spike4dgs.method.splat import Views
-from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=40, height=25, n_ticks=80)

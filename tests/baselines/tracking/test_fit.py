@@ -24,11 +24,11 @@ from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.fit import FitJob, measure
+from spike4dgs.method.fit import FitJob
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
-from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.supervision.pixel import PixelSettings
 from spike4dgs.method.training_views.foreground import foreground_masks
 from spike4dgs.method.training_views.training_images import TrainingImages

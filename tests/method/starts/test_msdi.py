@@ -22,6 +22,7 @@ from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.msdi.weights import VARIABLE, WEIGHTS, Card, load_network
 from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.clip import SpikeClip
 from spike4dgs.method.starts.msdi import (
     Estimate,
     MsdiSettings,
@@ -122,7 +123,7 @@ def test_without_a_rising_line_the_matched_points_are_all(perfect: Estimate) -> 
 def test_the_start_is_that_of_corrected_images_where_views_match(random_network: Path) -> None:
     start, flat = msdi(SCENE), rig(SCENE, RigSettings(flat_field=True))
     assert start.cameras is SCENE.cameras
-    n = len(matched(SCENE, MsdiSettings(), flat_field=True)[0].points)
+    n = len(matched(SCENE, MsdiSettings(), SpikeClip(SCENE, MsdiSettings().window_ticks, flat_field=True))[0].points)
     np.testing.assert_array_equal(start.points[:n], flat.points[:n])
 
 
