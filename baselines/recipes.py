@@ -12,6 +12,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from spike4dgs.baselines.exposure import Exposure
+from spike4dgs.baselines.images.frames import RECORDED
 from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.nearest_view import NearestView
@@ -42,10 +44,10 @@ INITIALIZATIONS = {
     ),
 }
 PARTS = Parts(
-    images=IMAGES,
+    images={**IMAGES, **{maker.name: maker for maker in RECORDED}},
     initialization=INITIALIZATIONS,
     motion={**ours.PARTS.motion, **MOTIONS},
-    supervision={**ours.PARTS.supervision, "spike-render": SpikeRender},
+    supervision={**ours.PARTS.supervision, "spike-render": SpikeRender, "exposure": Exposure},
     algorithms={"tracking": TRACKING, "radiance-field": RADIANCE_FIELD},
 )
 _MOTIONS = {"d3dgs": "tracking", "stg": "spacetime", "4dgs": "hexplane"}
@@ -87,6 +89,15 @@ CALIBRATED = (
         Recipe(f"adaptive+rig-flat+{name}", "adaptive", "rig", _MOTIONS[name], "pixel", FLAT)
         for name in ("d3dgs", "stg")
     ),
+)
+
+# What other sensors at the same positions give: frames, and frames with events. Nothing of the spikes reaches these.
+SENSORS = (
+    Recipe("rgb+stg", "rgb", "rig", "spacetime", "pixel"),
+    Recipe("rgb+4dgs", "rgb", "rig", "hexplane", "pixel"),
+    Recipe("rgb-deblur+stg", "rgb", "rig", "spacetime", "exposure"),
+    Recipe("edi+stg", "edi", "rig", "spacetime", "pixel"),
+    Recipe("edi+4dgs", "edi", "rig", "hexplane", "pixel"),
 )
 
 # Images by networks that other people trained, with their weights.
@@ -134,7 +145,7 @@ METHODS: dict[str, Method] = Table(
     {
         **{
             recipe.name: RecipeMethod(recipe, PARTS)
-            for recipe in (*RECIPES, *CALIBRATED, *PUBLISHED, *SUPERVISED, *POSED, *TUNED)
+            for recipe in (*RECIPES, *CALIBRATED, *SENSORS, *PUBLISHED, *SUPERVISED, *POSED, *TUNED)
         },
         "nearest-view": NearestView("nearest-view", IMAGES["tfp"]),
     },

@@ -60,6 +60,11 @@ class Frames(Sequence[Frame]):
     exposure_us: float
     files: Manifest  # of the scene, with this camera's frames alone
 
+    @property
+    def exposure_ticks(self) -> int:
+        """Ticks that a frame is the mean of: its tick, and those that follow."""
+        return round(self.exposure_us * 1e-6 * self.rate_hz)
+
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.ticks)
