@@ -15,6 +15,11 @@ MEASUREMENTS: dict[str, Command] = {
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
         "report hard-cases --out runs/hard-cases",
     ),
+    "report modality": Command(
+        "spike4dgs.cli.studies:modality",
+        "fit what spike, frame and event cameras record of the same scenes, and plot it against their bits per second",
+        "report modality data/turntable-10-small-100ms --out runs/modality",
+    ),
     "report oracle-ladder": Command(
         "spike4dgs.cli.studies:oracle_ladder",
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",

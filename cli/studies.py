@@ -5,6 +5,7 @@ from __future__ import annotations
 from spike4dgs.studies.faults import fault_table as fault_table
 from spike4dgs.studies.hard_cases import hard_cases as hard_cases
 from spike4dgs.studies.images import images as images
+from spike4dgs.studies.modality.command import modality as modality
 from spike4dgs.studies.oracle_ladder import oracle_ladder as oracle_ladder
 from spike4dgs.studies.patterns import patterns as patterns
 from spike4dgs.studies.poses import poses as poses
