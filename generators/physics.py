@@ -49,6 +49,7 @@ class Physics:
         flicker_duty: share of a period in which an LED is on; 0 is a sine.
         warming_k: temperature of the sensors in the clip above that at calibration.
         reset_noise, read_noise, dead_ticks: see `sensor.model.Sensor`.
+        noisy_others: frame and event cameras have noise, see `other_sensors`; spikes and truth stay the same.
     """
 
     lens: Distortion = ()
@@ -64,6 +65,7 @@ class Physics:
     reset_noise: float = 0.0
     read_noise: float = 0.0
     dead_ticks: float = 0.0
+    noisy_others: bool = False
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -101,6 +103,7 @@ _WORDS = {
     "reset_noise": "reset",
     "read_noise": "read",
     "dead_ticks": "dead",
+    "noisy_others": "others",
 }
 IDEAL, REALISTIC = "ideal", "realistic"
 CAMERAS = {
@@ -133,6 +136,8 @@ class PhysicsOptions:
         reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
         dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
+        noisy_others: Give the frame cameras shot and read noise, and the event cameras unequal thresholds, shot events
+            and a refractory period, as published; spikes and truth do not change.
     """
 
     camera: str = IDEAL
@@ -149,6 +154,7 @@ class PhysicsOptions:
     reset_noise: float | None = None
     read_noise: float | None = None
     dead_ticks: float | None = None
+    noisy_others: bool | None = None
 
     def physics(self) -> Physics:
         """Return the physics. Raises UserError for an unknown camera and for numbers that no camera has."""

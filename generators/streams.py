@@ -5,7 +5,7 @@ One call writes all recordings of one camera, the spikes last.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,16 @@ from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
-from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, THRESHOLD, events, exposures
+from spike4dgs.generators.other_sensors import (
+    EXPOSURE_S,
+    FPS,
+    THRESHOLD,
+    EventNoise,
+    FrameNoise,
+    events,
+    exposures,
+    noisy_frame,
+)
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import Clip, KeyStore
@@ -44,9 +53,12 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
     write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
     instants, clip = _lit(job, store, view, plan)
+    noisy, rng = job.physics.noisy_others, np.random.default_rng([*entropy, *b"others"])
     for tick, image in exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
-        write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(image))
-    found = events(_lit(job, store, view, plan)[0].keys, instants.ticks, job.n_ticks, RATE_HZ)
+        shown = noisy_frame(image, FrameNoise(), rng) if noisy else image
+        write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(shown))
+    noise, again = EventNoise() if noisy else None, _lit(job, store, view, plan)[0]
+    found = events(again.keys, again.ticks, job.n_ticks, RATE_HZ, noise=noise, rng=rng)
     write_events(scene / f"events/{camera.id}.npz", found)
     charge = random_charge(*size, entropy)
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
@@ -92,13 +104,15 @@ def sensor_facts(job: Job) -> dict[str, Any]:
 
 def extras(job: Job) -> dict[str, dict[str, Any]]:
     """Return the entries of scene.json about the files that `write_camera` and the ground truth add."""
+    noisy = job.physics.noisy_others
+    frames, noise = ({"noise": asdict(n)} if noisy else {} for n in (FrameNoise(), EventNoise()))
     return {
         "ground_truth": {
             "images": "linear radiance, half float: R, G, B and gray Y; 1 is white",
             "geometry": "Z: metres along the optical axis; id: see instances; flow.x, flow.y: px to 1 ms later",
             "sparse_every_ticks": job.profile.sparse_every,
         },
-        "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S, "coding": "8-bit sRGB gray"},
-        "events": {"threshold": THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"},
+        "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S, "coding": "8-bit sRGB gray"} | frames,
+        "events": {"threshold": THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"} | noise,
         "calibration": calibration.calibration_facts(),
     }

@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, THRESHOLD, events, exposures
+from spike4dgs.generators.other_sensors import (
+    EXPOSURE_S,
+    FPS,
+    THRESHOLD,
+    EventNoise,
+    FrameNoise,
+    events,
+    exposures,
+    noisy_frame,
+)
 from spike4dgs.generators.sensor.reference import tick_means
 
 
@@ -107,3 +116,57 @@ def test_events_after_the_clip_are_left_out():
     keys = [np.full((1, 1), v, np.float32) for v in (0.1, 0.1, 0.9)]
     assert len(events(keys, [0, 20, 40], 20, RATE).t) == 0
     assert len(events(keys, [0, 20, 40], 40, RATE).t) == 10
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def test_a_noisy_frame_has_the_noise_of_the_data_sheets():
+    """Shot noise of 10,700 electrons at white is 40.3 dB; in the dark the read noise is left, 71.3 dB below white."""
+    noise, shape = FrameNoise(full_well=10_700), (300, 400)
+    for radiance in (0.0, 0.05, 0.4):
+        image = noisy_frame(np.full(shape, radiance, np.float32), noise, rng()).astype(np.float64)
+        if radiance:
+            assert abs(image.mean() - radiance) < 4 * image.std() / np.sqrt(image.size)
+            assert image.std() == pytest.approx(np.sqrt(radiance * 10_700 + 2.9**2) / 10_700, rel=0.02)
+        else:  # what is below black is clipped
+            assert np.sqrt(2 * np.square(image).mean()) == pytest.approx(10 ** (-71.3 / 20), rel=0.02)
+    bright = noisy_frame(np.full(shape, 1.5, np.float32), noise, rng())
+    assert (bright == 1).all() and bright.dtype == np.float32
+
+
+def test_thresholds_differ_from_pixel_to_pixel_and_by_sign():
+    """A ramp of many thresholds tells each pixel's own: its log radiance over its number of events."""
+    shape, ramp = (40, 50), 60.0
+    quiet = EventNoise(shot_hz=0, refractory_us=0)
+    found = {}
+    for p, keys in ((1, [1e-3, 1e-3 * np.exp(ramp)]), (0, [1e-3 * np.exp(ramp), 1e-3])):
+        images = [np.full(shape, k, np.float64) for k in keys]
+        e = events(images, [0, 20], 20, RATE, noise=quiet, rng=rng())
+        assert (e.p == p).all()
+        found[p] = ramp / np.bincount(e.y.astype(int) * 50 + e.x, minlength=2000)
+    for threshold in found.values():
+        assert threshold.mean() == pytest.approx(THRESHOLD, abs=0.005)
+        assert threshold.std() == pytest.approx(quiet.mismatch, rel=0.06)
+    assert abs(np.corrcoef(*found.values())[0, 1]) < 0.1
+
+
+def test_a_refractory_pixel_sends_fewer_events_and_none_too_early():
+    keys = [np.full((1, 1), v, np.float64) for v in (1e-3, 1e-3 * np.exp(8.1))]
+    every = events(keys, [0, 200], 200, RATE)  # 40 events in 10 ms, 247 us apart
+    calm = events(keys, [0, 200], 200, RATE, noise=EventNoise(0, shot_hz=0, refractory_us=450), rng=rng())
+    assert len(every.t) == 40 and len(calm.t) == 20 and np.diff(calm.t).min() >= 450
+    assert set(calm.t) <= set(every.t)
+
+
+@pytest.mark.parametrize(("radiance", "share"), [(0.0, 1.0), (0.5, 0.625), (1.0, 0.25)])
+def test_shot_events_come_at_their_rate_and_in_order(radiance, share):
+    image, noise = np.full((100, 100), radiance, np.float32), EventNoise()
+    found = events([image] * 5, [0, 500, 900, 1500, 2000], 2000, RATE, noise=noise, rng=rng())
+    expected = 10_000 * 0.1 * noise.shot_hz * share  # in 0.1 s
+    assert abs(len(found.t) - expected) < 4 * np.sqrt(expected)
+    assert abs(int(found.p.sum()) - len(found.t) / 2) < 2 * np.sqrt(expected)
+    assert (np.diff(found.t) >= 0).all() and 0 <= found.t[0] and found.t[-1] < 100_000
+    assert abs(found.t.mean() - 50_000) < 4 * 100_000 / np.sqrt(12 * expected)
+    assert len(np.unique(found.y.astype(int) * 100 + found.x)) > expected / 2

@@ -168,3 +168,13 @@ def test_a_scenes_description_states_what_the_sensor_does(tmp_path, monkeypatch)
     sensor = open_scene(Maker(made, tmp_path, plain).make()).meta["sensor"]
     assert (sensor["dead_ticks"], sensor["read_noise"], sensor["reset_noise"]) == (1, 0.006, 0.0009)
     assert not {"dead_ticks", "psf_px"} & set(open_scene(Maker(JOB, tmp_path, plain).make()).meta["sensor"])
+
+
+def test_noise_of_other_sensors_changes_nothing_else(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    quiet, noisy = (open_scene(Maker(made, tmp_path, plain).make()) for made in (JOB, job(noisy_others=True)))
+    assert noisy.id == "car-0-tiny-others" and noisy.revision == quiet.revision
+    assert noisy.meta["source"]["physics"] == {"noisy_others": True}
+    assert noisy.meta["conventional"]["noise"] == {"full_well": 10_700.0, "read": 2.9}
+    assert noisy.meta["events"]["noise"]["shot_hz"] == 5.0 and "noise" not in quiet.meta["events"]
+    assert len(noisy.events("cam_00")) != len(quiet.events("cam_00"))
