@@ -38,6 +38,8 @@ CHANGED = "the method ran with other settings (--set); a track takes it as a rec
 _NAMED = 3  # scenes that a message names
 _FROZEN = "restore the file: a release does not change, what is new goes into the next one"
 
+OTHER_SENSORS = frozenset(("frames", "events"))  # no revision covers these, so every track withholds them
+
 
 @dataclass(frozen=True)
 class Track:
@@ -216,7 +218,7 @@ def place_of(record: Mapping[str, Any]) -> Place:
     same = [t for t in release.tracks if t.scenes == dataset["scenes"] and t.split == dataset["split"]]
     given = set(record["method"].get("given", DEFAULT_GIVEN))
     changed = is_changed(record["method"]["name"])
-    if boards := tuple(t.name for t in same if not t.withheld & given and not changed):
+    if boards := tuple(t.name for t in same if not (t.withheld | OTHER_SENSORS) & given and not changed):
         return Place(f"{PUBLIC}/{release.number}-{same[0].name}@{revision}", boards, "")
     more = f"+{len(ids) - 1}" if len(ids) > 1 else ""
     return Place(f"{LOCAL}/{ids[0]}{more}@{revision}", (), CHANGED if changed else why_local(dataset, release, same))

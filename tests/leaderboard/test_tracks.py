@@ -113,6 +113,12 @@ def test_a_method_that_was_given_what_every_track_withholds_is_local(tmp_path: P
     assert place_of(record_of({"s": "0" * 64}, given=[])).tracks == ("unposed",)
 
 
+@pytest.mark.parametrize("kind", ["frames", "events"])
+def test_what_no_revision_covers_is_on_no_board(kind: str) -> None:
+    place = place_of(record_of(of_track("outdoor-small"), given=["poses", kind]))
+    assert not place.is_public and "was given what outdoor-small" in place.why
+
+
 ids = st.text(min_size=1, max_size=120)
 
 
