@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterable, Sequence
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
 from spike4dgs.method.recipes import METHODS as OURS
+from spike4dgs.method.tuned import SUFFIX as TUNED
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
-from spike4dgs.studies.results.plan import KNOWLEDGE, ROWS, TABLE1, TABLE2, Group, cells_of
+from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, Record
 
 NOTHING = "No cell of this table has been measured yet."
 NO_LEAD = "No row of ours and another with equal knowledge have been measured on all scenes yet."
-NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ROWS)
+NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ALL_ROWS)
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
@@ -194,10 +195,12 @@ def _commit(record: Record) -> str:
 
 def _mixed_code(own: Iterable[Record]) -> list[str]:
     """Return a sentence that names the rows of each commit where the methods' code differs between them."""
-    codes: dict[bool, set[str]] = {True: set(), False: set()}
+    codes: dict[str, set[str]] = {}
     by_commit: dict[str, dict[str, None]] = {}
     for r in own:
-        codes[r["row"] in OURS].add(r["code"])  # digests of methods in `method` leave the baselines out
+        # Digests of methods in `method` leave the baselines out; those of tuned rows cover their settings.
+        kind = r["row"] if r["row"].endswith(TUNED) else "ours" if r["row"] in OURS else "theirs"
+        codes.setdefault(kind, set()).add(r["code"])
         by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
     if all(len(found) <= 1 for found in codes.values()):
         return []

@@ -13,6 +13,7 @@ from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.studies.results.pages import BLOCK, pages_of
 
 _RATCHET = Path("studies", "results", "loose_figures.json")  # in a checkout
+_SEARCHES = re.compile(r"^<!-- searches -->\n.*?^<!-- end searches -->$", re.MULTILINE | re.DOTALL)  # `report tuning`
 _FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 _NUMBER = r"\d+(?:\.\d+)?"
 _DECIBELS = re.compile(rf"(?:{_NUMBER}(?:\s*(?:,|/|-|and|to|or)\s*))*{_NUMBER}\s+dB\b")  # "7.8 and 7.1 dB" are two
@@ -27,7 +28,7 @@ def loose_figures(text: str) -> Iterator[tuple[int, str]]:
     >>> list(loose_figures("It leads by 7.8 and 7.1 dB.\\n\\n| row | PSNR |\\n| x | 30.25 |"))
     [(1, '7.8'), (1, '7.1'), (4, '30.25')]
     """
-    for hidden in (BLOCK, _FENCE):
+    for hidden in (BLOCK, _SEARCHES, _FENCE):
         text = hidden.sub(lambda found: "\n" * found[0].count("\n"), text)
     places = {}
     for found in _DECIBELS.finditer(text):

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from spike4dgs.baselines import recipes as theirs
 from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.benchmark.method import find_methods, make_budget
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.generators.make_dataset import SceneSettings, track_jobs
+from spike4dgs.method import recipes as ours
+from spike4dgs.method.tuned import SUFFIX as TUNED
+from spike4dgs.method.tuned import read_tuned
 from spike4dgs.studies.results.plan import (
     CALIBRATED,
     PLAN,
@@ -44,7 +49,20 @@ def test_every_row_is_a_method_and_stands_once(group: Group) -> None:
 @pytest.mark.parametrize("group", PLAN, ids=lambda g: g.name)
 def test_the_blocks_of_the_tables_follow_from_the_recipes(group: Group) -> None:
     for knowledge, names in ABOUT.items():
-        assert {row.name for row in group.rows if knowledge_of(METHODS[row.name]) == knowledge} == names
+        found = [row.name for row in group.rows if knowledge_of(METHODS[row.name]) == knowledge]
+        assert {name for name in found if not name.endswith(TUNED)} == names
+        assert {name.removesuffix(TUNED) for name in found} == names
+
+
+def test_a_row_is_tuned_where_a_search_of_it_is_kept() -> None:
+    searched = {}
+    for recipes in (theirs, ours):
+        searched |= read_tuned(Path(recipes.__file__).with_name("tuned.json"))
+    rows = {row.name: row for row in TABLE1.rows}
+    assert {name for name in rows if name.endswith(TUNED)} == {f"{name}{TUNED}" for name in searched if name in rows}
+    for name in searched.keys() & rows.keys():
+        assert rows[f"{name}{TUNED}"].seeds == rows[name].seeds
+        assert all(scene in rows[f"{name}{TUNED}"].tuned_on for scene in searched[name]["scenes"])
 
 
 def test_a_calibrated_row_is_one_whose_recipe_is_given_flat_fields() -> None:
@@ -66,6 +84,7 @@ def test_cells_stand_once_and_what_matters_most_comes_first() -> None:
     once = replace(TABLE1, rows=tuple(replace(row, seeds=1) for row in TABLE1.rows))
     assert cells_of([*PLAN, once]) == cells, "a cell of two groups is one"
     order = [(cells[k].row, cells[k].seed) for k in range(0, len(cells), 9)]
+    order = [(row, seed) for row, seed in order if not row.endswith(TUNED)]
     for k in range(0, len(cells), 9):
         assert {cell.scene for cell in cells[k : k + 9]} == nine
         assert len({(cell.row, cell.seed) for cell in cells[k : k + 9]}) == 1
