@@ -233,7 +233,11 @@ _PART = re.compile(r"\..+\.[0-9]+\.part(\.[^.]+)?")  # as in `atomic_path` and `
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what killed processes left half written in a folder and below it. The caller holds the folder's lock."""
-    for path in folder.rglob(".*.part*"):
-        if _PART.fullmatch(path.name) and path.is_file():
-            path.unlink(missing_ok=True)
+    """Remove what killed processes left half written in a folder and below it. The caller holds the folder's lock.
+
+    A fit's process, which ends after its caller was killed, may remove folders meanwhile: `Path.rglob` would raise.
+    """
+    for inside, _, names in os.walk(folder):
+        for path in (Path(inside, name) for name in names if _PART.fullmatch(name)):
+            if path.is_file():
+                path.unlink(missing_ok=True)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -195,6 +197,28 @@ def test_parts_of_killed_processes_are_removed_and_nothing_else(tmp_path: Path) 
         (tmp_path / name).touch()
     remove_parts(tmp_path)
     assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
+
+
+def test_parts_are_removed_beside_a_process_that_removes_folders(tmp_path: Path) -> None:
+    done = threading.Event()
+
+    def come_and_go() -> None:
+        while not done.is_set():
+            for name in "abcdefgh":
+                (tmp_path / name / "inner").mkdir(parents=True)
+            for name in "abcdefgh":
+                shutil.rmtree(tmp_path / name)
+
+    other = threading.Thread(target=come_and_go)
+    other.start()
+    try:
+        for k in range(300):
+            (tmp_path / f".a.{k}.part").touch()
+            remove_parts(tmp_path)
+            assert not (tmp_path / f".a.{k}.part").exists()
+    finally:
+        done.set()
+        other.join()
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="a system without /proc")
