@@ -17,6 +17,20 @@ from spike4dgs.generators.worlds.surfaces import Material, mesh_to_mitsuba
 
 _Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)  # Mitsuba's skies are y up
 _PLAIN = Material((0.5, 0.5, 0.5))
+_ALIGNMENT = 64  # bytes, of Dr.Jit's own arrays
+
+
+def aligned(array: np.ndarray) -> np.ndarray:
+    """Return a copy that starts at a multiple of 64 bytes, for Dr.Jit.
+
+    Dr.Jit maps NumPy's memory, and compiles a kernel anew for each pattern of alignments of its inputs. NumPy aligns
+    by chance.
+    """
+    room = np.empty(array.nbytes + _ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % _ALIGNMENT
+    copy = room[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy
 
 
 class Hits(NamedTuple):
@@ -94,12 +108,12 @@ class MitsubaScene:
         moved = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
         for parameters in self._parameters:
             for name, (positions, _) in moved.items():
-                parameters[f"{name}.vertex_positions"] = positions
+                parameters[f"{name}.vertex_positions"] = aligned(positions)
             if self._own_normals:
                 parameters.update()
             for name, (_, normals) in moved.items():
                 if normals is not None:
-                    parameters[f"{name}.vertex_normals"] = normals
+                    parameters[f"{name}.vertex_normals"] = aligned(normals)
             parameters.update()
         self._time_s = t_s
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.like_surfaces import LIKE_COSINE, LIKE_PX
-from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
+from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene, aligned
 
 LEAST_WEIGHT = 0.02  # of like surfaces around a sample, of at most 1; below it a sample traces its path
 
@@ -62,9 +62,9 @@ class SoftMaps:
         self._moving = [(mi.ShapePtr(by_id[name]), first) for name, first in scene.first_faces().items()]
         faces = np.zeros((len(scene.moving_faces), 4), np.uint32)
         faces[:, :3] = scene.moving_faces
-        self._faces = mi.UInt32(faces.ravel())
+        self._faces = mi.UInt32(aligned(faces.ravel()))
         rows = [[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
-        self._cameras = mi.Float(np.array(rows, np.float32).ravel())  # [C, 21]
+        self._cameras = mi.Float(aligned(np.array(rows, np.float32).ravel()))  # [C, 21]
         self._has_lens = any(c.distortion for c in cameras)
 
     def place(
@@ -170,4 +170,4 @@ def _packed(values: np.ndarray) -> mi.Float:
     """Return rows [N, up to 4] as one buffer of four floats a row."""
     rows = np.zeros((max(len(values), 1), 4), np.float32)
     rows[: len(values), : values.shape[1] if len(values) else 0] = values
-    return mi.Float(rows.ravel())
+    return mi.Float(aligned(rows.ravel()))

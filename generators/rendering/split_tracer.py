@@ -92,7 +92,7 @@ class SplitTracer(WavefrontTracer):
         else:
             light = self._scattered(scene, si, bsdf, self._matte, sampler, matte)
             light /= dr.maximum(bsdf.eval_diffuse_reflectance(si, matte), _LEAST_ALBEDO)
-        first = dr.arange(mi.UInt32, len(pixels)) * spp  # all samples of a pixel see one point
+        first = dr.arange(mi.UInt32, len(pixels)) * dr.opaque(mi.UInt32, spp)  # all samples of a pixel see one point
         points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
         shiny = dr.select(coated, mi.UInt32(1), 0)
         dr.eval(points, normals, shiny, light)

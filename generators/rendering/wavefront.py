@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
+from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene, aligned
 
 _LENS_STEPS = 6  # of Newton's method: enough for float32 where a lens moves a pixel by a fifth of the image
 _QUANTILES = 4096  # of a blurred pixel's footprint: its variance is right to 1e-3
@@ -44,13 +44,15 @@ class PixelSampler(mi.Sampler):  # type: ignore[misc]
     """Correlated multi-jittered samples (Kensler 2013) that depend on the pixel's key and the sample number alone.
 
     Mitsuba's own samplers number their sequences by lane, so a pixel's samples would change with the list of pixels
-    traced. `count` must be a power of two: its permutations then need no rejection loop.
+    traced. A pixel has 2 ** `bits` samples: the permutations of a power of two need no rejection loop. `bits` is no
+    literal of the program, so that one kernel serves all numbers of samples.
     """
 
-    def __init__(self, key: mi.UInt32, index: mi.UInt32, count: int) -> None:
+    def __init__(self, key: mi.UInt32, index: mi.UInt32, bits: mi.UInt32) -> None:
         super().__init__(mi.Properties())
-        bits = count.bit_length() - 1
-        self._count, self._columns, self._rows = count, 1 << (bits + 1) // 2, 1 << bits // 2
+        self._across, down = (bits + 1) >> 1, bits >> 1
+        self._count, self._columns, self._rows = (mi.UInt32(1) << b for b in (bits, self._across, down))
+        self._share, self._width, self._height = (1 / mi.Float(n) for n in (self._count, self._columns, self._rows))
         self.key, self.index = key, index
         self.dimension = dr.zeros(mi.UInt32, dr.width(key))
 
@@ -58,18 +60,18 @@ class PixelSampler(mi.Sampler):  # type: ignore[misc]
         """Return one stratified number in [0, 1) per lane."""
         salt = self._next_salt()
         stratum = _shuffle(self.index, self._count, salt)
-        return (mi.Float(stratum) + _unit(_hash(salt ^ (self.index * 0x68E31DA4)))) / self._count
+        return (mi.Float(stratum) + _unit(_hash(salt ^ (self.index * 0x68E31DA4)))) * self._share
 
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
         """Return one point per lane, stratified on the grid and along both axes."""
         salt = self._next_salt()
         s = _shuffle(self.index, self._count, salt)
-        column, row = s & (self._columns - 1), s >> (self._columns.bit_length() - 1)
+        column, row = s & (self._columns - 1), s >> self._across
         across = _shuffle(row, self._rows, _hash(salt + 0x51633E2D))
         down = _shuffle(column, self._columns, _hash(salt + 0x6B43A9B5))
         jitter = _hash(salt ^ (self.index * 0xB5297A4D))
-        x = (mi.Float(column) + (mi.Float(across) + _unit(jitter)) / self._rows) / self._columns
-        y = (mi.Float(row) + (mi.Float(down) + _unit(_hash(jitter))) / self._columns) / self._rows
+        x = (mi.Float(column) + (mi.Float(across) + _unit(jitter)) * self._height) * self._width
+        y = (mi.Float(row) + (mi.Float(down) + _unit(_hash(jitter))) * self._width) * self._height
         return mi.Point2f(x, y)
 
     def _next_salt(self) -> mi.UInt32:
@@ -89,7 +91,7 @@ def _unit(x: mi.UInt32) -> mi.Float:
     return mi.Float(x >> 8) * (1.0 / (1 << 24))
 
 
-def _shuffle(i: mi.UInt32, n: int, salt: mi.UInt32) -> mi.UInt32:
+def _shuffle(i: mi.UInt32, n: mi.UInt32, salt: mi.UInt32) -> mi.UInt32:
     """Return a random permutation of 0..n-1, n a power of two: every step is invertible modulo n."""
     w = n - 1
     i = (i ^ salt) & w
@@ -110,7 +112,7 @@ class WavefrontTracer:
     def __init__(
         self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int, psf_px: float = 0.0
     ) -> None:
-        self._footprint = mi.Float(footprint_quantiles(psf_px)) if psf_px else None
+        self._footprint = mi.Float(aligned(footprint_quantiles(psf_px).astype(np.float32))) if psf_px else None
         self._scene, self._seed = scene, seed
         self._width, self._height = cameras[0].width, cameras[0].height
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
@@ -118,12 +120,14 @@ class WavefrontTracer:
         for c in cameras:
             to_world = c.R.T @ np.linalg.inv(c.K)  # pixel coordinates -> world direction
             rows.append([*to_world.ravel(), *c.center])
-        self._cameras = mi.Float(np.array(rows, np.float32).ravel())  # [C, 12]
+        self._cameras = mi.Float(aligned(np.array(rows, np.float32).ravel()))  # [C, 12]
         lenses = [[c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
-        self._lenses = mi.Float(np.array(lenses, np.float32).ravel()) if any(c.distortion for c in cameras) else None
+        has_lens = any(c.distortion for c in cameras)
+        self._lenses = mi.Float(aligned(np.array(lenses, np.float32).ravel())) if has_lens else None
         by_id = {shape.id(): shape for shape in scene.movers.shapes()}
         self._movers = [mi.ShapePtr(by_id[name]) for name in scene.mover_ids]
-        self._keys = mi.UInt32(np.array([zlib.crc32(c.id.encode()) for c in cameras], np.uint32))
+        keys = [zlib.crc32(c.id.encode()) for c in cameras]
+        self._keys = mi.UInt32(aligned(np.array([*keys, 0], np.uint32)))  # one number alone would be another kernel's
 
     def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
         """Return the linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
@@ -146,18 +150,19 @@ class WavefrontTracer:
         self, pixels: np.ndarray, spp: int, stream: int | np.ndarray, centre: bool = False
     ) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
         """Return view [K spp], sampler and ray of each sample; `centre`: all rays through the middle of their pixel."""
-        listed = mi.UInt32(np.ascontiguousarray(pixels, np.uint32))
+        listed = mi.UInt32(aligned(pixels.astype(np.uint32)))
         lane = dr.arange(mi.UInt32, len(pixels) * spp)
-        shift = spp.bit_length() - 1
-        pixel, index = dr.gather(mi.UInt32, listed, lane >> shift), lane & (spp - 1)
+        bits = dr.opaque(mi.UInt32, spp.bit_length() - 1)
+        number = lane >> bits
+        pixel, index = dr.gather(mi.UInt32, listed, number), lane - (number << bits)
         area = self._width * self._height
         view = pixel // area
         inside = pixel - view * area
         row = inside // self._width
         column = inside - row * self._width
-        salt = self._salt(stream, spp, lane >> shift)
+        salt = self._salt(stream, spp, number)
         key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self._keys, view))) + salt)
-        sampler = PixelSampler(key, index, spp)
+        sampler = PixelSampler(key, index, bits)
         offset = mi.Point2f(0.5) if centre else sampler.next_2d()
         if self._footprint is not None and not centre:
             offset = mi.Point2f(self._blurred(offset.x), self._blurred(offset.y))
@@ -168,7 +173,7 @@ class WavefrontTracer:
         if isinstance(stream, int):
             return dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
         salts = (self._seed * 0x2545F491 + stream.astype(np.uint64) * 0x9E3779B1 + spp) & 0xFFFFFFFF
-        return dr.gather(mi.UInt32, mi.UInt32(salts.astype(np.uint32)), number)
+        return dr.gather(mi.UInt32, mi.UInt32(aligned(salts.astype(np.uint32))), number)
 
     def _means(self, values: mi.Color3f, spp: int) -> np.ndarray:
         """Return the means [K, 3] float32 of each pixel's samples."""
@@ -215,7 +220,9 @@ class WavefrontTracer:
 
     def prepare(self, origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
         """Return rays [N, 3] with unit directions, prepared for repeated casts."""
-        o, d = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (origins, directions))
+        o, d = (
+            mi.Vector3f(*(mi.Float(aligned(axis.astype(np.float32))) for axis in a.T)) for a in (origins, directions)
+        )
         ray = mi.Ray3f(mi.Point3f(o), d)
         dr.eval(ray)
         return ray

@@ -106,3 +106,27 @@ def test_background_and_truth_of_a_view_do_not_depend_on_other_views(r):
     mask = alone.object_masks(T_S)[0]
     assert alone.background[0].tobytes() == together.background[1].tobytes()
     assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
+
+
+@one_world
+def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
+    """NumPy's memory starts anywhere; a kernel that depends on it is compiled anew for every other key."""
+    import drjit as dr
+
+    maps = r._maps_at(T_S)
+    room = np.arange(4096)
+
+    def rendered(start: int, count: int, spp: int) -> None:
+        r._scene.set_time(T_S + start * 1e-6)
+        where = room[start : start + count]
+        r._tracer.trace(where, spp, start, True)
+        r._tracer.split(where, spp, where + 1, True, maps)
+        r._tracer.soft(where, spp, 8, where, True)
+
+    rendered(0, 2000, 8)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for start, count, spp in ((1, 200, 8), (6, 37, 16), (11, 301, 4)):
+            rendered(start, count, spp)
+        launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    assert launched and all(kernel["cache_hit"] for kernel in launched)
