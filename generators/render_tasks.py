@@ -30,6 +30,7 @@ from spike4dgs.generators.worlds import WORLDS, WorldScene
 _POINTS_PER_VIEW = 250  # of the sparse model
 _PIXELS = 1 << 14  # of a range of the background, or more: a second of work or longer
 _MOST_PARTS = 32
+_OF_SPLIT = ("soft_static", "maps_of")  # arguments that renderers of whole paths have not
 Watch = Callable[[str, Iterable[Any], int], Iterator[Any]]
 
 
@@ -103,10 +104,13 @@ class RenderSoft(_Task):
 
     truth: bool
 
+    @cached_property
+    def _renderer(self) -> Any:
+        return renderer_of(self.job, cameras_of(self.job), truth=self.truth)
+
     def __call__(self, part: tuple[int, int]) -> tuple[NDArray[np.float32], ...]:
-        """Return points, normals and soft light of the pixels; see `split_render.SplitRenderer.soft_at`."""
-        renderer: Any = renderer_of(self.job, cameras_of(self.job), truth=self.truth)
-        return renderer.soft_at(np.arange(*part))  # type: ignore[no-any-return]
+        """Return the arrays of the pixels; see `split_render.SplitRenderer.soft_at`."""
+        return self._renderer.soft_at(np.arange(*part))  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +132,20 @@ class RenderStatic(_Task):
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints(_Task):
-    """Finds points on static surfaces; the argument of the call is ignored."""
+    """Finds points on static surfaces at t = 0, a coarse grid of every view's pixels; ignores its argument."""
 
     def __call__(self, part: object) -> NDArray[np.float64]:
         """Return the points [N, 3] for the sparse model."""
-        return _surface_points(renderer_of(self.job, cameras_of(self.job), truth=False))
+        renderer = renderer_of(self.job, cameras_of(self.job), truth=False)
+        depths, moving = renderer.depths(0.0), renderer.object_masks(0.0)
+        found = []
+        for camera, depth, mask in zip(renderer.cameras, depths, moving, strict=True):
+            step = max(1, round(np.sqrt(depth.size / _POINTS_PER_VIEW)))
+            v, u = (g.ravel() for g in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
+            keep = np.isfinite(depth[v, u]) & ~mask[v, u]
+            uv = np.stack([u[keep], v[keep]], axis=1) + 0.5
+            found.append(camera.unproject(uv, depth[v, u][keep].astype(np.float64)))
+        return np.concatenate(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +198,9 @@ class RenderTargets(_Task):
     def _held_out(self) -> MultiViewRenderer:
         view = held_out_view(self.job)
         views = cameras_of(self.job)[view : view + 1]
-        return renderer_of(self.job, views, truth=True, static=self.static.views([view]))
+        return renderer_of(
+            self.job, views, truth=True, static=self.static.views([view]), maps_of=lambda: self._every_view
+        )
 
     def __call__(self, ticks: Sequence[int]) -> list[Truth]:
         """Return the ground truth of `ticks`."""
@@ -200,12 +215,14 @@ class RenderTargets(_Task):
 
 
 def renderer_of(
-    job: Job, views: Sequence[Camera], *, truth: bool, seed: int | None = None, **others: Any
+    job: Job,
+    views: Sequence[Camera],
+    *,
+    truth: bool,
+    seed: int | None = None,
+    **others: Any,
 ) -> MultiViewRenderer:
-    """Return the renderer of streams or of ground truth, which have no random number in common.
-
-    `seed` is another seed than the job's; `others` go to the renderer.
-    """
+    """Return the renderer of streams or of ground truth, of no common random number. `others` go to the renderer."""
     p = job.profile
     own = {
         "seed": job.render_seed + truth if seed is None else seed,
@@ -214,28 +231,13 @@ def renderer_of(
         "color": truth,
         "whole_frames": job.whole_frames and not truth,
         "psf_px": job.physics.psf_px,
-    }
+    } | others
     if (soft := p.target_soft if truth else p.soft) is None:
-        return MultiViewRenderer(
-            world_of(job), views, **{k: v for k, v in (own | others).items() if k != "soft_static"}
-        )
+        return MultiViewRenderer(world_of(job), views, **{k: v for k, v in own.items() if k not in _OF_SPLIT})
     from spike4dgs.generators.rendering.split_render import SplitRenderer  # it needs compiled kernels
 
     anchors_s = anchor_s(world_of(job), cameras_of(job), soft.anchor_px)
-    return SplitRenderer(world_of(job), views, soft=soft, anchors_s=anchors_s, **(own | others))
-
-
-def _surface_points(renderer: MultiViewRenderer) -> NDArray[np.float64]:
-    """Return points [N, 3] on static surfaces at t = 0, a coarse grid of every view's pixels, for the sparse model."""
-    depths, moving = renderer.depths(0.0), renderer.object_masks(0.0)
-    found = []
-    for camera, depth, mask in zip(renderer.cameras, depths, moving, strict=True):
-        step = max(1, round(np.sqrt(depth.size / _POINTS_PER_VIEW)))
-        v, u = (g.ravel() for g in np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step])
-        keep = np.isfinite(depth[v, u]) & ~mask[v, u]
-        uv = np.stack([u[keep], v[keep]], axis=1) + 0.5
-        found.append(camera.unproject(uv, depth[v, u][keep].astype(np.float64)))
-    return np.concatenate(found)
+    return SplitRenderer(world_of(job), views, soft=soft, anchors_s=anchors_s, **own)
 
 
 class StaticParts(NamedTuple):

@@ -45,13 +45,15 @@ class SoftStatic:
     """Soft light in the views without moving objects, float32; see `split_render`.
 
     Attributes:
-        points, normals: [C, H, W, 3], the surface points at the centres of the pixels; normals are 0 without a surface.
+        points, normals: [C, H, W, 3], surface points at the pixels' centres; normals are 0 without one.
+        paths: [C, H, W] int32, of matte light at each pixel.
         first: [C, H, W, 6], soft light with the random numbers of keys: matte over the albedo, gloss.
         smooth: the same, smoothed.
     """
 
     points: np.ndarray
     normals: np.ndarray
+    paths: np.ndarray
     first: np.ndarray
     smooth: np.ndarray
 
@@ -60,10 +62,8 @@ class SoftStatic:
 class StaticViews:
     """The views without moving objects, linear RGB [C, H, W, 3] float32.
 
-    Attributes:
-        background: at full quality.
-        first: the same with the random numbers, and therefore the noise, of keys.
-        soft: of a `split_render.SplitRenderer`.
+    `background` is at full quality, `first` has the random numbers, and therefore the noise, of keys; `soft` is of a
+    `split_render.SplitRenderer`.
     """
 
     background: np.ndarray
@@ -137,8 +137,8 @@ class MultiViewRenderer(Visibility):
         if static is not None:
             self.static = static
 
-    def _make_tracer(self, seed: int, psf_px: float) -> Any:
-        return make_tracer(self._scene, self.cameras, seed, psf_px)
+    def _make_tracer(self, *settings: Any) -> Any:
+        return make_tracer(self._scene, self.cameras, *settings)
 
     @cached_property
     def static(self) -> StaticViews:
@@ -264,7 +264,7 @@ class MultiViewRenderer(Visibility):
         return gray(self._tracer.trace(pixels, spp, 0, moving))
 
     def _flat(self, image: np.ndarray) -> np.ndarray:
-        """Return a view of the image as [N] or [N, 3]."""
+        """Return a view of the image, [N] or [N, 3]."""
         return image.reshape(-1, 3) if self.color else image.reshape(-1)
 
     def _sparse(self, mask_name: str, values_name: str, given: np.ndarray, values: np.ndarray) -> dict[str, np.ndarray]:

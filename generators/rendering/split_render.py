@@ -17,7 +17,7 @@ ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -27,12 +27,13 @@ from scipy.ndimage import maximum_filter
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.profiles import SoftSampling
-from spike4dgs.generators.rendering.like_surfaces import smoothed
+from spike4dgs.generators.rendering.like_surfaces import coverage, pixel_widths, places_in, shared, smoothed
 from spike4dgs.generators.rendering.render import MAX_DEPTH, MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 
 _NEAR_PX = 1  # around moving objects: pixels that may see one
 _MOVED = 0.1  # distance in widths of a pixel by which a point differs from the background's
 _MOST_MAPS = 4
+_LEAST_PATHS = 4
 _KEYS, _MAPS = 1 << 20, 1 << 28  # first of the streams of keys and of maps; those below are the background's
 
 
@@ -45,6 +46,7 @@ class SplitRenderer(MultiViewRenderer):
         soft: SoftSampling,
         anchors_s: float | None = None,
         soft_static: SoftStatic | None = None,
+        maps_of: Callable[[], SplitRenderer] | None = None,
         **others: Any,
     ) -> None:
         """Load the world; see `MultiViewRenderer`. `spp` and `background_spp` are the samples of direct light.
@@ -53,10 +55,13 @@ class SplitRenderer(MultiViewRenderer):
             soft: samples of soft light.
             anchors_s: seconds between maps, as for a rig of which these cameras are a part; if None, by their motion.
             soft_static: that of a renderer with the same arguments, where `static` is not given.
+            maps_of: returns a renderer of the whole rig, whose maps these views of it take.
         """
         super().__init__(*args, **others)
         self.soft = soft
         self._maps: dict[float | None, Any] = {}
+        self._arrays: dict[float, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._maps_of = maps_of
         known = others.get("static")
         if (given := soft_static if known is None else known.soft) is not None:
             self.soft_static = given
@@ -102,9 +107,38 @@ class SplitRenderer(MultiViewRenderer):
         return join_soft([self.soft_at(np.arange(int(np.prod(self.shape))))], self.cameras, self.soft.sigma_px)
 
     def soft_at(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return points and normals [K, 3] of the background at flat pixels, and soft light [K, 6], not smoothed."""
-        known = self._tracer.soft(pixels, self.soft.spp, self.soft.gloss_spp, 0, False)
-        return known.points, known.normals, np.concatenate([known.matte, known.gloss], 1)
+        """Return of the background at flat pixels what `SoftStatic` has, but for `smooth`."""
+        points, normals, coated, paths = (a[pixels] for a in self._static_surfaces)
+        return points, normals, paths, self._paths_light(pixels, coated, paths, 0, False)
+
+    @cached_property
+    def _static_surfaces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points and normals [N, 3] of the background in all pixels, which have a coat, and their numbers of paths."""
+        every = np.arange(int(np.prod(self.shape)))
+        points, normals, coated = self._tracer.surfaces(every, False)
+        geometry = (a.reshape(*self.shape, -1) for a in (points, normals))
+        alike = np.zeros(self.shape, np.int8)
+        return points, normals, coated, self._shared_paths(every, alike, *geometry)
+
+    def _shared_paths(
+        self, where: np.ndarray, labels: np.ndarray, points: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """Return the paths [K] int32 of matte light at flat pixels: fewer where more views see the point."""
+        known = np.zeros(self.shape, np.int32)
+        known.ravel()[where] = 1
+        places = places_in(points.reshape(-1, 3)[where], self.cameras)
+        views = coverage(where, known, labels, points, normals, pixel_widths(points, self.cameras), places)
+        return np.maximum(_LEAST_PATHS, 2 ** np.ceil(np.log2(self.soft.spp / views)).astype(np.int32)).astype(np.int32)
+
+    def _paths_light(
+        self, where: np.ndarray, coated: np.ndarray, paths: np.ndarray, streams: int | np.ndarray, moving: bool
+    ) -> np.ndarray:
+        """Return soft light [K, 6] at flat pixels, not smoothed: matte over the albedo, gloss."""
+        found = np.zeros((len(where), 6), np.float32)
+        found[:, :3] = self._tracer.soft(where, paths, streams, moving, gloss=False)
+        own = streams if isinstance(streams, int) else streams[coated]
+        found[coated, 3:] = self._tracer.soft(where[coated], self.soft.gloss_spp, own, moving, gloss=True)
+        return found
 
     def _maps_at(self, t_s: float | None) -> list[tuple[float, Any]]:
         """Return the maps to blend at a time, and their weights."""
@@ -125,46 +159,78 @@ class SplitRenderer(MultiViewRenderer):
         """Return the map at a time; None: of the background."""
         from spike4dgs.generators.rendering.soft_map import SoftPoints, soft_map
 
+        of = self._maps_of() if self._maps_of else self
+        numbers = {camera.id: k for k, camera in enumerate(of.cameras)}
+        mine = [numbers[camera.id] for camera in self.cameras]
+        points, normals, light = (a[mine].reshape(-1, a.shape[-1]) for a in of.soft_arrays(t_s))
+        corners = self._scene.moving_vertices(0.0 if t_s is None else t_s)
+        return soft_map(SoftPoints(points, normals, light[:, :3], light[:, 3:]), corners)
+
+    def soft_arrays(self, t_s: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return points, normals [C, H, W, 3] and smoothed soft light [C, H, W, 6]; `t_s` None: without objects."""
+        if t_s is None:
+            return self.soft_static.points, self.soft_static.normals, self.soft_static.smooth
+        if t_s not in self._arrays:
+            if len(self._arrays) >= _MOST_MAPS:  # times usually ascend; dropped arrays can be made again, equal
+                del self._arrays[min(self._arrays)]
+            self._arrays[t_s] = self._make_arrays(t_s)
+        return self._arrays[t_s]
+
+    def _make_arrays(self, t_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         static = self.soft_static
         points, normals, light = (np.array(a) for a in (static.points, static.normals, static.smooth))
-        if t_s is not None:
-            where, known, moved = self._soft_points(t_s)
-            flat = [a.reshape(-1, a.shape[-1]) for a in (points, normals, light)]
-            flat[0][where[moved]], flat[1][where[moved]] = known.points[moved], known.normals[moved]
-            values = np.zeros_like(light)  # in static points the change of light, elsewhere the light
-            before = np.where(moved[:, None], 0, static.first.reshape(-1, 6)[where])
-            values.reshape(-1, 6)[where] = np.concatenate([known.matte, known.gloss], 1) - before
-            labels = np.zeros(self.shape, np.int8)
-            labels.ravel()[where[moved]] = 1
-            widths = pixel_widths(points, self.cameras)
-            smooth = smoothed(where, values, labels, points, normals, widths, self.soft.sigma_px)
-            flat[2][where] = np.where(moved[:, None], smooth, np.maximum(flat[2][where] + smooth, 0))
-        corners = self._scene.moving_vertices(0.0 if t_s is None else t_s)
-        known = SoftPoints(*(a.reshape(-1, 3) for a in (points, normals, light[..., :3], light[..., 3:])))
-        return soft_map(known, corners)
-
-    def _soft_points(self, t_s: float) -> tuple[np.ndarray, Any, np.ndarray]:
-        """Return the flat pixels [K] whose soft light may differ from the background's, it, and which points moved."""
         reach = 2 * (int(np.ceil(self.soft.anchor_px)) + 1) + 1  # what the keys between two anchors trace
         where = np.flatnonzero(maximum_filter(self.traced(t_s), size=(1, reach, reach)))
-        own = _MAPS + round(t_s * 1e7)
-        streams = np.where(self.object_masks(t_s).ravel()[where], own, 0)
+        on_object = self.object_masks(t_s).ravel()[where]
         self._scene.set_time(t_s)
-        known = self._tracer.soft(where, self.soft.spp, self.soft.gloss_spp, streams, True)
-        far = np.linalg.norm(known.points - self.soft_static.points.reshape(-1, 3)[where], axis=1)
-        return where, known, far > _MOVED * pixel_widths(self.soft_static.points, self.cameras).ravel()[where]
+        seen, facing, coated = self._tracer.surfaces(where, True)
+        far = np.linalg.norm(seen - points.reshape(-1, 3)[where], axis=1)
+        moved = far > _MOVED * pixel_widths(points, self.cameras).ravel()[where]
+        points.reshape(-1, 3)[where[moved]], normals.reshape(-1, 3)[where[moved]] = seen[moved], facing[moved]
+        labels = np.zeros(self.shape, np.int8)
+        labels.ravel()[where[moved]] = 1
+        # static points have the paths of the background: the same random numbers, and what counts is the difference
+        paths = np.zeros(self.shape, np.int32)
+        paths.ravel()[where] = np.where(
+            moved, self._shared_paths(where, labels, points, normals), static.paths.ravel()[where]
+        )
+        streams = np.where(on_object, _MAPS + round(t_s * 1e7), 0)
+        values = np.zeros_like(light)  # in static points the change of light, elsewhere the light
+        before = np.where(moved[:, None], 0, static.first.reshape(-1, 6)[where])
+        values.reshape(-1, 6)[where] = self._paths_light(where, coated, paths.ravel()[where], streams, True) - before
+        smooth = smoothed_light(where, values, paths, labels, points, normals, self.cameras, self.soft.sigma_px)
+        flat = light.reshape(-1, 6)
+        flat[where] = np.where(moved[:, None], smooth, np.maximum(flat[where] + smooth, 0))
+        return points, normals, light
 
 
 def join_soft(parts: Sequence[tuple[np.ndarray, ...]], cameras: Sequence[Camera], sigma_px: float) -> SoftStatic:
     """Return the background's map of the results of `SplitRenderer.soft_at` for all pixels in order."""
     shape = len(cameras), cameras[0].height, cameras[0].width
-    points, normals, first = (np.concatenate(p).reshape(*shape, -1) for p in zip(*parts, strict=True))
-    labels, widths = np.zeros(shape, np.int8), pixel_widths(points, cameras)
-    smooth = smoothed(np.arange(labels.size), first, labels, points, normals, widths, sigma_px)
-    return SoftStatic(points, normals, first, smooth.reshape(first.shape))
+    points, normals, paths, first = (np.concatenate(p).reshape(*shape, -1) for p in zip(*parts, strict=True))
+    paths, labels = paths[..., 0], np.zeros(shape, np.int8)
+    smooth = smoothed_light(np.arange(labels.size), first, paths, labels, points, normals, cameras, sigma_px)
+    return SoftStatic(points, normals, paths, first, smooth.reshape(first.shape))
 
 
-def pixel_widths(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the width [C, H, W] float32 in metres of a pixel at surface points [C, H, W, 3]."""
-    depths = [np.abs(p @ c.R[2] + c.t[2]) / c.fx for p, c in zip(points, cameras, strict=True)]
-    return np.stack(depths).astype(np.float32)
+def smoothed_light(
+    where: np.ndarray,
+    light: np.ndarray,
+    paths: np.ndarray,
+    labels: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    cameras: Sequence[Camera],
+    sigma_px: float,
+) -> np.ndarray:
+    """Return soft light [K, 6] at flat pixels: matte light is a mean over all views, gloss over one."""
+    widths = pixel_widths(points, cameras)
+    matte, gloss = (np.ascontiguousarray(light[..., part]) for part in (slice(3), slice(3, 6)))
+    places = places_in(points.reshape(-1, 3)[where], cameras)
+    return np.concatenate(
+        [
+            shared(where, matte, paths, labels, points, normals, widths, places, sigma_px),
+            smoothed(where, gloss, labels, points, normals, widths, sigma_px),
+        ],
+        1,
+    )

@@ -23,14 +23,13 @@ import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
-from spike4dgs.generators.rendering.soft_map import LEAST_WEIGHT, SoftMap, SoftMaps, SoftPoints
-from spike4dgs.generators.rendering.wavefront import LANES, WavefrontTracer
+from spike4dgs.generators.rendering.soft_map import LEAST_WEIGHT, SoftMap, SoftMaps
+from spike4dgs.generators.rendering.wavefront import LANES, Counts, WavefrontTracer
 
 _LEAST_ALBEDO = 1e-3
 # Radiance of a soft path, at most: some four times that of white paper in the sun. Rarely a path finds a caustic, the
 # sun in somebody's varnish, which is twenty times as bright; smoothed, it would be a spot of several pixels.
 _MOST_LIGHT = 4.0
-Streams = int | np.ndarray  # of all pixels, or of each [K]
 
 
 class SplitTracer(WavefrontTracer):
@@ -50,54 +49,48 @@ class SplitTracer(WavefrontTracer):
     # ------------------------------------------------------------ the parts
 
     def split(
-        self, pixels: np.ndarray, spp: int, stream: Streams, moving: bool, maps: Sequence[tuple[float, SoftMap]]
+        self, pixels: np.ndarray, spp: Counts, stream: Counts, moving: bool, maps: Sequence[tuple[float, SoftMap]]
     ) -> np.ndarray:
         """Return the linear RGB radiance [K, 3] float32, with soft light of `maps` (weight, map), blended."""
         parts = [np.zeros((0, 3), np.float32)]
-        for some, streams in self._launches(pixels, spp, stream):
-            view, sampler, ray = self._camera_samples(some, spp, streams)
-            parts.append(self._means(self._radiance(view, sampler, ray, moving, maps), spp))
+        for some, counts, streams in _launches(pixels, spp, stream):
+            view, sampler, ray = self._camera_samples(some, counts, streams)
+            parts.append(self._means(self._radiance(view, sampler, ray, moving, maps), counts))
         return np.concatenate(parts)
 
-    def soft(self, pixels: np.ndarray, spp: int, gloss_spp: int, stream: Streams, moving: bool) -> SoftPoints:
-        """Return the surface points that the centres of `pixels` see, and their soft light: the means of paths."""
-        parts = [SoftPoints(*(np.zeros((0, 3), np.float32) for _ in range(4)))]
-        for some, streams in self._launches(pixels, spp, stream):
-            points, normals, matte, shiny = self._soft(some, spp, streams, moving, gloss=False)
-            gloss, which = np.zeros_like(matte), np.flatnonzero(shiny)
-            if len(which):
-                own = streams if isinstance(streams, int) else streams[which]
-                gloss[which] = self._soft(some[which], gloss_spp, own, moving, gloss=True)[2]
-            parts.append(SoftPoints(points, normals, matte, gloss))
-        return SoftPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    def surfaces(self, pixels: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the points and normals [K, 3] that the centres of `pixels` see (0: nothing), and which have a coat."""
+        _, _, ray = self._camera_samples(pixels, 1, 0, centre=True)
+        si = self._scene_at(moving).ray_intersect(ray)
+        points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
+        shiny = dr.select(_lobes(si, si.bsdf(ray))[1], mi.UInt32(1), 0)
+        dr.eval(points, normals, shiny)
+        at, normal = (np.ascontiguousarray(np.array(a, np.float32).T) for a in (points, normals))
+        return at, normal, np.array(shiny) > 0
+
+    def soft(self, pixels: np.ndarray, spp: Counts, stream: Counts, moving: bool, *, gloss: bool) -> np.ndarray:
+        """Return soft light [K, 3] at the centres of `pixels`, means of paths: gloss, or matte over albedo."""
+        parts = [np.zeros((0, 3), np.float32)]
+        for some, counts, streams in _launches(pixels, spp, stream):
+            _, sampler, ray = self._camera_samples(some, counts, streams, centre=True)
+            parts.append(self._means(self._soft(sampler, ray, moving, gloss), counts))
+        return np.concatenate(parts)
 
     # ------------------------------------------------------------ internals
 
-    def _launches(self, pixels: np.ndarray, spp: int, stream: Streams) -> Iterator[tuple[np.ndarray, Streams]]:
-        per_launch = max(LANES // spp, 1)
-        for k in range(0, len(pixels), per_launch):
-            yield pixels[k : k + per_launch], stream if isinstance(stream, int) else stream[k : k + per_launch]
+    def _scene_at(self, moving: bool) -> mi.Scene:
+        return self._scene.full if moving else self._scene.empty
 
-    def _soft(
-        self, pixels: np.ndarray, spp: int, stream: Streams, moving: bool, *, gloss: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return points, normals, soft light of one lobe [K, 3] each, and which have a coat [K]."""
-        _, sampler, ray = self._camera_samples(pixels, spp, stream, centre=True)
-        scene = self._scene.full if moving else self._scene.empty
+    def _soft(self, sampler: mi.Sampler, ray: mi.RayDifferential3f, moving: bool, gloss: bool) -> mi.Color3f:
+        """Return the soft light of one lobe by each sample."""
+        scene = self._scene_at(moving)
         si = scene.ray_intersect(ray)
         bsdf = si.bsdf(ray)
         matte, coated, _ = _lobes(si, bsdf)
         if gloss:
-            light = self._scattered(scene, si, bsdf, self._glossy, sampler, coated)
-        else:
-            light = self._scattered(scene, si, bsdf, self._matte, sampler, matte)
-            light /= dr.maximum(bsdf.eval_diffuse_reflectance(si, matte), _LEAST_ALBEDO)
-        first = dr.arange(mi.UInt32, len(pixels)) * dr.opaque(mi.UInt32, spp)  # all samples of a pixel see one point
-        points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
-        shiny = dr.select(coated, mi.UInt32(1), 0)
-        dr.eval(points, normals, shiny, light)
-        at, normal, coat = (np.array(dr.gather(type(a), a, first)) for a in (points, normals, shiny))
-        return np.asarray(at, np.float32).T, np.asarray(normal, np.float32).T, self._means(light, spp), coat > 0
+            return self._scattered(scene, si, bsdf, self._glossy, sampler, coated)
+        light = self._scattered(scene, si, bsdf, self._matte, sampler, matte)
+        return light / dr.maximum(bsdf.eval_diffuse_reflectance(si, matte), _LEAST_ALBEDO)
 
     def _radiance(
         self,
@@ -108,7 +101,7 @@ class SplitTracer(WavefrontTracer):
         maps: Sequence[tuple[float, SoftMap]],
     ) -> mi.Color3f:
         """Return the radiance of each sample."""
-        scene = self._scene.full if moving else self._scene.empty
+        scene = self._scene_at(moving)
         hit = scene.ray_intersect_preliminary(ray)
         si = hit.compute_surface_interaction(ray)
         bsdf = si.bsdf(ray)
@@ -157,6 +150,16 @@ class SplitTracer(WavefrontTracer):
                 kept = dr.select(metal, _balance(bs.pdf, scene.pdf_emitter_direction(si, ds, lamp & metal)), 0)
             light -= dr.select(lamp, emitter.eval(met, lamp) * (1 - kept), 0)
         return dr.select(active, weight * dr.minimum(light, self.most_light), 0)
+
+
+def _launches(pixels: np.ndarray, spp: Counts, stream: Counts) -> Iterator[tuple[np.ndarray, Counts, Counts]]:
+    """Yield pixels, numbers of samples and streams of each launch, of about LANES samples at most."""
+    ends = np.cumsum(spp) if isinstance(spp, np.ndarray) else spp * np.arange(1, len(pixels) + 1)
+    launch = ends // LANES  # neighbours in the list stay together
+    bounds = [0, *(np.flatnonzero(np.diff(launch)) + 1).tolist(), len(pixels)]
+    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+        if a < b:
+            yield pixels[a:b], *(x if isinstance(x, int) else x[a:b] for x in (spp, stream))  # type: ignore[misc]
 
 
 def _lobes(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool, mi.Bool]:

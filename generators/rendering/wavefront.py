@@ -19,6 +19,7 @@ from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene, ali
 _LENS_STEPS = 6  # of Newton's method: enough for float32 where a lens moves a pixel by a fifth of the image
 _QUANTILES = 4096  # of a blurred pixel's footprint: its variance is right to 1e-3
 LANES = 1 << 22  # samples per launch; bounds memory (about 40 bytes each), changes no result
+Counts = int | np.ndarray  # a number for all pixels, or one for each [K]
 
 
 def footprint_quantiles(psf_px: float) -> np.ndarray:
@@ -147,14 +148,12 @@ class WavefrontTracer:
         return self._means(radiance, spp)
 
     def _camera_samples(
-        self, pixels: np.ndarray, spp: int, stream: int | np.ndarray, centre: bool = False
+        self, pixels: np.ndarray, spp: Counts, stream: Counts, centre: bool = False
     ) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
-        """Return view [K spp], sampler and ray of each sample; `centre`: all rays through the middle of their pixel."""
+        """Return view, sampler and ray of each sample; `centre`: all rays through the middle of their pixel."""
         listed = mi.UInt32(aligned(pixels.astype(np.uint32)))
-        lane = dr.arange(mi.UInt32, len(pixels) * spp)
-        bits = dr.opaque(mi.UInt32, spp.bit_length() - 1)
-        number = lane >> bits
-        pixel, index = dr.gather(mi.UInt32, listed, number), lane - (number << bits)
+        number, index, bits = self._lanes(len(pixels), spp)
+        pixel = dr.gather(mi.UInt32, listed, number)
         area = self._width * self._height
         view = pixel // area
         inside = pixel - view * area
@@ -168,16 +167,34 @@ class WavefrontTracer:
             offset = mi.Point2f(self._blurred(offset.x), self._blurred(offset.y))
         return view, sampler, self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
 
-    def _salt(self, stream: int | np.ndarray, spp: int, number: mi.UInt32) -> mi.UInt32:
+    def _lanes(self, count: int, spp: Counts) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Return of each sample its pixel's position in the list, its number there, and the bits of that number."""
+        if isinstance(spp, int):
+            bits = dr.opaque(mi.UInt32, spp.bit_length() - 1)
+            lane = dr.arange(mi.UInt32, count * spp)
+            number = lane >> bits
+            return number, lane - (number << bits), bits
+        number = mi.UInt32(aligned(np.repeat(np.arange(count, dtype=np.uint32), spp)))
+        first = mi.UInt32(aligned((np.cumsum(spp) - spp).astype(np.uint32)))
+        bits = mi.UInt32(aligned(np.log2(spp).astype(np.uint32)))
+        first, bits = (dr.gather(mi.UInt32, a, number) for a in (first, bits))
+        return number, dr.arange(mi.UInt32, dr.width(number)) - first, bits
+
+    def _salt(self, stream: Counts, spp: Counts, number: mi.UInt32) -> mi.UInt32:
         """Return the salt of each sample; `number` is the position of its pixel in the list."""
-        if isinstance(stream, int):
+        if isinstance(stream, int) and isinstance(spp, int):
             return dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
-        salts = (self._seed * 0x2545F491 + stream.astype(np.uint64) * 0x9E3779B1 + spp) & 0xFFFFFFFF
+        streams, counts = (np.asarray(a).astype(np.uint64) for a in (stream, spp))
+        salts = (np.uint64(self._seed * 0x2545F491 & 0xFFFFFFFF) + streams * 0x9E3779B1 + counts) & 0xFFFFFFFF
         return dr.gather(mi.UInt32, mi.UInt32(aligned(salts.astype(np.uint32))), number)
 
-    def _means(self, values: mi.Color3f, spp: int) -> np.ndarray:
+    def _means(self, values: mi.Color3f, spp: Counts) -> np.ndarray:
         """Return the means [K, 3] float32 of each pixel's samples."""
         dr.eval(values)  # the path kernel writes one colour per sample; the reductions below read it
+        if not isinstance(spp, int):
+            first = np.cumsum(spp) - spp
+            sums = np.stack([np.add.reduceat(np.array(c, np.float32), first) for c in values], 1)
+            return np.asarray(sums / spp[:, None].astype(np.float32))
         return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in values], 1) / np.float32(spp)
 
     def _blurred(self, u: mi.Float) -> mi.Float:

@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spike4dgs.generators.rendering.like_surfaces import LIKE_COSINE, LIKE_PX, RADIUS_PX, smoothed
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.generators.rendering.like_surfaces import (
+    FARTHEST,
+    LEAST_EXPONENT,
+    LIKE_COSINE,
+    LIKE_PX,
+    RADIUS_PX,
+    coverage,
+    pixel_widths,
+    places_in,
+    shared,
+    smoothed,
+)
 
 SHAPE = (2, 9, 12)
 
@@ -48,3 +60,66 @@ def test_a_step_between_two_walls_stays():
     points, widths, labels = np.zeros((*SHAPE, 3), np.float32), np.ones(SHAPE, np.float32), np.zeros(SHAPE, np.int8)
     found = smoothed(np.arange(labels.size), values, labels, points, normals, widths, 1.5)
     assert np.array_equal(found.reshape(values.shape), values)
+
+
+def a_rig() -> tuple[Camera, ...]:
+    """Two views of the plane z = 2 from a short distance apart, one of them tilted."""
+    tilt = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
+    lens = {"width": 12, "height": 9, "fx": 20.0, "fy": 20.0, "cx": 6.0, "cy": 4.5}
+    return (
+        Camera(id="a", R=np.eye(3), t=np.zeros(3), **lens),
+        Camera(id="b", R=tilt, t=np.array([-0.3, 0.02, 0.0]), **lens),
+    )
+
+
+def plain_shared(k, values, paths, labels, points, normals, widths, cameras, sigma):
+    """Return the mean and the number of views of one pixel, with every pixel of every view looked at."""
+    own, row, column = np.unravel_index(k, labels.shape)
+    point, wide = points[own, row, column].astype(np.float64), widths[own, row, column]
+    total, weight, views = np.zeros(values.shape[-1]), 0.0, 1
+    for view, camera in enumerate(cameras):
+        ((u, v),), _ = camera.project(point[None])
+        u, v = (column, row) if view == own else (u - 0.5, v - 0.5)
+        for y in range(labels.shape[1]):
+            for x in range(labels.shape[2]):
+                itself = (view, y, x) == (own, row, column)
+                apart = points[view, y, x] - point
+                like = normals[own, row, column] @ normals[view, y, x] >= LIKE_COSINE
+                like &= abs(normals[own, row, column] @ apart) <= LIKE_PX * wide
+                like &= labels[view, y, x] == labels[own, row, column] and paths[view, y, x] > 0
+                nearest = view != own and abs(x - u) <= 0.5 and abs(y - v) <= 0.5
+                views += bool(nearest and like and np.linalg.norm(apart) <= wide)
+                exponent = -((y - v) ** 2 + (x - u) ** 2) / (2 * sigma**2)
+                if max(abs(y - v), abs(x - u)) > RADIUS_PX or exponent < LEAST_EXPONENT:
+                    continue
+                if itself or like and (view == own or np.linalg.norm(apart) <= FARTHEST * wide):
+                    w = np.exp(exponent) * paths[view, y, x]
+                    total, weight = total + w * values[view, y, x], weight + w
+    return total / weight, views
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.9])
+def test_light_is_shared_by_the_views_that_see_a_point(sigma):
+    rng = np.random.default_rng(1)
+    cameras = a_rig()
+    rows, columns = np.mgrid[:9, :12] + 0.5
+    uv = np.stack([columns.ravel(), rows.ravel()], 1)
+    points = np.zeros((*SHAPE, 3), np.float32)
+    for view, camera in enumerate(cameras):  # where the rays meet the plane
+        ways = camera.unproject(uv, np.ones(len(uv))) - camera.center
+        points[view] = (camera.center + ways * ((2 - camera.center[2]) / ways[:, 2:])).reshape(9, 12, 3)
+    points[..., 2] += rng.choice([0, 0.5], SHAPE, p=[0.8, 0.2])  # another plane behind
+    normals = np.zeros_like(points)
+    normals[..., 2] = -1
+    normals[rng.random(SHAPE) < 0.1] = 0
+    labels, paths = rng.integers(0, 2, SHAPE).astype(np.int8), rng.choice([4, 8, 16], SHAPE).astype(np.int32)
+    paths[1, rng.random(SHAPE[1:]) < 0.1] = 0
+    values, widths = rng.random((*SHAPE, 3), dtype=np.float32), pixel_widths(points, cameras)
+    chosen = np.flatnonzero(paths.ravel())
+    known = chosen, paths, labels, points, normals, widths, places_in(points.reshape(-1, 3)[chosen], cameras)
+    views = coverage(*known)
+    means = shared(chosen, values, *known[1:], sigma)
+    expected = [plain_shared(k, values, paths, labels, points, normals, widths, cameras, sigma) for k in chosen]
+    assert 0.1 < np.mean(views == 2) < 0.9
+    assert np.array_equal(views, [e[1] for e in expected])
+    np.testing.assert_allclose(means, [e[0] for e in expected], rtol=1e-5)

@@ -102,9 +102,11 @@ def test_a_key_depends_on_the_seed_and_the_time_alone(r, other):
 
 @one_world
 def test_background_and_truth_of_a_view_do_not_depend_on_other_views(r):
-    alone, together = renderer(r.world, (4,), anchors_s=r._anchor_s), r
+    """But for the soft light of the whole rig, which all its views share."""
+    alone, together = renderer(r.world, (4,), anchors_s=r._anchor_s, static=r.static.views([1]), maps_of=lambda: r), r
     mask = alone.object_masks(T_S)[0]
-    assert alone.background[0].tobytes() == together.background[1].tobytes()
+    again = renderer(r.world, (4,), soft_static=r.static.views([1]).soft)
+    assert again.background[0].tobytes() == together.background[1].tobytes()
     assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
 
 
@@ -121,7 +123,8 @@ def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
         where = room[start : start + count]
         r._tracer.trace(where, spp, start, True)
         r._tracer.split(where, spp, where + 1, True, maps)
-        r._tracer.soft(where, spp, 8, where, True)
+        r._tracer.soft(where, np.full(count, spp), where, True, gloss=False)
+        r._tracer.soft(where, spp, where, True, gloss=True)
 
     rendered(0, 2000, 8)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -130,3 +133,18 @@ def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
             rendered(start, count, spp)
         launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     assert launched and all(kernel["cache_hit"] for kernel in launched)
+
+
+@one_world
+def test_views_share_soft_light_of_the_points_that_they_see(r):
+    """A point that two views see has half of the paths in each, and together about the noise of one view alone."""
+    alone = renderer(r.world, (4,), soft_static=None)
+    known = r.soft_static.paths
+    assert set(np.unique(known)) <= {4, 8, 16, 32} and (alone.soft_static.paths == SOFT.spp).all()
+    halves = known[1] <= SOFT.spp // 2
+    assert halves.mean() > 0.3
+    other = renderer(r.world, seed=5).soft_static, renderer(r.world, (4,), seed=5).soft_static
+    together = (r.soft_static.smooth[1] - other[0].smooth[1])[halves, :3]
+    single = (alone.soft_static.smooth[0] - other[1].smooth[0])[halves, :3]
+    assert np.mean(together**2) < 1.6 * np.mean(single**2)  # fewer strata
+    assert abs(np.mean(r.soft_static.smooth[1] - alone.soft_static.smooth[0])) < 0.01
