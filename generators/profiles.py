@@ -17,27 +17,31 @@ TARGET_EVERY = RATE_HZ // 1000  # ticks between ground-truth frames: 1 ms
 
 
 @dataclass(frozen=True)
-class SoftSampling:
-    """How soft light is found: see `rendering.split_render`. Paths per pixel are powers of two.
+class SplitSampling:
+    """How direct and soft light are found: see `rendering.split_render`. Paths per pixel are powers of two.
 
     Attributes:
-        spp: paths of the matte lobe for each pixel of a map.
-        gloss_spp: paths of a coat's gloss, which reflects a few percent.
+        paths: of the matte lobe for each surface point of a map, by all views that see it.
+        gloss_paths: of a coat's gloss, which reflects a few percent, in each pixel of a map.
         sigma_px: of the Gaussian weights with which a map is smoothed over each surface.
         anchor_px: motion of the fastest point between two maps.
+        spread: standard deviation of single samples of direct light for which a pixel has one; their number goes with
+            its power 0.85.
     """
 
-    spp: int
-    gloss_spp: int
+    paths: int
+    gloss_paths: int
     sigma_px: float
     anchor_px: float
+    spread: float
 
 
 @dataclass(frozen=True)
 class Profile:
     """Size and sampling of a scene. Samples per pixel are powers of two.
 
-    Without `soft`, every sample is a whole path; with it, one of direct light.
+    Without `soft`, every sample is a whole path. With it one is direct light; `spp` and `target_spp` are the most of a
+    pixel, whose number is chosen.
     """
 
     views: tuple[int, ...]  # of the 3x3 array; 4, the centre, is held out
@@ -49,8 +53,8 @@ class Profile:
     target_spp: int  # of ground truth, in the pixels that change
     max_key_px: float  # largest motion of an image point between two of its keys
     sparse_every: int  # ticks between the ground-truth frames of the cameras that are not held out
-    soft: SoftSampling | None = None  # of key frames
-    target_soft: SoftSampling | None = None  # of ground truth
+    soft: SplitSampling | None = None  # of key frames
+    target_soft: SplitSampling | None = None  # of ground truth
 
 
 _ALL = tuple(range(9))
@@ -84,10 +88,9 @@ TRACKS = {
     "paper": Track("paper", (PUBLIC_VARIANT,), IDEAL),  # the size of the paper's scenes
 }
 
-# Noise of moving objects, from pairs of renderings of variant 10 at small: 46.4 dB (motor) to 51.1 (bird) in streams,
-# 52.1 to 59.4 in truth (docs/results/rendering.md). Streams and truth smooth alike and have maps at the same times, so
-# that what smoothing changes is the same light in both. Twice the pixels a metre smooth over as much of the surface
-# with twice the sigma, less a margin, and may move twice as far between two maps.
+# Noise where objects move, from pairs of renderings of variant 10: docs/results/rendering.md. Streams and truth smooth
+# alike and have maps at the same times, so that what smoothing changes is the same light in both. Twice the pixels a
+# metre smooth over as much of the surface with twice the sigma, less a margin, and may move twice as far between maps.
 SPLIT_PROFILES: dict[str, Profile] = {
     "tiny": Profile(
         (0, 2, 4, 7),
@@ -95,18 +98,38 @@ SPLIT_PROFILES: dict[str, Profile] = {
         40,
         0.004,
         32,
-        64,
+        32,
         128,
         0.5,
         40,
-        SoftSampling(32, 8, 0.5, 4),
-        SoftSampling(64, 16, 0.5, 4),
+        SplitSampling(32, 8, 0.5, 4, 0.0026),
+        SplitSampling(64, 16, 0.5, 4, 0.00045),
     ),
     "small": Profile(
-        _ALL, 200, 125, 0.02, 64, 64, 256, 0.25, 100, SoftSampling(64, 16, 0.5, 4), SoftSampling(128, 32, 0.5, 4)
+        _ALL,
+        200,
+        125,
+        0.02,
+        64,
+        64,
+        256,
+        0.25,
+        100,
+        SplitSampling(64, 16, 0.5, 4, 0.0026),
+        SplitSampling(128, 32, 0.5, 4, 0.00045),
     ),
     "paper": Profile(
-        _ALL, 400, 250, 0.1, 64, 64, 256, 0.25, 400, SoftSampling(32, 8, 0.8, 8), SoftSampling(64, 16, 0.8, 8)
+        _ALL,
+        400,
+        250,
+        0.1,
+        64,
+        64,
+        256,
+        0.25,
+        400,
+        SplitSampling(32, 8, 0.8, 8, 0.0026),
+        SplitSampling(64, 16, 0.8, 8, 0.00045),
     ),
 }
 

@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.physics import from_settings, true_cameras
-from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, SoftSampling
+from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, SplitSampling
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
+from spike4dgs.generators.rendering.like_surfaces import join_soft
 from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene
 
 _POINTS_PER_VIEW = 250  # of the sparse model
-_PIXELS = 1 << 14  # of a range of the background, or more: a second of work or longer
+_PIXELS = 1 << 15  # of a range of the background, or more: a second of work or longer
 _MOST_PARTS = 32
 _OF_SPLIT = ("soft_static", "maps_of")  # arguments that renderers of whole paths have not
 Watch = Callable[[str, Iterable[Any], int], Iterator[Any]]
@@ -56,7 +57,7 @@ def recorded_job(source: Mapping[str, Any]) -> Job | None:
 
 
 def _recorded_profile(sampling: Mapping[str, Any]) -> Profile:
-    soft = {name: SoftSampling(**sampling[name]) for name in ("soft", "target_soft") if name in sampling}
+    soft = {name: SplitSampling(**sampling[name]) for name in ("soft", "target_soft") if name in sampling}
     return Profile(**{**sampling, **soft, "views": tuple(sampling["views"])})
 
 
@@ -288,13 +289,12 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
     which = "background of the truth" if truth else "background"
     sampling, soft = (p.target_soft if truth else p.soft), None
     if sampling is not None:
-        from spike4dgs.generators.rendering.split_render import join_soft
-
         soft = join_soft(rendered(RenderSoft(job, truth), f"soft {which}"), cameras, sampling.sigma_px)
     own = other is None or soft is not None
     found = rendered(RenderStatic(job, truth, own, soft), which)
-    images = [np.concatenate(parts).reshape(*shape, 3) for parts in zip(*found, strict=True)]
-    if other is None or own:
-        background, first = images
-        return StaticViews(background, first, soft)
+    images = [(a := np.concatenate(parts)).reshape(*shape, *a.shape[1:]) for parts in zip(*found, strict=True)]
+    if soft is not None:
+        return StaticViews(images[0], images[0], soft, images[1])
+    if other is None:
+        return StaticViews(*images)
     return StaticViews(other.background, images[0])

@@ -13,6 +13,7 @@ import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
+from spike4dgs.generators.rendering.render import SoftStatic
 
 LIKE_COSINE = 0.85  # between the normals of points that share soft light
 LIKE_PX = 0.7  # distance of a point from the other's tangent plane, in widths of a pixel
@@ -30,12 +31,11 @@ def pixel_widths(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 def places_in(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Return column and row [K, C, 2] float32, 0 at the centre of the first pixel, of points [K, 3] in all views.
 
-    NaN where a view does not show the point.
+    NaN where a point is behind a camera. Beyond the fold of a lens places are wrong: no like surface is seen there.
     """
+    rows = [[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
     out = np.full((len(points), len(cameras), 2), np.nan, np.float32)
-    for view, camera in enumerate(cameras):
-        uv, z = camera.project(points)
-        out[:, view] = np.where(z[:, None] > 0, uv - 0.5, np.nan)
+    in_threads(_places, len(points), points.astype(np.float64), np.array(rows), out, small=len(points) < 1000)
     return out
 
 
@@ -72,16 +72,19 @@ def shared(
 ) -> np.ndarray:
     """Return weighted means [K, D] float32 of `values` around flat `pixels` [K], on like surfaces in all views.
 
-    In its own view a pixel takes from the same pixels as in `smoothed`; in another view from those around its surface
-    point's place, if their points are within FARTHEST widths of a pixel of it. Weights are `paths` times a Gaussian
-    of the distance in px, without its tails.
+    In its own view a pixel takes from those within RADIUS_PX with its label, a normal within LIKE_COSINE of its own and
+    a point near its tangent plane; in another view from those around its surface point's place, if their points are
+    also within FARTHEST widths of a pixel of it. Weights are `paths` times a Gaussian of the distance in px, cut.
 
     Args:
         pixels: flat numbers of the pixels.
         values: [C, H, W, D].
         paths: [C, H, W] int32, the samples of each value; 0 for none.
-        labels, points, normals, widths: as in `smoothed`.
-        places: [K, C, 2] from `places_in`, of the pixels' points.
+        labels: [C, H, W] int8.
+        points: [C, H, W, 3] positions of the surface points.
+        normals: [C, H, W, 3], unit.
+        widths: [C, H, W], width of a pixel at the point in metres.
+        places: [K, C, 2] from `places_in`, of the pixels' points; NaN leaves a view out.
         sigma_px: of the Gaussian weights.
     """
     out = np.zeros((len(pixels), values.shape[-1]), np.float32)
@@ -90,72 +93,57 @@ def shared(
     return out
 
 
-def smoothed(
-    pixels: np.ndarray,
-    values: np.ndarray,
+def join_soft(parts: Sequence[tuple[np.ndarray, ...]], cameras: Sequence[Camera], sigma_px: float) -> SoftStatic:
+    """Return the background's map of the results of `SplitRenderer.soft_at` for all pixels in order."""
+    shape = len(cameras), cameras[0].height, cameras[0].width
+    points, normals, paths, first = (np.concatenate(p).reshape(*shape, -1) for p in zip(*parts, strict=True))
+    paths, labels = paths[..., 0], np.zeros(shape, np.int8)
+    smooth = smoothed_light(np.arange(labels.size), first, paths, labels, points, normals, cameras, sigma_px)
+    return SoftStatic(points, normals, paths, first, smooth.reshape(first.shape))
+
+
+def smoothed_light(
+    where: np.ndarray,
+    light: np.ndarray,
+    paths: np.ndarray,
     labels: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
-    widths: np.ndarray,
+    cameras: Sequence[Camera],
     sigma_px: float,
 ) -> np.ndarray:
-    """Return the weighted means [K, D] float32 of `values` around the flat `pixels` [K], over like surfaces alone.
-
-    A pixel takes from those within RADIUS_PX in its view that have its label, a normal within LIKE_COSINE of its own,
-    and a point near its tangent plane.
-
-    Args:
-        pixels: flat numbers of the pixels to smooth.
-        values: [C, H, W, D].
-        labels: [C, H, W] int8.
-        points: [C, H, W, 3] positions of the surface points.
-        normals: [C, H, W, 3], unit.
-        widths: [C, H, W], width of a pixel at the point in metres.
-        sigma_px: of the Gaussian weights.
-    """
-    out = np.zeros((len(pixels), values.shape[-1]), np.float32)
-    arrays = pixels, values, labels, points, normals, widths
-    in_threads(_smooth, len(pixels), *arrays, sigma_px, out, small=len(pixels) < 1000)
-    return out
+    """Return soft light [K, 6] at flat pixels: matte light is a mean over all views, gloss over one."""
+    widths = pixel_widths(points, cameras)
+    matte, gloss = (np.ascontiguousarray(light[..., part]) for part in (slice(3), slice(3, 6)))
+    places = places_in(points.reshape(-1, 3)[where], cameras)
+    nowhere = np.full_like(places, np.nan)
+    return np.concatenate(
+        [
+            shared(where, matte, paths, labels, points, normals, widths, places, sigma_px),
+            shared(where, gloss, np.minimum(paths, 1), labels, points, normals, widths, nowhere, sigma_px),
+        ],
+        1,
+    )
 
 
 @kernel
-def _smooth(
-    pixels: Any,
-    values: Any,
-    labels: Any,
-    points: Any,
-    normals: Any,
-    widths: Any,
-    sigma: float,
-    out: Any,
-    start: int,
-    stop: int,
-) -> None:
-    _, height, width = labels.shape
-    area = height * width
+def _places(points: Any, cameras: Any, out: Any, start: int, stop: int) -> None:
     for k in range(start, stop):
-        view, inside = pixels[k] // area, pixels[k] % area
-        row, column = inside // width, inside % width
-        normal, point = normals[view, row, column], points[view, row, column]
-        far = LIKE_PX * widths[view, row, column]
-        total, weight = np.zeros(out.shape[1]), 0.0
-        for y in range(max(row - RADIUS_PX, 0), min(row + RADIUS_PX + 1, height)):
-            for x in range(max(column - RADIUS_PX, 0), min(column + RADIUS_PX + 1, width)):
-                if labels[view, y, x] != labels[view, row, column]:
-                    continue
-                cosine, off = 0.0, 0.0
-                for i in range(3):
-                    cosine += normal[i] * normals[view, y, x, i]
-                    off += normal[i] * (points[view, y, x, i] - point[i])
-                if (cosine < LIKE_COSINE or abs(off) > far) and not (y == row and x == column):
-                    continue
-                w = np.exp(-0.5 * ((y - row) ** 2 + (x - column) ** 2) / sigma**2)
-                weight += w
-                for i in range(out.shape[1]):
-                    total[i] += w * values[view, y, x, i]
-        for i in range(out.shape[1]):
-            out[k, i] = total[i] / weight
+        for view in range(len(cameras)):
+            c = cameras[view]
+            x, y, z = (
+                c[0] * points[k, 0] + c[1] * points[k, 1] + c[2] * points[k, 2] + c[9],
+                c[3] * points[k, 0] + c[4] * points[k, 1] + c[5] * points[k, 2] + c[10],
+                c[6] * points[k, 0] + c[7] * points[k, 1] + c[8] * points[k, 2] + c[11],
+            )
+            if z <= 0:
+                continue
+            x, y = x / z, y / z
+            s = x * x + y * y
+            radial = 1 + s * (c[16] + s * (c[17] + s * c[20]))
+            u = x * radial + 2 * c[18] * x * y + c[19] * (s + 2 * x * x)
+            v = y * radial + 2 * c[19] * x * y + c[18] * (s + 2 * y * y)
+            out[k, view, 0], out[k, view, 1] = c[12] * u + c[14] - 0.5, c[13] * v + c[15] - 0.5
 
 
 @kernel

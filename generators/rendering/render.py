@@ -62,24 +62,27 @@ class SoftStatic:
 class StaticViews:
     """The views without moving objects, linear RGB [C, H, W, 3] float32.
 
-    `background` is at full quality, `first` has the random numbers, and therefore the noise, of keys; `soft` is of a
-    `split_render.SplitRenderer`.
+    `background` is at full quality, `first` has the noise of keys; `soft` and `samples` [C, H, W], numbers of samples,
+    are of a `split_render.SplitRenderer`.
     """
 
     background: np.ndarray
     first: np.ndarray
     soft: SoftStatic | None = None
+    samples: np.ndarray | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays for a file or another process."""
         soft = {f"soft_{name}": array for name, array in vars(self.soft).items()} if self.soft else {}
+        soft |= {"samples": self.samples} if self.samples is not None else {}
         return {"background": self.background, "first": self.first, **soft}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> StaticViews:
         """Return the views from the result of `arrays`."""
         soft = {name.removeprefix("soft_"): a for name, a in arrays.items() if name.startswith("soft_")}
-        return StaticViews(arrays["background"], arrays["first"], SoftStatic(**soft) if soft else None)
+        given = SoftStatic(**soft) if soft else None, arrays.get("samples")
+        return StaticViews(arrays["background"], arrays["first"], *given)
 
     def views(self, chosen: Sequence[int]) -> StaticViews:
         """Return a selection of the views."""
@@ -197,7 +200,7 @@ class MultiViewRenderer(Visibility):
 
     def crn_frames(self, t_s: float) -> np.ndarray:
         """Return all pixels traced at `t_s` with the random numbers of `keys`, to measure the error of `keys`."""
-        rgb = self._whole(self.spp, 0, t_s)
+        rgb = self._rgb_at(np.arange(int(np.prod(self.shape))), self.spp, 0, t_s).reshape(*self.shape, 3)
         return rgb if self.color else gray(rgb)
 
     def reference_frames(self, t_s: float, spp: int) -> np.ndarray:
@@ -223,10 +226,6 @@ class MultiViewRenderer(Visibility):
         return np.ones(self.shape, bool) if self.whole_frames else super().traced(t_s)
 
     # ------------------------------------------------------------ internals
-
-    def _whole(self, spp: int, stream: int, t_s: float | None) -> np.ndarray:
-        """Return every pixel traced, linear RGB [C, H, W, 3]."""
-        return self._rgb_at(np.arange(int(np.prod(self.shape))), spp, stream, t_s).reshape(*self.shape, 3)
 
     def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
         """Return the radiance [K] or [K, 3] of the flat pixels `where` of a key."""

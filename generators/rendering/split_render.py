@@ -1,13 +1,17 @@
 """Key frames by `split_tracer`: soft light comes from maps, which noise does not outlive.
 
 Soft light over the albedo is smooth on every surface and changes slowly with it. `soft` paths find it at the centres of
-pixels, at anchor times, and it is averaged over like surfaces around each pixel. A
+pixels, at anchor times. It is averaged over like surfaces around each pixel, matte light over those of all views. A
 key carries each of its samples along the exact motion of its surface to the anchors before and after, and blends what
 their maps have there.
 
+Numbers of samples. A fifth of the pixels, at edges, has nearly all the noise of direct light. Pilot samples, which no
+image has, tell how widely a pixel's samples spread: of the background once, of moving surfaces at anchors, from where
+keys take it along the motion.
+
 Random numbers. A key's samples near moving objects have numbers that no other key has: their noise is independent in
-time. Elsewhere they have the same numbers at all times, and what counts is the difference that they see to the
-background. Soft light on moving surfaces has numbers of its anchor, so its noise travels with the surface.
+time. Elsewhere they have those of the background. Soft light on moving surfaces has numbers of its anchor, so its
+noise travels with the surface; on static ones what counts is the difference to the background.
 
 Streams and ground truth have the same anchor times: what carrying and blending change is the same light in both.
 
@@ -17,24 +21,30 @@ ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import maximum_filter, uniform_filter
 
-from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
-from spike4dgs.generators.profiles import SoftSampling
-from spike4dgs.generators.rendering.like_surfaces import coverage, pixel_widths, places_in, shared, smoothed
+from spike4dgs.generators.profiles import SplitSampling
+from spike4dgs.generators.rendering.like_surfaces import coverage, join_soft, pixel_widths, places_in, smoothed_light
 from spike4dgs.generators.rendering.render import MAX_DEPTH, MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 
 _NEAR_PX = 1  # around moving objects: pixels that may see one
 _MOVED = 0.1  # distance in widths of a pixel by which a point differs from the background's
 _MOST_MAPS = 4
 _LEAST_PATHS = 4
-_KEYS, _MAPS = 1 << 20, 1 << 28  # first of the streams of keys and of maps; those below are the background's
+# First streams of keys, of maps and of pilots; those below are the background's.
+_KEYS, _MAPS, _PILOTS = 1 << 20, 1 << 28, 3 << 28
+_EDGE_PX = 2  # around the edge of a shadow
+_LEAST_SAMPLES = 4
+_BACKGROUND = 2  # its noise is half of the keys': all images have it, and it is rendered once
+# Samples of a pixel go with this power of the spread. Errors of n stratified samples fall as n^-0.85: 1 / 0.85 would
+# give all pixels the same noise, 2 / (1 + 2 * 0.85) = 0.74 the least noise in total.
+_POWER = 0.85
 
 
 class SplitRenderer(MultiViewRenderer):
@@ -43,16 +53,16 @@ class SplitRenderer(MultiViewRenderer):
     def __init__(
         self,
         *args: Any,
-        soft: SoftSampling,
+        soft: SplitSampling,
         anchors_s: float | None = None,
         soft_static: SoftStatic | None = None,
         maps_of: Callable[[], SplitRenderer] | None = None,
         **others: Any,
     ) -> None:
-        """Load the world; see `MultiViewRenderer`. `spp` and `background_spp` are the samples of direct light.
+        """Load the world; see `MultiViewRenderer`. `spp`: the most samples in a pixel.
 
         Args:
-            soft: samples of soft light.
+            soft: samples of soft light, and how many direct light has.
             anchors_s: seconds between maps, as for a rig of which these cameras are a part; if None, by their motion.
             soft_static: that of a renderer with the same arguments, where `static` is not given.
             maps_of: returns a renderer of the whole rig, whose maps these views of it take.
@@ -62,6 +72,7 @@ class SplitRenderer(MultiViewRenderer):
         self._maps: dict[float | None, Any] = {}
         self._arrays: dict[float, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         self._maps_of = maps_of
+        self._spreads: dict[float, np.ndarray] = {}
         known = others.get("static")
         if (given := soft_static if known is None else known.soft) is not None:
             self.soft_static = given
@@ -76,16 +87,12 @@ class SplitRenderer(MultiViewRenderer):
 
     def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
         """Return the radiance [K] or [K, 3] of the flat pixels `where` of a key."""
-        own = _KEYS + round(t_s * 1e7)
-        near = maximum_filter(self.object_masks(t_s), size=(1, 2 * _NEAR_PX + 1, 2 * _NEAR_PX + 1)).ravel()[where]
-        near |= self.whole_frames
-        rgb = self._rgb_at(where, self.spp, np.where(near, own, 0), t_s)
-        traced = rgb if self.color else gray(rgb)
-        background, first = (self._flat(image)[where] for image in (self.background, self._first))
-        seen = near[:, None] if self.color else near
-        return np.asarray(np.where(seen, traced, np.maximum(traced + (background - first), 0)))
+        near, samples = self._sampling(where, t_s)
+        self._scene.set_time(t_s)
+        rgb = self._rgb_at(where, samples, np.where(near, _KEYS + round(t_s * 1e7), 0), t_s)
+        return rgb if self.color else gray(rgb)
 
-    def _rgb_at(self, pixels: np.ndarray, spp: int, stream: Any, t_s: float | None) -> np.ndarray:
+    def _rgb_at(self, pixels: np.ndarray, spp: Any, stream: Any, t_s: float | None) -> np.ndarray:
         """Return linear RGB [K, 3] of flat pixels; `t_s` None: without moving objects."""
         maps, moving = self._maps_at(t_s), t_s is not None
         if t_s is not None:
@@ -93,13 +100,89 @@ class SplitRenderer(MultiViewRenderer):
         rgb = self._tracer.split(pixels, spp, stream, moving, maps)
         return np.asarray(rgb * np.float32(self.world.exposure))
 
-    # ------------------------------------------------------------ soft light
+    # ------------------------------------------------------------ numbers of samples
+
+    def _sampling(self, where: np.ndarray, t_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return which of the flat pixels [K] may see a moving object, and their samples in a key."""
+        near = _around(self.object_masks(t_s), _NEAR_PX).ravel()[where]
+        if self.whole_frames:
+            return np.ones_like(near), np.full(len(where), self.spp)
+        moving = _around(self._carried_spread(where, t_s), _NEAR_PX).ravel()[where]
+        static = np.where(self._shadow_edges(t_s).ravel()[where], self.spp, self._static_samples.ravel()[where])
+        return near, np.where(near, self._samples(moving), static)
+
+    def _samples(self, spread: np.ndarray) -> np.ndarray:
+        """Return the samples that the standard deviations of single ones, before exposure, ask for: powers of two."""
+        wanted = (spread * self.world.exposure / self.soft.spread) ** _POWER
+        return 2 ** np.ceil(np.log2(np.clip(wanted, min(_LEAST_SAMPLES, self.spp), self.spp))).astype(np.int64)
+
+    def _shadow_edges(self, t_s: float) -> np.ndarray:
+        """Return [C, H, W] bool: the pixels with both light and shadow of moving objects nearby."""
+        edges = np.zeros(self.shape, bool)
+        for shadow, flagged, _ in self._snapshot(t_s).shadows:
+            dark = np.zeros(self.shape, bool)
+            dark.ravel()[shadow.pixels[flagged]] = True
+            edges |= _around(dark, _EDGE_PX) & _around(~dark, _EDGE_PX)
+        return edges
+
+    def _carried_spread(self, where: np.ndarray, t_s: float) -> np.ndarray:
+        """Return [C, H, W]: what `_spread` had at the nearest anchor where moving surfaces were that are seen now.
+
+        In and around the flat pixels `where`; elsewhere, and on static surfaces, 0. Infinite where no view had it.
+        """
+        anchor = round(t_s / self._anchor_s) * self._anchor_s
+        known, wanted, spread = self._spread(anchor), np.zeros(self.shape, bool), np.zeros(self.shape, np.float32)
+        wanted.ravel()[where] = True
+        snapshot = self._snapshot(t_s)
+        seen = np.flatnonzero(_around(wanted, _NEAR_PX).ravel() & snapshot.seen)
+        moved = self._moved(seen, snapshot, t_s, anchor)
+        view, inside = seen // known[0].size, np.zeros(len(seen), bool)
+        at = np.floor(places_in(moved, self.cameras)[np.arange(len(seen)), view] + 0.5)
+        inside = (at >= 0).all(1) & (at[:, 0] < self.shape[2]) & (at[:, 1] < self.shape[1])
+        column, row = np.where(inside[:, None], at, 0).astype(np.int64).T
+        spread.ravel()[seen] = np.where(inside, known[view, row, column], np.inf)
+        return spread
+
+    def _spread(self, t_s: float) -> np.ndarray:
+        """Return the spread [C, H, W] of single samples around each pixel that may see a moving object at an anchor."""
+        if t_s not in self._spreads:
+            if len(self._spreads) >= _MOST_MAPS:  # times usually ascend, as of maps
+                del self._spreads[min(self._spreads)]
+            near, own = _around(self.object_masks(t_s), _NEAR_PX), _PILOTS + round(t_s * 1e7)
+            half = (0.5, self._map(t_s))  # twice: so it is the kernel of keys
+            self._scene.set_time(t_s)
+            self._spreads[t_s] = self._piloted(near, own, True, [half, half])
+        return self._spreads[t_s]
+
+    def _piloted(self, chosen: np.ndarray, stream: int, moving: bool, maps: list[tuple[float, Any]]) -> np.ndarray:
+        """Return the spread [C, H, W] by pilot samples of the `chosen` pixels [C, H, W], a root mean square of 3x3."""
+        where, squares = np.flatnonzero(chosen), np.zeros(self.shape, np.float32)
+        squares.ravel()[where] = self._tracer.spread(where, np.full(len(where), stream), moving, maps) ** 2
+        count = uniform_filter(chosen.astype(np.float32), size=(1, 3, 3), mode="constant")
+        mean = uniform_filter(squares, size=(1, 3, 3), mode="constant") / np.maximum(count, 1 / 9)
+        return np.sqrt(np.maximum(mean, 0))
+
+    @cached_property
+    def _static_samples(self) -> np.ndarray:
+        """The samples [C, H, W] of the background."""
+        if "static" in self.__dict__ and self.static.samples is not None:
+            return self.static.samples.astype(np.int64)
+        spread = self._piloted(np.ones(self.shape, bool), _PILOTS - 1, False, self._maps_at(None))
+        return self._samples(_BACKGROUND * spread)
 
     @cached_property
     def static(self) -> StaticViews:
         """The views without moving objects."""
-        views = super().static
-        return StaticViews(views.background, views.first, self.soft_static)
+        background, samples = self.static_at(np.arange(int(np.prod(self.shape))))
+        background = background.reshape(*self.shape, 3)
+        return StaticViews(background, background, self.soft_static, samples.reshape(self.shape))
+
+    def static_at(self, pixels: np.ndarray, background: bool = True) -> tuple[np.ndarray, ...]:
+        """Return the background [K, 3] at flat pixels and its numbers of samples [K]; keys have the same numbers."""
+        samples = self._static_samples.ravel()[pixels]
+        return self._rgb_at(pixels, samples, np.zeros(len(pixels), np.int64), None), samples.astype(np.uint16)
+
+    # ------------------------------------------------------------ soft light
 
     @cached_property
     def soft_static(self) -> SoftStatic:
@@ -128,7 +211,9 @@ class SplitRenderer(MultiViewRenderer):
         known.ravel()[where] = 1
         places = places_in(points.reshape(-1, 3)[where], self.cameras)
         views = coverage(where, known, labels, points, normals, pixel_widths(points, self.cameras), places)
-        return np.maximum(_LEAST_PATHS, 2 ** np.ceil(np.log2(self.soft.spp / views)).astype(np.int32)).astype(np.int32)
+        return np.maximum(_LEAST_PATHS, 2 ** np.ceil(np.log2(self.soft.paths / views)).astype(np.int32)).astype(
+            np.int32
+        )
 
     def _paths_light(
         self, where: np.ndarray, coated: np.ndarray, paths: np.ndarray, streams: int | np.ndarray, moving: bool
@@ -137,7 +222,7 @@ class SplitRenderer(MultiViewRenderer):
         found = np.zeros((len(where), 6), np.float32)
         found[:, :3] = self._tracer.soft(where, paths, streams, moving, gloss=False)
         own = streams if isinstance(streams, int) else streams[coated]
-        found[coated, 3:] = self._tracer.soft(where[coated], self.soft.gloss_spp, own, moving, gloss=True)
+        found[coated, 3:] = self._tracer.soft(where[coated], self.soft.gloss_paths, own, moving, gloss=True)
         return found
 
     def _maps_at(self, t_s: float | None) -> list[tuple[float, Any]]:
@@ -204,33 +289,6 @@ class SplitRenderer(MultiViewRenderer):
         return points, normals, light
 
 
-def join_soft(parts: Sequence[tuple[np.ndarray, ...]], cameras: Sequence[Camera], sigma_px: float) -> SoftStatic:
-    """Return the background's map of the results of `SplitRenderer.soft_at` for all pixels in order."""
-    shape = len(cameras), cameras[0].height, cameras[0].width
-    points, normals, paths, first = (np.concatenate(p).reshape(*shape, -1) for p in zip(*parts, strict=True))
-    paths, labels = paths[..., 0], np.zeros(shape, np.int8)
-    smooth = smoothed_light(np.arange(labels.size), first, paths, labels, points, normals, cameras, sigma_px)
-    return SoftStatic(points, normals, paths, first, smooth.reshape(first.shape))
-
-
-def smoothed_light(
-    where: np.ndarray,
-    light: np.ndarray,
-    paths: np.ndarray,
-    labels: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    cameras: Sequence[Camera],
-    sigma_px: float,
-) -> np.ndarray:
-    """Return soft light [K, 6] at flat pixels: matte light is a mean over all views, gloss over one."""
-    widths = pixel_widths(points, cameras)
-    matte, gloss = (np.ascontiguousarray(light[..., part]) for part in (slice(3), slice(3, 6)))
-    places = places_in(points.reshape(-1, 3)[where], cameras)
-    return np.concatenate(
-        [
-            shared(where, matte, paths, labels, points, normals, widths, places, sigma_px),
-            smoothed(where, gloss, labels, points, normals, widths, sigma_px),
-        ],
-        1,
-    )
+def _around(images: np.ndarray, reach_px: int) -> np.ndarray:
+    """Return the largest value within some pixels of each [C, H, W]."""
+    return np.asarray(maximum_filter(images, size=(1, 2 * reach_px + 1, 2 * reach_px + 1)))

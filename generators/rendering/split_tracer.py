@@ -22,10 +22,12 @@ import mitsuba as mi
 import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.rendering.soft_map import LEAST_WEIGHT, SoftMap, SoftMaps
 from spike4dgs.generators.rendering.wavefront import LANES, Counts, WavefrontTracer
 
+PILOT = 4  # samples from which the number of a pixel's samples is chosen, a power of two
 _LEAST_ALBEDO = 1e-3
 # Radiance of a soft path, at most: some four times that of white paper in the sun. Rarely a path finds a caustic, the
 # sun in somebody's varnish, which is twenty times as bright; smoothed, it would be a spot of several pixels.
@@ -57,6 +59,18 @@ class SplitTracer(WavefrontTracer):
             view, sampler, ray = self._camera_samples(some, counts, streams)
             parts.append(self._means(self._radiance(view, sampler, ray, moving, maps), counts))
         return np.concatenate(parts)
+
+    def spread(
+        self, pixels: np.ndarray, stream: Counts, moving: bool, maps: Sequence[tuple[float, SoftMap]]
+    ) -> np.ndarray:
+        """Return the standard deviations [K] of PILOT samples of each pixel's gray radiance, as `split` has them."""
+        parts = [np.zeros((0, PILOT), np.float32)]
+        for some, counts, streams in _launches(pixels, PILOT, stream):
+            view, sampler, ray = self._camera_samples(some, counts, streams)
+            radiance = self._radiance(view, sampler, ray, moving, maps)
+            dr.eval(radiance)
+            parts.append(gray(np.stack([np.array(c, np.float32) for c in radiance], 1)).reshape(-1, PILOT))
+        return np.asarray(np.concatenate(parts).std(1, ddof=1))
 
     def surfaces(self, pixels: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the points and normals [K, 3] that the centres of `pixels` see (0: nothing), and which have a coat."""

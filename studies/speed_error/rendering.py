@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.scene.images import gray
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, Job, SoftSampling
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, Job, SplitSampling
 from spike4dgs.generators.render_tasks import (
     RenderKeys,
     StaticParts,
@@ -244,7 +244,7 @@ def split_light(request: Request) -> Iterator[Series]:
     Whole paths with 16 times the samples.
 
     Nearly all the noise of a path is soft light, and that is smooth on every surface once it is divided by the albedo.
-    The time is that of a whole image, with the maps around it at hand.
+    The time is that of a whole image with the most samples in every pixel, and with the maps around it at hand.
 
     tests/studies/speed_error/test_rendering.py
     """
@@ -258,14 +258,14 @@ def split_series(job: Job, repeats: int) -> Series:
 
     t_s, view, world = (job.n_ticks // 2 + 0.25) / RATE_HZ, held_out_view(job), world_of(job)
     camera, split = cameras_of(job)[view : view + 1], SPLIT_PROFILES[job.profile_name]
-    ways: dict[str, tuple[int, SoftSampling | None, Role]] = {
+    ways: dict[str, tuple[int, SplitSampling | None, Role]] = {
         f"paths, {job.profile.spp} samples": (job.profile.spp, None, ""),
         f"paths, {16 * job.profile.spp} samples": (16 * job.profile.spp, None, "exact"),
         f"maps, {split.spp} samples": (split.spp, split.soft, "chosen"),
         f"maps, {split.target_spp} samples": (split.target_spp, split.target_soft, ""),
     }
 
-    def image(spp: int, soft: SoftSampling | None, seed: int) -> Callable[[], NDArray[np.float32]]:
+    def image(spp: int, soft: SplitSampling | None, seed: int) -> Callable[[], NDArray[np.float32]]:
         make = MultiViewRenderer if soft is None else partial(SplitRenderer, soft=soft)
         renderer = make(world, camera, seed=job.seed + seed, spp=spp, background_spp=spp)
         return lambda: renderer.crn_frames(t_s)[0]

@@ -16,10 +16,15 @@ from spike4dgs.generators.rendering.like_surfaces import (
     pixel_widths,
     places_in,
     shared,
-    smoothed,
 )
 
 SHAPE = (2, 9, 12)
+
+
+def smoothed(pixels, values, labels, points, normals, widths, sigma):
+    """Return the means in the pixels' own views alone."""
+    nowhere = np.full((len(pixels), len(labels), 2), np.nan, np.float32)
+    return shared(pixels, values, np.ones(labels.shape, np.int32), labels, points, normals, widths, nowhere, sigma)
 
 
 def plain(k, values, labels, points, normals, widths, sigma):
@@ -32,8 +37,9 @@ def plain(k, values, labels, points, normals, widths, sigma):
             normal = normals[view, row, column].astype(np.float64)
             off = normal @ (points[view, y, x].astype(np.float64) - points[view, row, column])
             like = normal @ normals[view, y, x] >= LIKE_COSINE and abs(off) <= LIKE_PX * widths[view, row, column]
-            if like or (y, x) == (row, column):
-                w = np.exp(-((y - row) ** 2 + (x - column) ** 2) / (2 * sigma**2))
+            exponent = -((y - row) ** 2 + (x - column) ** 2) / (2 * sigma**2)
+            if (like and exponent >= LEAST_EXPONENT) or (y, x) == (row, column):
+                w = np.exp(exponent)
                 total, weight = total + w * values[view, y, x], weight + w
     return total / weight
 

@@ -140,11 +140,42 @@ def test_views_share_soft_light_of_the_points_that_they_see(r):
     """A point that two views see has half of the paths in each, and together about the noise of one view alone."""
     alone = renderer(r.world, (4,), soft_static=None)
     known = r.soft_static.paths
-    assert set(np.unique(known)) <= {4, 8, 16, 32} and (alone.soft_static.paths == SOFT.spp).all()
-    halves = known[1] <= SOFT.spp // 2
+    assert set(np.unique(known)) <= {4, 8, 16, 32} and (alone.soft_static.paths == SOFT.paths).all()
+    halves = known[1] <= SOFT.paths // 2
     assert halves.mean() > 0.3
     other = renderer(r.world, seed=5).soft_static, renderer(r.world, (4,), seed=5).soft_static
     together = (r.soft_static.smooth[1] - other[0].smooth[1])[halves, :3]
     single = (alone.soft_static.smooth[0] - other[1].smooth[0])[halves, :3]
     assert np.mean(together**2) < 1.6 * np.mean(single**2)  # fewer strata
     assert abs(np.mean(r.soft_static.smooth[1] - alone.soft_static.smooth[0])) < 0.01
+
+
+@one_world
+def test_each_pixel_has_samples_of_its_own(r):
+    """The same as of pixels traced apart, each group with its number; and no pixel knows of others in the list."""
+    where = np.flatnonzero(r.traced(T_S))
+    near, samples = r._sampling(where, T_S)
+    assert len(np.unique(samples)) > 2 and samples.min() >= 4 and samples.max() <= SPP
+    assert near[r.object_masks(T_S).ravel()[where]].all()
+    values, streams = r._traced_at(where, T_S), np.where(near, 77, 0)
+    assert np.array_equal(r._traced_at(where[::3], T_S), values[::3])
+    together = r._rgb_at(where, samples, streams, T_S)
+    for n in np.unique(samples):
+        mine = samples == n
+        apart = r._rgb_at(where[mine], int(n), streams[mine], T_S)
+        np.testing.assert_allclose(together[mine], apart, rtol=1e-5, atol=1e-6)
+
+
+@one_world
+def test_chosen_numbers_of_samples_leave_the_mean(r, monkeypatch):
+    """Pilot samples are thrown away: what they choose cannot lean to bright or to dark."""
+    where = np.flatnonzero(r.traced(T_S))
+    monkeypatch.setattr(r._tracer, "most_light", 1e30)
+    _, samples = r._sampling(where, T_S)
+    r._scene.set_time(T_S)
+    chosen = np.stack([gray(r._tracer.split(where, samples, 100 + k, True, [])) for k in range(24)]).astype(np.float64)
+    whole = radiances(r, where, 64, range(8), None)
+    for some in (samples == n for n in np.unique(samples)):
+        difference = chosen.mean(0)[some] - whole.mean(0)[some]
+        error = np.sqrt(np.mean(chosen.var(0)[some] / 23 + whole.var(0)[some] / 7) / some.sum())
+        assert abs(difference.mean()) < 4 * error + 1e-4
