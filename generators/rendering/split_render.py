@@ -41,7 +41,6 @@ _LEAST_PATHS = 4
 _KEYS, _MAPS, _PILOTS = 1 << 20, 1 << 28, 3 << 28
 _EDGE_PX = 2  # around the edge of a shadow
 _LEAST_SAMPLES = 4
-_BACKGROUND = 2  # its noise is half of the keys': all images have it, and it is rendered once
 # Samples of a pixel go with this power of the spread. Errors of n stratified samples fall as n^-0.85: 1 / 0.85 would
 # give all pixels the same noise, 2 / (1 + 2 * 0.85) = 0.74 the least noise in total.
 _POWER = 0.85
@@ -167,8 +166,7 @@ class SplitRenderer(MultiViewRenderer):
         """The samples [C, H, W] of the background."""
         if "static" in self.__dict__ and self.static.samples is not None:
             return self.static.samples.astype(np.int64)
-        spread = self._piloted(np.ones(self.shape, bool), _PILOTS - 1, False, self._maps_at(None))
-        return self._samples(_BACKGROUND * spread)
+        return self._samples(self._piloted(np.ones(self.shape, bool), _PILOTS - 1, False, self._maps_at(None)))
 
     @cached_property
     def static(self) -> StaticViews:
