@@ -164,7 +164,7 @@ def _shot_events(
     rate = noise.shot_hz * (1 - (1 - noise.shot_bright) * bright)
     counts = rng.poisson(rate * (span_us[1] - span_us[0]) * 1e-6)
     pixel = np.repeat(np.arange(log.size), counts)
-    t = rng.uniform(*span_us, len(pixel)).astype(np.int64)
+    t = rng.uniform(span_us[0], span_us[1], len(pixel)).astype(np.int64)
     return t, pixel, rng.integers(0, 2, len(pixel), dtype=np.uint8)
 
 

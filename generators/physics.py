@@ -154,7 +154,7 @@ class PhysicsOptions:
     reset_noise: float | None = None
     read_noise: float | None = None
     dead_ticks: float | None = None
-    noisy_others: bool | None = None
+    noisy_others: bool = False
 
     def physics(self) -> Physics:
         """Return the physics. Raises UserError for an unknown camera and for numbers that no camera has."""
