@@ -112,7 +112,7 @@ ROWS = (
 
 def tuned_rows() -> tuple[Row, ...]:
     """Return the rows X.tuned that there are, in the order of X, with as many seeds."""
-    files = [Path(recipes.__file__).with_name("tuned.json") for recipes in (theirs, ours)]
+    files = [Path(str(recipes.__file__)).with_name("tuned.json") for recipes in (theirs, ours)]
     searched = {name: found for path in files for name, found in read_tuned(path).items()}
     return tuple(
         replace(row, name=f"{row.name}{TUNED}", tuned_on=f"{', '.join(found['scenes'])}, {found['trials']} trials")

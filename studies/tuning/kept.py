@@ -17,7 +17,9 @@ def keeping(method: RecipeMethod, device: str) -> RecipeMethod:
     """Return the same recipe, whose images on `device` and whose starts are remembered; every bit stays."""
     recipe, parts = method.recipe, method.parts
     maker, first = method.images.on(device), method.initialization
-    own = {name: _images(f) for name in ("rate", "corrected", "rate_over") if (f := getattr(maker, name))}
+    own: dict[str, Any] = {
+        name: _images(f) for name in ("rate", "corrected", "rate_over") if (f := getattr(maker, name))
+    }
     images = {**parts.images, recipe.images: replace(maker, made_on=None, **own)}
     starts = {**parts.initialization, recipe.initialization: replace(first, start=_starts(first.start))}
     return RecipeMethod(recipe, replace(parts, images=images, initialization=starts), method.description)

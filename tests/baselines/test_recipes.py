@@ -60,7 +60,7 @@ def test_a_recipe_is_the_parts_that_its_name_says(recipe: Recipe) -> None:
     if recipe.name.startswith(("dy-", "spike4dgs")):
         assert recipe.name.endswith("+colmap") == recipe.initialization.startswith("colmap")
     else:
-        images, *middle = recipe.name.split("+")
+        images, *middle = recipe.name.removesuffix(".tuned").split("+")
         at = next(i for i, part in enumerate(middle) if part in motions)
         assert (recipe.images, recipe.motion) == (images, motions[middle[at]])
         expected = ("+".join(middle[:at]) or ("msdi" if images == "msdi" else "rig")).removesuffix("-flat")
