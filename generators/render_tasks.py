@@ -296,5 +296,5 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
     if soft is not None:
         return StaticViews(images[0], images[0], soft, images[1])
     if other is None:
-        return StaticViews(*images)
+        return StaticViews(images[0], images[1])
     return StaticViews(other.background, images[0])

@@ -39,6 +39,7 @@ from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
+from spike4dgs.method.tuned import SUFFIX
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
@@ -232,7 +233,7 @@ def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
     )
     motion, made, loss, start = (name if label is None else label for label, name in named)
     made = f"images {made}" + (", corrected by calibration" if flat else "")
-    return "; ".join(filter(None, (motion, made, loss, start)))
+    return "; ".join(filter(None, (motion, made, loss, start, recipe.name.endswith(SUFFIX) and "settings by search")))
 
 
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:

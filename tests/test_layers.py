@@ -29,7 +29,7 @@ ORDER = {
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "second_renderings truth held_frames previews scene_maker scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat gaussians training_views motion supervision pose_refinement "
-    "schedule models checkpoint msdi images matching starts self_calibration trainer fit tuned recipes viewing "
+    "schedule models checkpoint msdi images matching starts self_calibration trainer tuned fit recipes viewing "
     "recordings",
     "baselines": "nearest_view images radiance_field spike_render exposure starts tracking spacetime recipes",
     "leaderboard": "tracks entry reading truth_check rank verify submit page season",
