@@ -7,7 +7,7 @@ share their samples of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,19 @@ LIKE_PX = 0.7  # distance of a point from the other's tangent plane, in widths o
 RADIUS_PX = 3
 LEAST_EXPONENT = -5.0  # of a weight in `shared`: what follows is less than a percent of the nearest
 FARTHEST = 2.0  # distance of a point in another view, in widths of a pixel: grazing views see it with much around it
+
+
+class Surfaces(NamedTuple):
+    """What the centres of all pixels see."""
+
+    labels: np.ndarray  # [C, H, W] int8; surfaces of two labels share nothing
+    points: np.ndarray  # [C, H, W, 3] float32, positions
+    normals: np.ndarray  # [C, H, W, 3] float32, unit; 0 without a surface
+    widths: np.ndarray  # [C, H, W] float32, of a pixel at the point, in metres
+
+    def places(self, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+        """Return what `places_in` has of the points of flat pixels [K]."""
+        return places_in(self.points.reshape(-1, 3)[pixels], cameras)
 
 
 def pixel_widths(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
@@ -39,23 +52,14 @@ def places_in(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return out
 
 
-def coverage(
-    pixels: np.ndarray,
-    paths: np.ndarray,
-    labels: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    widths: np.ndarray,
-    places: np.ndarray,
-) -> np.ndarray:
+def coverage(pixels: np.ndarray, paths: np.ndarray, surfaces: Surfaces, places: np.ndarray) -> np.ndarray:
     """Return the number [K] int32 of views that see the surface point of each flat pixel within a pixel's width.
 
     Its own view counts. In another, the pixel nearest to the point has to have samples (`paths` [C, H, W] > 0), the
     same label, and a like surface. The arguments are those of `shared`.
     """
     out = np.ones(len(pixels), np.int32)
-    arrays = pixels, paths, labels, points, normals, widths, places
-    in_threads(_coverage, len(pixels), *arrays, out, small=len(pixels) < 1000)
+    in_threads(_coverage, len(pixels), pixels, paths, *surfaces, places, out, small=len(pixels) < 1000)
     return out
 
 
@@ -63,10 +67,7 @@ def shared(
     pixels: np.ndarray,
     values: np.ndarray,
     paths: np.ndarray,
-    labels: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    widths: np.ndarray,
+    surfaces: Surfaces,
     places: np.ndarray,
     sigma_px: float,
 ) -> np.ndarray:
@@ -80,16 +81,12 @@ def shared(
         pixels: flat numbers of the pixels.
         values: [C, H, W, D].
         paths: [C, H, W] int32, the samples of each value; 0 for none.
-        labels: [C, H, W] int8.
-        points: [C, H, W, 3] positions of the surface points.
-        normals: [C, H, W, 3], unit.
-        widths: [C, H, W], width of a pixel at the point in metres.
+        surfaces: of all pixels.
         places: [K, C, 2] from `places_in`, of the pixels' points; NaN leaves a view out.
         sigma_px: of the Gaussian weights.
     """
     out = np.zeros((len(pixels), values.shape[-1]), np.float32)
-    arrays = pixels, values, paths, labels, points, normals, widths, places
-    in_threads(_shared, len(pixels), *arrays, sigma_px, out, small=len(pixels) < 1000)
+    in_threads(_shared, len(pixels), pixels, values, paths, *surfaces, places, sigma_px, out, small=len(pixels) < 1000)
     return out
 
 
@@ -97,30 +94,25 @@ def join_soft(parts: Sequence[tuple[np.ndarray, ...]], cameras: Sequence[Camera]
     """Return the background's map of the results of `SplitRenderer.soft_at` for all pixels in order."""
     shape = len(cameras), cameras[0].height, cameras[0].width
     points, normals, paths, first = (np.concatenate(p).reshape(*shape, -1) for p in zip(*parts, strict=True))
-    paths, labels = paths[..., 0], np.zeros(shape, np.int8)
-    smooth = smoothed_light(np.arange(labels.size), first, paths, labels, points, normals, cameras, sigma_px)
+    paths, every = paths[..., 0], np.arange(paths[..., 0].size)
+    surfaces = Surfaces(np.zeros(shape, np.int8), points, normals, pixel_widths(points, cameras))
+    smooth = smoothed_light(every, first, paths, surfaces, surfaces.places(every, cameras), sigma_px)
     return SoftStatic(points, normals, paths, first, smooth.reshape(first.shape))
 
 
 def smoothed_light(
-    where: np.ndarray,
-    light: np.ndarray,
-    paths: np.ndarray,
-    labels: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    cameras: Sequence[Camera],
-    sigma_px: float,
+    where: np.ndarray, light: np.ndarray, paths: np.ndarray, surfaces: Surfaces, places: np.ndarray, sigma_px: float
 ) -> np.ndarray:
-    """Return soft light [K, 6] at flat pixels: matte light is a mean over all views, gloss over one."""
-    widths = pixel_widths(points, cameras)
+    """Return soft light [K, 6] at flat pixels: matte light is a mean over all views, gloss over one.
+
+    `light` is [C, H, W, 6]; the other arguments are those of `shared`.
+    """
     matte, gloss = (np.ascontiguousarray(light[..., part]) for part in (slice(3), slice(3, 6)))
-    places = places_in(points.reshape(-1, 3)[where], cameras)
     nowhere = np.full_like(places, np.nan)
     return np.concatenate(
         [
-            shared(where, matte, paths, labels, points, normals, widths, places, sigma_px),
-            shared(where, gloss, np.minimum(paths, 1), labels, points, normals, widths, nowhere, sigma_px),
+            shared(where, matte, paths, surfaces, places, sigma_px),
+            shared(where, gloss, np.minimum(paths, 1), surfaces, nowhere, sigma_px),
         ],
         1,
     )

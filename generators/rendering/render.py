@@ -62,8 +62,8 @@ class SoftStatic:
 class StaticViews:
     """The views without moving objects, linear RGB [C, H, W, 3] float32.
 
-    `background` is at full quality, `first` has the noise of keys; `soft` and `samples` [C, H, W], numbers of samples,
-    are of a `split_render.SplitRenderer`.
+    `background` is at full quality; `first` has the noise of keys, and may be the same. `soft` and `samples` [C, H, W],
+    numbers of samples, are of a `split_render.SplitRenderer`.
     """
 
     background: np.ndarray
@@ -75,14 +75,15 @@ class StaticViews:
         """Return the arrays for a file or another process."""
         soft = {f"soft_{name}": array for name, array in vars(self.soft).items()} if self.soft else {}
         soft |= {"samples": self.samples} if self.samples is not None else {}
-        return {"background": self.background, "first": self.first, **soft}
+        first = {} if self.first is self.background else {"first": self.first}
+        return {"background": self.background, **first, **soft}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> StaticViews:
         """Return the views from the result of `arrays`."""
         soft = {name.removeprefix("soft_"): a for name, a in arrays.items() if name.startswith("soft_")}
         given = SoftStatic(**soft) if soft else None, arrays.get("samples")
-        return StaticViews(arrays["background"], arrays["first"], *given)
+        return StaticViews(arrays["background"], arrays.get("first", arrays["background"]), *given)
 
     def views(self, chosen: Sequence[int]) -> StaticViews:
         """Return a selection of the views."""

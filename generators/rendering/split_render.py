@@ -30,7 +30,14 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.profiles import SplitSampling
-from spike4dgs.generators.rendering.like_surfaces import coverage, join_soft, pixel_widths, places_in, smoothed_light
+from spike4dgs.generators.rendering.like_surfaces import (
+    Surfaces,
+    coverage,
+    join_soft,
+    pixel_widths,
+    places_in,
+    smoothed_light,
+)
 from spike4dgs.generators.rendering.render import MAX_DEPTH, MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 
 _NEAR_PX = 1  # around moving objects: pixels that may see one
@@ -87,7 +94,6 @@ class SplitRenderer(MultiViewRenderer):
     def _traced_at(self, where: np.ndarray, t_s: float) -> np.ndarray:
         """Return the radiance [K] or [K, 3] of the flat pixels `where` of a key."""
         near, samples = self._sampling(where, t_s)
-        self._scene.set_time(t_s)
         rgb = self._rgb_at(where, samples, np.where(near, _KEYS + round(t_s * 1e7), 0), t_s)
         return rgb if self.color else gray(rgb)
 
@@ -197,21 +203,17 @@ class SplitRenderer(MultiViewRenderer):
         """Points and normals [N, 3] of the background in all pixels, which have a coat, and their numbers of paths."""
         every = np.arange(int(np.prod(self.shape)))
         points, normals, coated = self._tracer.surfaces(every, False)
-        geometry = (a.reshape(*self.shape, -1) for a in (points, normals))
-        alike = np.zeros(self.shape, np.int8)
-        return points, normals, coated, self._shared_paths(every, alike, *geometry)
+        at, facing = (a.reshape(*self.shape, -1) for a in (points, normals))
+        surfaces = Surfaces(np.zeros(self.shape, np.int8), at, facing, pixel_widths(at, self.cameras))
+        paths = self._shared_paths(every, surfaces, surfaces.places(every, self.cameras))
+        return points, normals, coated, paths
 
-    def _shared_paths(
-        self, where: np.ndarray, labels: np.ndarray, points: np.ndarray, normals: np.ndarray
-    ) -> np.ndarray:
+    def _shared_paths(self, where: np.ndarray, surfaces: Surfaces, places: np.ndarray) -> np.ndarray:
         """Return the paths [K] int32 of matte light at flat pixels: fewer where more views see the point."""
         known = np.zeros(self.shape, np.int32)
         known.ravel()[where] = 1
-        places = places_in(points.reshape(-1, 3)[where], self.cameras)
-        views = coverage(where, known, labels, points, normals, pixel_widths(points, self.cameras), places)
-        return np.maximum(_LEAST_PATHS, 2 ** np.ceil(np.log2(self.soft.paths / views)).astype(np.int32)).astype(
-            np.int32
-        )
+        views = coverage(where, known, surfaces, places)
+        return np.maximum(_LEAST_PATHS, 2 ** np.ceil(np.log2(self.soft.paths / views))).astype(np.int32)
 
     def _paths_light(
         self, where: np.ndarray, coated: np.ndarray, paths: np.ndarray, streams: int | np.ndarray, moving: bool
@@ -272,16 +274,16 @@ class SplitRenderer(MultiViewRenderer):
         points.reshape(-1, 3)[where[moved]], normals.reshape(-1, 3)[where[moved]] = seen[moved], facing[moved]
         labels = np.zeros(self.shape, np.int8)
         labels.ravel()[where[moved]] = 1
+        surfaces = Surfaces(labels, points, normals, pixel_widths(points, self.cameras))
+        places = surfaces.places(where, self.cameras)
         # static points have the paths of the background: the same random numbers, and what counts is the difference
         paths = np.zeros(self.shape, np.int32)
-        paths.ravel()[where] = np.where(
-            moved, self._shared_paths(where, labels, points, normals), static.paths.ravel()[where]
-        )
+        paths.ravel()[where] = np.where(moved, self._shared_paths(where, surfaces, places), static.paths.ravel()[where])
         streams = np.where(on_object, _MAPS + round(t_s * 1e7), 0)
         values = np.zeros_like(light)  # in static points the change of light, elsewhere the light
         before = np.where(moved[:, None], 0, static.first.reshape(-1, 6)[where])
         values.reshape(-1, 6)[where] = self._paths_light(where, coated, paths.ravel()[where], streams, True) - before
-        smooth = smoothed_light(where, values, paths, labels, points, normals, self.cameras, self.soft.sigma_px)
+        smooth = smoothed_light(where, values, paths, surfaces, places, self.soft.sigma_px)
         flat = light.reshape(-1, 6)
         flat[where] = np.where(moved[:, None], smooth, np.maximum(flat[where] + smooth, 0))
         return points, normals, light

@@ -12,6 +12,7 @@ from spike4dgs.generators.rendering.like_surfaces import (
     LIKE_COSINE,
     LIKE_PX,
     RADIUS_PX,
+    Surfaces,
     coverage,
     pixel_widths,
     places_in,
@@ -24,7 +25,8 @@ SHAPE = (2, 9, 12)
 def smoothed(pixels, values, labels, points, normals, widths, sigma):
     """Return the means in the pixels' own views alone."""
     nowhere = np.full((len(pixels), len(labels), 2), np.nan, np.float32)
-    return shared(pixels, values, np.ones(labels.shape, np.int32), labels, points, normals, widths, nowhere, sigma)
+    surfaces = Surfaces(labels, points, normals, widths)
+    return shared(pixels, values, np.ones(labels.shape, np.int32), surfaces, nowhere, sigma)
 
 
 def plain(k, values, labels, points, normals, widths, sigma):
@@ -122,9 +124,9 @@ def test_light_is_shared_by_the_views_that_see_a_point(sigma):
     paths[1, rng.random(SHAPE[1:]) < 0.1] = 0
     values, widths = rng.random((*SHAPE, 3), dtype=np.float32), pixel_widths(points, cameras)
     chosen = np.flatnonzero(paths.ravel())
-    known = chosen, paths, labels, points, normals, widths, places_in(points.reshape(-1, 3)[chosen], cameras)
-    views = coverage(*known)
-    means = shared(chosen, values, *known[1:], sigma)
+    surfaces, places = Surfaces(labels, points, normals, widths), places_in(points.reshape(-1, 3)[chosen], cameras)
+    views = coverage(chosen, paths, surfaces, places)
+    means = shared(chosen, values, paths, surfaces, places, sigma)
     expected = [plain_shared(k, values, paths, labels, points, normals, widths, cameras, sigma) for k in chosen]
     assert 0.1 < np.mean(views == 2) < 0.9
     assert np.array_equal(views, [e[1] for e in expected])
