@@ -29,7 +29,7 @@ from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
 from spike4dgs.method.recipes import FLAT, MSDI_SETTINGS
 from spike4dgs.method.starts.base import Initialization
-from spike4dgs.method.tuned import tuned
+from spike4dgs.method.tuned import read_tuned, tuned
 
 INITIALIZATIONS = {
     **ours.PARTS.initialization,
@@ -139,7 +139,8 @@ POSED = (
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
     Recipe("tfi+dust3r+4dgs+spss", "tfi", "dust3r", "hexplane", "spss"),
 )
-TUNED = tuned((*RECIPES, *CALIBRATED, *PUBLISHED), Path(__file__).with_name("tuned.json"))
+SEARCHES = read_tuned(Path(__file__).with_name("tuned.json"))
+TUNED = tuned((*RECIPES, *CALIBRATED, *PUBLISHED), SEARCHES)
 METHODS: dict[str, Method] = Table(
     "methods",
     {

@@ -39,7 +39,7 @@ from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
-from spike4dgs.method.tuned import SUFFIX
+from spike4dgs.method.tuned import is_tuned
 
 T = TypeVar("T")
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
@@ -223,17 +223,17 @@ def short(settings: SettingsByPart) -> dict[str, Settings]:
 
 def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
     """Return one line that says what a recipe is, from its parts' labels."""
-    supervision = parts.supervision.get(recipe.supervision)
     flat = recipe.settings.get("images.flat_field") and recipe.images != "msdi"
     named = (
         (algorithm.label, recipe.motion),
         (parts.images[recipe.images].label, recipe.images),
-        (getattr(supervision, "label", None), recipe.supervision),
+        (getattr(parts.supervision.get(recipe.supervision), "label", None), recipe.supervision),
         (parts.initialization[recipe.initialization].label, recipe.initialization),
     )
     motion, made, loss, start = (name if label is None else label for label, name in named)
     made = f"images {made}" + (", corrected by calibration" if flat else "")
-    return "; ".join(filter(None, (motion, made, loss, start, recipe.name.endswith(SUFFIX) and "settings by search")))
+    searched = "settings by search" if is_tuned(recipe.name) else ""
+    return "; ".join(filter(None, (motion, made, loss, start, searched)))
 
 
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:

@@ -20,7 +20,7 @@ from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.starts.msdi import MsdiMatchedSettings, MsdiSettings, msdi, msdi_matched
 from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.supervision.table import SUPERVISIONS
-from spike4dgs.method.tuned import tuned
+from spike4dgs.method.tuned import read_tuned, tuned
 
 PARTS = Parts(
     images={maker.name: maker for maker in (ADAPTIVE, INTERVALS, MSDI)},
@@ -135,13 +135,14 @@ SELF_CALIBRATED = Recipe(
     {**_PATHS, "initialization.noise": 1e-4, "trainer.coarse_steps": 800, "motion.coherence": 0.005},
 )
 
+SEARCHES = read_tuned(Path(__file__).with_name("tuned.json"))
 _AS_THEY_ARE = (
     *SPIKE4DGS,
     Recipe("adaptive+rig-flat+4dgs", "adaptive", "rig", "hexplane", "pixel", FLAT),
     SPIKE4DGS_X,
     SELF_CALIBRATED,
 )
-RECIPES = (*_AS_THEY_ARE, *tuned(_AS_THEY_ARE, Path(__file__).with_name("tuned.json")))
+RECIPES = (*_AS_THEY_ARE, *tuned(_AS_THEY_ARE, SEARCHES))
 _DESCRIPTIONS = {
     "spike4dgs": "the paper's method: MSDI's points and images, 4DGS, SPSS",
     "spike4dgs-x": "our own design: means over known spans of time, a fixed background, and paths of what moves",

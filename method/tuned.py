@@ -17,19 +17,24 @@ from typing import Any
 from spike4dgs.benchmark.method import Recipe
 
 SUFFIX = ".tuned"
+Searches = dict[str, dict[str, Any]]  # by row
 
 
-def read_tuned(path: Path) -> dict[str, dict[str, Any]]:
-    """Return what a file of the package keeps of searches, by row."""
-    found: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+def is_tuned(name: str) -> bool:
+    """Return whether a row's name is that of one with searched settings."""
+    return name.endswith(SUFFIX)
+
+
+def read_tuned(path: Path) -> Searches:
+    """Return what a file of the package keeps of searches."""
+    found: Searches = json.loads(path.read_text(encoding="utf-8"))
     return found
 
 
-def tuned(recipes: Iterable[Recipe], path: Path) -> tuple[Recipe, ...]:
-    """Return a recipe X.tuned for each of `recipes` that the file has settings for."""
-    known = read_tuned(path)
+def tuned(recipes: Iterable[Recipe], searches: Searches) -> tuple[Recipe, ...]:
+    """Return a recipe X.tuned for each of `recipes` that was searched."""
     return tuple(
-        replace(r, name=f"{r.name}{SUFFIX}", settings={**r.settings, **known[r.name]["settings"]})
+        replace(r, name=f"{r.name}{SUFFIX}", settings={**r.settings, **searches[r.name]["settings"]})
         for r in recipes
-        if r.name in known
+        if r.name in searches
     )

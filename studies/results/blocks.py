@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
 from spike4dgs.method.recipes import METHODS as OURS
-from spike4dgs.method.tuned import SUFFIX as TUNED
+from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
@@ -199,7 +199,7 @@ def _mixed_code(own: Iterable[Record]) -> list[str]:
     by_commit: dict[str, dict[str, None]] = {}
     for r in own:
         # Digests of methods in `method` leave the baselines out; those of tuned rows cover their settings.
-        kind = r["row"] if r["row"].endswith(TUNED) else "ours" if r["row"] in OURS else "theirs"
+        kind = r["row"] if is_tuned(r["row"]) else "ours" if r["row"] in OURS else "theirs"
         codes.setdefault(kind, set()).add(r["code"])
         by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
     if all(len(found) <= 1 for found in codes.values()):

@@ -5,15 +5,14 @@ from __future__ import annotations
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from spike4dgs import baselines, benchmark, method
-from spike4dgs.baselines.recipes import METHODS as THEIRS
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
+from spike4dgs.benchmark.method import get_method
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.method.recipes import METHODS as OURS
-from spike4dgs.method.tuned import SUFFIX as TUNED
+from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.results.records import DIGITS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,9 +52,8 @@ def check_clean(state: CodeState, allow_dirty: bool) -> None:
 def code_digest(row: str) -> str:
     """Return a digest of the sources that a row's method and its scores come from, and of searched settings."""
     found = sources_sha256([benchmark, method, *([] if row in OURS else [baselines])])
-    if row.endswith(TUNED):
-        known: Any = {**THEIRS, **OURS}[row]
-        found = sha256_json([found, dict(known.recipe.settings)])
+    if is_tuned(row):
+        found = sha256_json([found, get_method(row).params["settings"]])
     return found[:DIGITS]
 
 

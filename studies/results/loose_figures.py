@@ -10,10 +10,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.studies.results.pages import BLOCK, pages_of
+from spike4dgs.studies.kit.blocks import KINDS, pattern
+from spike4dgs.studies.results.pages import pages_of
 
 _RATCHET = Path("studies", "results", "loose_figures.json")  # in a checkout
-_SEARCHES = re.compile(r"^<!-- searches -->\n.*?^<!-- end searches -->$", re.MULTILINE | re.DOTALL)  # `report tuning`
+_GENERATED = pattern(*KINDS)
 _FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 _NUMBER = r"\d+(?:\.\d+)?"
 _DECIBELS = re.compile(rf"(?:{_NUMBER}(?:\s*(?:,|/|-|and|to|or)\s*))*{_NUMBER}\s+dB\b")  # "7.8 and 7.1 dB" are two
@@ -28,7 +29,7 @@ def loose_figures(text: str) -> Iterator[tuple[int, str]]:
     >>> list(loose_figures("It leads by 7.8 and 7.1 dB.\\n\\n| row | PSNR |\\n| x | 30.25 |"))
     [(1, '7.8'), (1, '7.1'), (4, '30.25')]
     """
-    for hidden in (BLOCK, _SEARCHES, _FENCE):
+    for hidden in (_GENERATED, _FENCE):
         text = hidden.sub(lambda found: "\n" * found[0].count("\n"), text)
     places = {}
     for found in _DECIBELS.finditer(text):

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
+from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.results.blocks import BLOCKS
 from spike4dgs.studies.results.records import Record
 
-BLOCK = re.compile(r"^<!-- records: (?P<name>[a-z0-9-]+) -->\n.*?^<!-- end records -->$", re.MULTILINE | re.DOTALL)
+BLOCK = pattern("records")
 _MARKER = re.compile(r"^<!-- (?:records: .*|end records) -->$", re.MULTILINE)
 
 

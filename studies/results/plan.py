@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, DEFAULT_GIVEN, Method
@@ -16,7 +15,6 @@ from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.generators.profiles import TRACKS
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.tuned import SUFFIX as TUNED
-from spike4dgs.method.tuned import read_tuned
 
 CALIBRATED, UNCALIBRATED = "calibrated", "uncalibrated"
 KNOWLEDGE = {  # the blocks of a table, in their order -> what its rows are given
@@ -112,8 +110,7 @@ ROWS = (
 
 def tuned_rows() -> tuple[Row, ...]:
     """Return the rows X.tuned that there are, in the order of X, with as many seeds."""
-    files = [Path(str(recipes.__file__)).with_name("tuned.json") for recipes in (theirs, ours)]
-    searched = {name: found for path in files for name, found in read_tuned(path).items()}
+    searched = {**theirs.SEARCHES, **ours.SEARCHES}
     return tuple(
         replace(row, name=f"{row.name}{TUNED}", tuned_on=f"{', '.join(found['scenes'])}, {found['trials']} trials")
         for row in ROWS

@@ -16,75 +16,52 @@ from spike4dgs.method.settings import Settings, SettingsByPart
 STEPS_OF_TWO = 1.6  # steps of two views in the time of one step of four (200x125 pixels, two cores)
 _CUSTOMARY, _BOX = "0.3 px^2", "1/12 px^2, compensated"
 Values = Mapping[str, Any]  # by knob, or by PART.NAME
+Parts = Mapping[str, Any]  # the settings of a recipe by part
 
 
 @dataclass(frozen=True)
 class Knob:
-    """One dimension of the search: one of `choices`, or a number between `low` and `high` on a log scale."""
+    """One dimension of the search: one of `choices`, or a number between `low` and `high` on a log scale.
+
+    Attributes:
+        has: whether a recipe with some settings has the knob.
+        own: the value that stands for these settings; of a choice, the nearest one does.
+        give: the settings, by PART.NAME, that the values of all knobs give in place of some settings.
+    """
 
     name: str
+    has: Callable[[Parts], bool]
+    own: Callable[[Parts], Any]
+    give: Callable[[Values, Parts], dict[str, Any]]
     choices: tuple[Any, ...] = ()
     low: float = 0.0
     high: float = 0.0
 
+    def start(self, settings: Parts) -> Any:
+        """Return the value that stands for a recipe as it is."""
+        own = self.own(settings)
+        if not self.choices or own in self.choices:
+            return own
+        return min(self.choices, key=lambda choice: abs(choice - own))
+
 
 def knobs_of(settings: SettingsByPart) -> tuple[Knob, ...]:
     """Return the knobs that a recipe with these settings has."""
-    return tuple(knob for knob, has, _ in _KNOBS if has(settings))
+    return tuple(knob for knob in KNOBS if knob.has(settings))
 
 
 def as_settings(values: Values, settings: SettingsByPart) -> dict[str, Any]:
     """Return the settings, by PART.NAME, that the values of knobs give a recipe whose own settings are `settings`."""
-    found: dict[str, Any] = {}
-    for knob, _, give in _KNOBS:
-        if knob.name in values:
-            found |= give(values[knob.name], settings)
-    return found | _steps(values, settings)
+    return {name: value for knob in KNOBS if knob.name in values for name, value in knob.give(values, settings).items()}
 
 
 def start_of(settings: SettingsByPart) -> dict[str, Any]:
-    """Return the values of knobs that stand for a recipe as it is, each choice the one nearest to its own setting."""
-    return {knob.name: _own(knob, settings) for knob in knobs_of(settings)}
-
-
-def _own(knob: Knob, settings: SettingsByPart) -> Any:
-    if not knob.choices:
-        return 1.0 if knob.name.endswith("rates") else _static_share(settings)
-    trainer = settings.get("trainer")
-    own = {
-        "filter": lambda: _BOX if getattr(trainer, "filter_compensated", False) else _CUSTOMARY,
-        "times": lambda: _value(settings, "images", "time_spacing_ticks"),
-    }
-    where = _PLACES.get(knob.name)
-    value = own[knob.name]() if knob.name in own else _value(settings, *where) if where else None
-    if value in knob.choices:
-        return value
-    return min(knob.choices, key=lambda choice: abs(choice - value))
-
-
-def _value(settings: SettingsByPart, part: str, name: str) -> Any:
-    return getattr(settings[part], name)
-
-
-def _has(part: str, *names: str) -> Callable[[SettingsByPart], bool]:
-    return lambda settings: part in settings and all(hasattr(settings[part], name) for name in names)
-
-
-def _set(part: str, name: str) -> Callable[[Any, SettingsByPart], dict[str, Any]]:
-    return lambda value, settings: {f"{part}.{name}": type(_value(settings, part, name))(value)}
-
-
-def _scaled_rates(part: str) -> Callable[[Any, SettingsByPart], dict[str, Any]]:
-    """Return what multiplies every rate of a part; `lr_last`, a ratio, and the rates of poses stay."""
-
-    def give(factor: float, settings: SettingsByPart) -> dict[str, Any]:
-        return {f"{part}.{name}": value * factor for name, value in rates(settings[part]).items()}
-
-    return give
+    """Return the values of knobs that stand for a recipe as it is."""
+    return {knob.name: knob.start(settings) for knob in knobs_of(settings)}
 
 
 def rates(part: Settings) -> dict[str, float]:
-    """Return the learning rates of a part, by name."""
+    """Return the learning rates of a part, by name; `lr_last`, a ratio, and the rates of poses are none."""
     return {
         name: value
         for name, value in asdict(part).items()
@@ -92,77 +69,78 @@ def rates(part: Settings) -> dict[str, float]:
     }
 
 
-def _filter(value: str, settings: SettingsByPart) -> dict[str, Any]:
-    box = value == _BOX
+def _factor(name: str, part: str, low: float, high: float) -> Knob:
+    """Return the knob of a factor on every rate of a part."""
+
+    def give(values: Values, settings: Parts) -> dict[str, Any]:
+        return {f"{part}.{rate}": value * values[name] for rate, value in rates(settings[part]).items()}
+
+    return Knob(name, lambda s: part in s and bool(rates(s[part])), lambda s: 1.0, give, low=low, high=high)
+
+
+def _choice(name: str, part: str, setting: str, *choices: Any) -> Knob:
+    """Return the knob of one setting."""
+
+    def give(values: Values, settings: Parts) -> dict[str, Any]:
+        return {f"{part}.{setting}": type(getattr(settings[part], setting))(values[name])}
+
+    return Knob(name, _has(part, setting), lambda s: getattr(s[part], setting), give, choices)
+
+
+def _has(part: str, setting: str) -> Callable[[Parts], bool]:
+    return lambda s: part in s and hasattr(s[part], setting)
+
+
+def _filter(values: Values, settings: Parts) -> dict[str, Any]:
+    box = values["filter"] == _BOX
     return {"trainer.filter_variance": 1 / 12 if box else 0.3, "trainer.filter_compensated": box}
 
 
-def _static_share(settings: SettingsByPart) -> float:
-    trainer: Any = settings["trainer"]
-    return float(trainer.coarse_steps / (trainer.coarse_steps + trainer.fine_steps))
-
-
-def _steps(values: Values, settings: SettingsByPart) -> dict[str, Any]:
-    """Return the steps of both stages: in all as much work as the recipe's own, split by `static_share`."""
-    if "static_share" not in values:
-        return {}
-    trainer: Any = settings["trainer"]
-    views = values.get("views_per_step", trainer.views_per_step)
-    cost = {2: 1.0, 4: STEPS_OF_TWO}  # of a step
-    total = (trainer.coarse_steps + trainer.fine_steps) * cost[trainer.views_per_step] / cost[views]
+def _steps(values: Values, settings: Parts) -> dict[str, Any]:
+    """Return the steps of both stages: in all as much work as the recipe's own."""
+    trainer = settings["trainer"]
+    cost = {2: 1.0, 4: STEPS_OF_TWO}  # of a step, by its views
+    total = (trainer.coarse_steps + trainer.fine_steps) * cost[trainer.views_per_step] / cost[values["views_per_step"]]
     coarse = round(total * values["static_share"])
     return {"trainer.coarse_steps": coarse, "trainer.fine_steps": round(total) - coarse}
 
 
-def _tracked_times(value: int, settings: SettingsByPart) -> dict[str, Any]:
+def _static_share(settings: Parts) -> float:
+    trainer = settings["trainer"]
+    return float(trainer.coarse_steps / (trainer.coarse_steps + trainer.fine_steps))
+
+
+def _tracked_times(values: Values, settings: Parts) -> dict[str, Any]:
     """Return the spacing of times that are tracked one by one, and as many steps in all as before."""
-    own = _value(settings, "images", "time_spacing_ticks")
-    later = round(_value(settings, "motion", "later_steps") * value / own)
-    return {"images.time_spacing_ticks": value, "motion.later_steps": later}
+    later = round(settings["motion"].later_steps * values["times"] / settings["images"].time_spacing_ticks)
+    return {"images.time_spacing_ticks": values["times"], "motion.later_steps": later}
 
 
-def _moves(settings: SettingsByPart) -> bool:
-    return "trainer" in settings and "motion" in settings
-
-
-_PLACES = {
-    "last_rate": ("trainer", "lr_last"),
-    "first_scale": ("trainer", "initial_scale"),
-    "views_per_step": ("trainer", "views_per_step"),
-    "average": ("trainer", "average"),
-    "time_cell": ("motion", "cell_ticks"),
-    "copies": ("motion", "moving_copies"),
-    "lifetime": ("motion", "moving_temporal_scale"),
-    "window": ("image_maker", "half_window"),
-    "loss": ("supervision", "huber_delta"),
-}
-
-
-# A knob, whether a recipe with some settings has it, and the settings that a value of it gives.
-_Entry = tuple[Knob, Callable[[SettingsByPart], bool], Callable[[Any, SettingsByPart], dict[str, Any]]]
-
-
-def _choice(name: str, *choices: Any) -> _Entry:
-    return Knob(name, choices), _has(*_PLACES[name]), _set(*_PLACES[name])
-
-
-_KNOBS: tuple[_Entry, ...] = (
-    (Knob("rates", low=0.5, high=8), _has("trainer", "lr_means"), _scaled_rates("trainer")),
-    (
-        Knob("motion_rates", low=0.25, high=8),
-        lambda s: "motion" in s and bool(rates(s["motion"])),
-        _scaled_rates("motion"),
+KNOBS = (
+    _factor("rates", "trainer", 0.5, 8),
+    _factor("motion_rates", "motion", 0.25, 8),
+    Knob(
+        "filter",
+        _has("trainer", "filter_variance"),
+        lambda s: _BOX if s["trainer"].filter_compensated else _CUSTOMARY,
+        _filter,
+        (_CUSTOMARY, _BOX),
     ),
-    (Knob("filter", (_CUSTOMARY, _BOX)), _has("trainer", "filter_variance"), _filter),
-    (Knob("static_share", low=0.1, high=0.5), _moves, lambda value, settings: {}),
-    _choice("last_rate", 1.0, 0.3, 0.1),
-    _choice("first_scale", 0.5, 0.7, 1.0),
-    _choice("views_per_step", 2, 4),
-    _choice("average", 0.0, 0.2),
-    _choice("time_cell", 16.0, 32.0, 64.0, 100.0),
-    _choice("copies", 2, 3, 5, 8),
-    _choice("lifetime", 0.1, 0.2, 0.3, 0.6),
-    _choice("window", 10, 14, 20, 28, 40),
-    _choice("loss", 0.0, 0.02, 0.05),
-    (Knob("times", (10, 16, 24)), _has("motion", "later_steps"), _tracked_times),
+    Knob("static_share", _has("trainer", "coarse_steps"), _static_share, _steps, low=0.1, high=0.5),
+    _choice("last_rate", "trainer", "lr_last", 1.0, 0.3, 0.1),
+    _choice("first_scale", "trainer", "initial_scale", 0.5, 0.7, 1.0),
+    _choice("views_per_step", "trainer", "views_per_step", 2, 4),
+    _choice("average", "trainer", "average", 0.0, 0.2),
+    _choice("time_cell", "motion", "cell_ticks", 16.0, 32.0, 64.0, 100.0),
+    _choice("copies", "motion", "moving_copies", 2, 3, 5, 8),
+    _choice("lifetime", "motion", "moving_temporal_scale", 0.1, 0.2, 0.3, 0.6),
+    _choice("window", "image_maker", "half_window", 10, 14, 20, 28, 40),
+    _choice("loss", "supervision", "huber_delta", 0.0, 0.02, 0.05),
+    Knob(
+        "times",
+        _has("motion", "later_steps"),
+        lambda s: s["images"].time_spacing_ticks,
+        _tracked_times,
+        (10, 16, 24),
+    ),
 )

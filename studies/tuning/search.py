@@ -13,7 +13,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.tuned import read_tuned
+from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.kit.checkout import find_checkout
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.tuning.kept import keeping
@@ -39,7 +40,6 @@ from spike4dgs.studies.tuning.knobs import Values, as_settings, knobs_of, start_
 
 TRIALS = 24
 BUDGET = "0.25"
-_MARK, _END = "<!-- searches -->", "<!-- end searches -->"
 _RANDOM = 8  # trials before the search follows what it has seen
 _METRICS = ("psnr", "psnr_dynamic")
 Trial = dict[str, Any]  # number, knobs, scores by scene (dB), seconds
@@ -76,9 +76,10 @@ def tuning(
         if (variant := scene.meta["source"].get("variant")) not in DEVELOPMENT_VARIANTS:
             expected = f"a development variant ({', '.join(map(str, DEVELOPMENT_VARIANTS))})"
             raise problem(scene.id, expected, f"variant {variant}", "tune on scenes that no table has")
-    chosen = choose_device_for([_recipe(name) for name in rows], device)
-    for name in rows:
-        method = keeping(_recipe(name), chosen)
+    recipes = [_recipe(name) for name in rows]
+    chosen = choose_device_for(recipes, device)
+    for recipe in recipes:
+        method = keeping(recipe, chosen)
         about = {
             "row": method.name,
             "scenes": {scene.id: scene.revision for scene in opened},
@@ -224,16 +225,14 @@ def write_results(out: Path) -> None:
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
         rows.append((f"`{record['row']}`", _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-"))
         heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
-        scores = [[x for s in record["scenes"] for x in t["scores"].get(s, (None, None))] for t in done]
-        write_csv(
-            out / f"{record['row']}.csv",
-            heads,
-            [
-                [t["number"], *map(_short, t["knobs"].values()), *x, t["seconds"]]
-                for t, x in zip(done, scores, strict=True)
-            ],
-        )
+        write_csv(out / f"{record['row']}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
     write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
+
+
+def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
+    """Return a trial's line of the CSV; scenes that it did not see have empty cells."""
+    scores = [score for scene in scenes for score in trial["scores"].get(scene, [None] * len(_METRICS))]
+    return [trial["number"], *map(_short, trial["knobs"].values()), *scores, trial["seconds"]]
 
 
 def publish(out: Path, root: Path) -> None:
@@ -249,9 +248,9 @@ def publish(out: Path, root: Path) -> None:
                 found[record["row"]] = _found(record)
         write_json(path, dict(sorted(found.items())))
     page = root / "docs" / "results" / "tuning.md"
-    text, table = page.read_text(encoding="utf-8"), (out / "tuning.md").read_text(encoding="utf-8")
-    before, after = text.split(_MARK)[0], text.split(_END)[1]
-    write_text(page, f"{before}{_MARK}\n{table}{_END}{after}")
+    table = (out / "tuning.md").read_text(encoding="utf-8")
+    block = f"<!-- searches -->\n{table}<!-- end searches -->"
+    write_text(page, pattern("searches").sub(lambda _: block, page.read_text(encoding="utf-8")))
     for path in sorted(out.glob("*.csv")):
         write_text(root / "docs" / "results" / "tables" / "tuning" / path.name, path.read_text(encoding="utf-8"))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +13,6 @@ from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.generators.make_dataset import SceneSettings, track_jobs
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.tuned import SUFFIX as TUNED
-from spike4dgs.method.tuned import read_tuned
 from spike4dgs.studies.results.plan import (
     CALIBRATED,
     PLAN,
@@ -55,9 +53,7 @@ def test_the_blocks_of_the_tables_follow_from_the_recipes(group: Group) -> None:
 
 
 def test_a_row_is_tuned_where_a_search_of_it_is_kept() -> None:
-    searched = {}
-    for recipes in (theirs, ours):
-        searched |= read_tuned(Path(recipes.__file__).with_name("tuned.json"))
+    searched = {**theirs.SEARCHES, **ours.SEARCHES}
     rows = {row.name: row for row in TABLE1.rows}
     assert {name for name in rows if name.endswith(TUNED)} == {f"{name}{TUNED}" for name in searched if name in rows}
     for name in searched.keys() & rows.keys():
