@@ -33,10 +33,14 @@ class SoftLight:
         trace: (flat pixels [K], spp, with the instances?, t_s) -> radiance [K].
         region: t_s -> [C, H, W] bool, the pixels that every key traces.
         anchor_s: time between anchors.
+
+    Attributes:
+        spp: samples per pixel of the cheap renderings, a power of two; SPP unless it is set before the first.
     """
 
     def __init__(self, shape: tuple[int, int, int], trace: Trace, region: Region, anchor_s: float) -> None:
         self._shape, self._trace, self._region, self._anchor_s = shape, trace, region, anchor_s
+        self.spp = SPP
         self._anchors: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def change(self, t_s: float) -> np.ndarray:
@@ -64,7 +68,7 @@ class SoftLight:
     def _without(self) -> tuple[np.ndarray, np.ndarray]:
         """Return flat numbers [C, h, w] of the anchors' pixels and their radiance without the instances."""
         flat = np.arange(int(np.prod(self._shape))).reshape(self._shape)[:, ::STEP, ::STEP]
-        return flat, self._trace(flat.ravel(), SPP, False, 0.0).reshape(flat.shape)
+        return flat, self._trace(flat.ravel(), self.spp, False, 0.0).reshape(flat.shape)
 
     def _anchor(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted sum of the relative change around each sample, and the weight: [C, h, w] each."""
@@ -79,7 +83,7 @@ class SoftLight:
         seen = ~self._region(t_s)[:, ::STEP, ::STEP]
         relative, weight = np.zeros(flat.shape, np.float32), np.where(seen, without, 0).astype(np.float32)
         # brighter samples have more weight: sums of radiance are smoothed, not ratios, so dark noise does not spread
-        relative[seen] = self._trace(flat[seen], SPP, True, t_s) - without[seen]
+        relative[seen] = self._trace(flat[seen], self.spp, True, t_s) - without[seen]
         near, far = (0, _SIGMA, _SIGMA), (0, _FAR_SIGMA, _FAR_SIGMA)
         total = ndimage.gaussian_filter(relative, near) + 1e-3 * ndimage.gaussian_filter(relative, far)
         return total, ndimage.gaussian_filter(weight, near) + 1e-3 * ndimage.gaussian_filter(weight, far) + 1e-12

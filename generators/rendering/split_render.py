@@ -39,6 +39,7 @@ from spike4dgs.generators.rendering.like_surfaces import (
     smoothed_light,
 )
 from spike4dgs.generators.rendering.render import MAX_DEPTH, MultiViewRenderer, SoftStatic, StaticViews, anchor_s
+from spike4dgs.generators.rendering.soft_light import SPP
 
 _NEAR_PX = 1  # around moving objects: pixels that may see one
 _MOVED = 0.1  # distance in widths of a pixel by which a point differs from the background's
@@ -74,6 +75,7 @@ class SplitRenderer(MultiViewRenderer):
             maps_of: returns a renderer of the whole rig, whose maps these views of it take.
         """
         super().__init__(*args, **others)
+        self._soft_light.spp = max(SPP, self.spp // 4)  # so that its noise stays below the rest, in ground truth too
         self.soft = soft
         self._maps: dict[float | None, Any] = {}
         self._arrays: dict[float, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
