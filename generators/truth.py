@@ -29,6 +29,7 @@ from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, 
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.second_renderings import second_truth
 
 _MASK_GROW_PX = 2
 _MASK_CHANGE = 0.1  # relative change of radiance that counts as moving light
@@ -152,13 +153,14 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
     first = job.target_ticks[:: max(1, len(job.target_ticks) // _PAIRS)][:_PAIRS]
     pairs = [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in job.target_ticks]
     ticks = sorted({t for pair in pairs for t in pair})
-    own = [_truth_again(job, view, job.seed + seed) for seed in _SEEDS]
-    masks = {t: own[0].object_masks(t / RATE_HZ)[0] for t in ticks}
+    own = [second_truth(job, view, job.seed + seed) for seed in _SEEDS]
+    objects = renderer_of(job, [camera], truth=True)
+    masks = {t: objects.object_masks(t / RATE_HZ)[0] for t in ticks}
     seen = {t: store.radiance(view, plan, t) for t in ticks}
     light = {t: np.float32(job.light_at(t)) for t in ticks}
     truths = {t: read_exr(scene / f"images/{Target(camera.id, t).name}.exr") / light[t] for t in ticks}
     moving = {t: read_mask(mask_file(scene, Target(camera.id, t))) for t in ticks}
-    others = {t: [r.keys(t / RATE_HZ)[0] for r in own] for t in ticks}
+    others = {t: [rendered(t / RATE_HZ) for rendered in own] for t in ticks}
     found = {
         "streams": _noise(seen, others, moving, masks) | _correlation(seen, others, moving, pairs),
         "truth": _noise(truths, others, moving, masks) | _correlation(truths, others, moving, pairs),
@@ -175,19 +177,6 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
         whole = {t: [r.crn_frames(t / RATE_HZ)[0] for r in paths] for t in some}
         found["truth_against_paths"] = _noise({t: truths[t] for t in some}, whole, moving, masks)
     return found
-
-
-def _truth_again(job: Job, view: int, seed: int) -> MultiViewRenderer:
-    """Return what renders the ground truth of a view as `RenderTargets` does, with other random numbers.
-
-    All that is systematic stays the same: a background of the rig, and maps that its views share.
-    """
-    alike: dict[str, Any] = {"truth": True, "color": False, "seed": seed}
-    camera = cameras_of(job)[view : view + 1]
-    if job.profile.soft is None:  # views share nothing
-        return renderer_of(job, camera, **alike)
-    every = renderer_of(job, cameras_of(job), **alike)
-    return renderer_of(job, camera, static=every.static.views([view]), maps_of=lambda: every, **alike)
 
 
 Images = Mapping[int, NDArray[np.float32]]  # by tick, [H, W]
