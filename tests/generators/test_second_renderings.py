@@ -5,8 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.generators.second_renderings import second_renderings
+from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
+from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
+from spike4dgs.generators.second_renderings import second_renderings, second_truth
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
 
@@ -27,3 +30,15 @@ def test_second_renderings_show_the_truths_noise(tiny_data: Path) -> None:
     assert between < ceiling, "each of them has noise of its own"
     share, error = noise_share(truth, truth, first, second)
     assert share == pytest.approx(1, abs=0.02) and error is not None and error < 0.02
+
+
+@pytest.mark.slow
+def test_a_second_truth_with_the_seed_of_the_first_equals_it() -> None:
+    """So the two differ in random numbers alone, where views share maps of soft light."""
+    job = Job("turntable", 0, 0, "tiny", SPLIT_PROFILES["tiny"], 0.004)
+    static = renderer_of(job, cameras_of(job), truth=True).static
+    tick = next(t for t in job.target_ticks if t not in job.sparse_ticks)
+    (truth,) = RenderTargets(job, static)([tick])
+    again = second_truth(job, truth.view, job.render_seed + 1)(tick / RATE_HZ)
+    np.testing.assert_allclose(gray(truth.rgb), again, rtol=1e-5, atol=1e-6)
+    assert np.abs(second_truth(job, truth.view, 77)(tick / RATE_HZ) - again).mean() > 1e-4
