@@ -29,18 +29,19 @@ def find_plugins(
     """
     plugins, fix = dict[str, Plugin](), "repair or uninstall the package that registers it"
     for entry in sorted(entry_points(group=group), key=lambda e: e.name):
-        where = f"entry point {entry.name}"
+        where, source = f"entry point {entry.name}", source_of(entry)
         try:
             found = entry.load()
         except Exception as e:  # somebody else's package
             raise problem(where, entry.value, f"{type(e).__name__}: {e}", fix) from e
         if not isinstance(found, Mapping):
-            raise problem(source_of(entry), f"a mapping from {kind} name to {kind}", type(found).__name__, fix)
+            raise problem(source, f"a mapping from {kind} name to {kind}", type(found).__name__, fix)
+        package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
         for name, value in found.items():
             if name in plugins or name in taken:
                 raise problem(where, f"a new {kind} name", f"'{name}' twice", "rename one of them")
-            check(name, value, source_of(entry))
-            plugins[name] = Plugin(value, f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value)
+            check(name, value, source)
+            plugins[name] = Plugin(value, package)
     return plugins
 
 
