@@ -520,13 +520,13 @@ def listing(root: Path) -> dict[str, int]:
 
 def run(root: Path, inputs: int, seed: int, only: str = "") -> dict[str, Outcome]:
     """Give the readers `inputs` hostile inputs in `root`; return what came of them, by case."""
+    from spike4dgs.benchmark.compilation import _folder
     from spike4dgs.benchmark.errors import UserError
-    from spike4dgs.benchmark.files import user_cache
 
     home, work = root / "home", root / "work"
     for folder in (home, root / "cwd", work):
         folder.mkdir(parents=True)
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache() / "numba"))  # kernels take long to compile
+    os.environ.setdefault("NUMBA_CACHE_DIR", _folder())  # the user's: kernels take long to compile
     os.environ.update(HOME=str(home), XDG_CACHE_HOME=str(home / "cache"), TMPDIR=str(work))
     (root / "untouched").write_text("untouched")
     os.chdir(root / "cwd")
