@@ -38,6 +38,7 @@ from spike4dgs.studies.results.records import (
     scores_of,
     write_row,
 )
+from spike4dgs.studies.results.scenes import revisions_of
 
 DEVICE = "cpu"  # of every published number
 
@@ -80,13 +81,13 @@ def sweep(
             held.enter_context(locked(lock, folder, "a folder that no other sweep uses", temporary=True))
             remove_parts(folder)
         records = read_records(settings.records)
-        _check_revisions(scenes.values(), records.values())
+        revisions = revisions_of(scenes.values(), records.values(), settings.records, console)
         here = [cell for cell in cells if cell.scene in scenes]
         todo = [cell for cell in here if not _is_done(records.get(_key(cell)), settings.quiet)]
         console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
         codes = {name: code_digest(name) for name in dict.fromkeys(cell.row for cell in here)}
         _say_other_code(here, records, codes, console)
-        _measure(todo, scenes, methods, codes, state, settings, records, console)
+        _measure(todo, scenes, revisions, methods, codes, state, settings, records, console)
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
@@ -109,14 +110,6 @@ def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[str, Sc
     return scenes
 
 
-def _check_revisions(scenes: Iterable[Scene], records: Iterable[Record]) -> None:
-    known = {record["scene"]: record["revision"] for record in records}
-    for scene in scenes:
-        if known.get(scene.id, scene.revision[:DIGITS]) != scene.revision[:DIGITS]:
-            fix = "use that scene, or move the records elsewhere and measure every row anew"
-            raise problem(scene.root, f"revision {known[scene.id]}, as in the records", scene.revision[:DIGITS], fix)
-
-
 def _key(cell: Cell) -> Key:
     return cell.row, cell.scene, cell.seed, make_budget(cell.budget).label, cell.split
 
@@ -137,6 +130,7 @@ def _say_other_code(
 def _measure(
     todo: Sequence[Cell],
     scenes: Mapping[str, Scene],
+    revisions: Mapping[str, str],
     methods: Mapping[str, Method],
     codes: Mapping[str, str],
     state: CodeState,
@@ -162,10 +156,12 @@ def _measure(
             if (found := code_digest(cell.row)) != codes[cell.row]:
                 fix = "start again; a sweep needs a checkout that nobody edits"
                 raise problem("the methods' code", codes[cell.row], f"{found}: it changed meanwhile", fix)
+            revision, own = revisions[cell.scene], job.scene.revision[:DIGITS]
             record: Record = {
                 "row": cell.row,
                 "scene": cell.scene,
-                "revision": job.scene.revision[:DIGITS],
+                "revision": revision,
+                **({"equivalent": own} if own != revision else {}),
                 "seed": cell.seed,
                 "budget": job.budget.label,
                 "split": cell.split,

@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import dummy_methods
+import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, wait_for
 from rich.console import Console
@@ -19,6 +21,7 @@ from small_scenes import write_small_scene
 from spike4dgs import baselines, benchmark, method
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Method
+from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint, write_fingerprint
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.studies.results import code_state as states
@@ -142,6 +145,23 @@ def test_records_of_other_code_are_kept_and_named_and_those_of_another_scene_ref
     assert "kept, measured by other code: a;" in swept(folder, [planned], methods)[2]
     write_row(folder / "records", "a", [{**r, "revision": "ffffffffffff"} for r in records.values()])
     with pytest.raises(UserError, match="expected revision ffffffffffff, as in the records"):
+        swept(folder, cells("b"), methods)
+
+
+def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_rounding(folder: Path) -> None:
+    methods = {"a": CountMethod("a"), "b": CountMethod("b")}
+    _, records, _ = swept(folder, cells("a"), methods)
+    path, own = folder / "records/scenes/pattern-0.npz", open_scene(folder / "pattern-0").revision
+    made = read_fingerprint(path)
+    assert made.revision == own and compare(open_scene(folder / "pattern-0"), made).is_equivalent
+    write_row(folder / "records", "a", [{**r, "revision": "f" * 12} for r in records.values()])
+    write_fingerprint(path, replace(made, revision="f" * 64))
+    _, records, said = swept(folder, cells("b"), methods)
+    of_b = next(r for r in records.values() if r["row"] == "b")
+    assert (of_b["revision"], of_b["equivalent"]) == ("f" * 12, own[:12]) and "0.0000% of its spike bits" in said
+    spikes = {k: v + (k.startswith("spikes/") and np.uint8(40)) for k, v in made.arrays.items()}
+    write_fingerprint(path, replace(made, revision="f" * 64, arrays=spikes))
+    with pytest.raises(UserError, match="expected revision ffffffffffff.*spikes"):
         swept(folder, cells("b"), methods)
 
 
