@@ -1,7 +1,8 @@
 """Streams without holes: missing ticks are filled from the spikes around them, bad pixels from a neighbour's spikes.
 
 Every consumer of a stream then works as it is, whatever it counts. What is filled says nothing new: a loss leaves bad
-pixels out (`CameraState.bad`), and the gaps that remain listed, which are long.
+pixels out (`CameraState.bad`), and the gaps that remain listed, which are long. Who looks at single spikes leaves out
+all that is filled where a spike's own tick matters (`lost_spikes`).
 
 A pixel's intervals within NEAR_TICKS on either side of a gap, two at least, give its usual interval L, and on an even
 train the places p and q of the last spike before the gap and the first after it. round((q - p) / L) - 1 spikes were
@@ -32,9 +33,10 @@ AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 
 def fill_gaps(stream: SpikeStream) -> SpikeStream:
-    """Return the stream with its missing ticks filled. Gaps longer than LONGEST_TICKS remain listed.
+    """Return the stream with its missing ticks filled, and listed in `filled`.
 
-    Of a mapped file the pages that change are in memory, and no others.
+    Gaps longer than LONGEST_TICKS remain listed in `gaps` too. Of a mapped file the pages that change are in memory,
+    and no others.
     """
     if not stream.gaps:
         return stream
@@ -47,7 +49,8 @@ def fill_gaps(stream: SpikeStream) -> SpikeStream:
     in_threads(_fill, packed.shape[1], plain, starts, stops, pixels, small=pixels * len(starts) < _SMALL)
     long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > LONGEST_TICKS]
     gaps = tuple(g for g in stream.gaps if any(a <= g.first_tick < b for a, b in long))
-    return replace(stream, packed=packed, gaps=gaps)
+    filled = tuple(sorted({*stream.filled, *stream.gaps}))
+    return replace(stream, packed=packed, gaps=gaps, filled=filled)
 
 
 def _private(packed: UInt8) -> UInt8:

@@ -1,7 +1,8 @@
 """Spike trains: the bits of a stream, turned so that a pixel's ticks lie in words, and counted now and then.
 
 Where a pixel's spikes are, and how many of them come before a tick, is then found in a few operations, however long the
-clip is. Trains take 1.13 times the stream's bytes, whatever its spikes; a list of their ticks takes 32 bits for each.
+clip is. The recorded spikes are here, and apart from them what lost ticks were filled with (`lost_spikes`). Trains take
+1.13 times the stream's bytes, whatever its spikes; a list of their ticks takes 32 bits for each.
 
 The kernels below are for other kernels, on the stored order of pixels. Words of one tick lie next to each other: images
 look at all pixels around the same few ticks.
@@ -19,39 +20,63 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from spike4dgs.benchmark.arrays import UInt8, UInt32, UInt64
+from spike4dgs.benchmark.arrays import Int64, Mask, UInt8, UInt32, UInt64
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 _COUNTED = 4  # words, 256 ticks, from one count to the next: fewer take more memory, more take longer
+_TYPES = np.uint64, np.uint32  # of words and counts
 
 
 @dataclass(frozen=True, eq=False)
 class SpikeTrains:
-    """The spikes of P pixels in W = n_ticks // 64 + 1 words."""
+    """The spikes of P pixels in W = n_ticks // 64 + 1 words, those of filled ticks left out."""
 
     words: UInt64  # [W, P] bit t & 63 of words[t >> 6, p]: pixel p fired in tick t
     before: UInt32  # [ceil(W / _COUNTED), P] spikes before word _COUNTED k
+    lost: Int64  # [n_ticks + 1] filled ticks before each tick, and before the end
+    filled_words: UInt64  # as `words`, of the filled ticks alone, one after the other; empty where there are none
+    filled_before: UInt32  # as `before`
+
+    @property
+    def arrays(self) -> tuple[UInt64, UInt32, Int64, UInt64, UInt32]:
+        """The fields, for kernels."""
+        return self.words, self.before, self.lost, self.filled_words, self.filled_before
 
 
 @lru_cache(maxsize=1)
 def spike_trains(stream: SpikeStream) -> SpikeTrains:
     """Return the trains of a stream, cached for the last one: images are made stream by stream."""
-    trains = SpikeTrains(*(np.empty(shape, dtype) for shape, dtype in _arrays(stream)))
-    in_threads(_turn, len(trains.words), rows(stream.packed), trains.words)
-    in_threads(_accumulate, trains.words.shape[1], trains.words, trains.before)
-    return trains
+    pixels, kept = stream.height * stream.width, present(stream.filled, stream.n_ticks)
+    lost = np.concatenate([[0], np.cumsum(~kept)]).astype(np.int64)
+    filled = _turned(stream.packed[~kept], pixels) if stream.filled else (np.empty((0, 0), t) for t in _TYPES)
+    return SpikeTrains(*_turned(stream.packed, pixels, kept if stream.filled else None), lost, *filled)
 
 
 def trains_bytes(stream: SpikeStream) -> int:
-    """Return the bytes that a stream's trains take."""
-    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in _arrays(stream))
+    """Return the bytes that the trains of a stream without filled ticks take."""
+    shapes = _shapes(stream.n_ticks, stream.height * stream.width)
+    return sum(math.prod(s) * np.dtype(t).itemsize for s, t in zip(shapes, _TYPES, strict=True))
 
 
-def _arrays(stream: SpikeStream) -> tuple[tuple[tuple[int, int], Any], ...]:
-    """Return shape and type of a stream's words and counts."""
-    pixels, count = stream.height * stream.width, stream.n_ticks // 64 + 1
-    return ((count, pixels), np.uint64), ((-(-count // _COUNTED), pixels), np.uint32)
+def _turned(packed: UInt8, pixels: int, kept: Mask | None = None) -> tuple[UInt64, UInt32]:
+    """Return words and counts of packed ticks, of those that are `kept` [n_ticks] alone."""
+    words, before = (np.empty(s, t) for s, t in zip(_shapes(len(packed), pixels), _TYPES, strict=True))
+    in_threads(_turn, len(words), rows(packed), words)
+    if kept is not None:
+        bits = np.zeros(64 * len(words), bool)
+        bits[: len(kept)] = kept
+        masks = np.packbits(bits.reshape(-1, 64), axis=1, bitorder="little").view("<u8").astype(np.uint64)
+        np.bitwise_and(words, masks, out=words)
+    in_threads(_accumulate, pixels, words, before)
+    return words, before
+
+
+def _shapes(n_ticks: int, pixels: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the shapes of words and counts."""
+    count = n_ticks // 64 + 1
+    return (count, pixels), (-(-count // _COUNTED), pixels)
 
 
 @kernel

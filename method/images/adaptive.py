@@ -7,7 +7,7 @@ T = t_j - t_i ticks between them, the rate is
     r_h = (j - i) / T,    and under constant light it lies between (j - i) / (T + 1) and (j - i) / (T - 1),
 
 for both spikes are known to the tick. A count over the same window would leave 1 / 2h to either side of j - i over 2h:
-r_h is 1 / r_h times as precise.
+r_h is 1 / r_h times as precise. Of a recording that lacks ticks, rates and bounds are those of `lost_spikes`.
 
 Windows grow by half an octave each. A pixel takes the longest one before these bounds cease to have a point in common:
 beyond it no constant light explains the spikes. The first bounds are those of the interval that t lies in. That no
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64, UInt8, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
+from spike4dgs.benchmark.spikes.lost_spikes import fewest, filled_between, most
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.base import ImageMaker
@@ -93,20 +94,23 @@ def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Fl
 
 
 def _arguments(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None) -> tuple[Any, ...]:
-    """Return what both kernels take: the trains, the tick, the windows' ticks [starts, stops), and the light."""
+    """Return what both kernels take: the trains, its light, the tick, and the windows' ticks [starts, stops)."""
     trains, halves = spike_trains(stream), half_windows(stream.n_ticks, s)
     edges = np.ceil([tick - halves, tick + halves]).clip(0, stream.n_ticks).astype(np.int64)
-    return trains.words, trains.before, tick, *edges, gathered(stream, light)
+    return *trains.arrays, gathered(stream, light), tick, *edges
 
 
 @kernel
 def _choose(
     words: UInt64,
     before: UInt32,
+    lost: Int64,
+    filled_words: UInt64,
+    filled_before: UInt32,
+    light: Float64,
     tick: int,
     starts: Int64,
     stops: Int64,
-    light: Float64,
     level: UInt8,
     start: int,
     stop: int,
@@ -132,8 +136,12 @@ def _choose(
                 j, last, wider = k, last_before(words, p, stops[s]), True
             if wider and j > i:
                 length = light[last] - light[first]
-                low = max(low, (j - i) / (length + 1))
-                high = min(high, (j - i) / (length - 1) if length > 1 else np.inf)
+                filled, doubt = (
+                    filled_between(lost, filled_words, filled_before, p, first, last),
+                    lost[last] - lost[first],
+                )
+                low = max(low, fewest(j - i, filled, doubt) / (length + 1))
+                high = min(high, most(j - i, filled, doubt) / (length - 1) if length > 1 else np.inf)
                 if low > high:
                     level[p] = s - 1
                     break
@@ -144,10 +152,13 @@ def _choose(
 def _estimate(
     words: UInt64,
     before: UInt32,
+    lost: Int64,
+    filled_words: UInt64,
+    filled_before: UInt32,
+    light: Float64,
     tick: int,
     starts: Int64,
     stops: Int64,
-    light: Float64,
     level: UInt8,
     image: Float32,
     start: int,
@@ -156,7 +167,8 @@ def _estimate(
     """Set each pixel's rate over its window, or over the next longer one that has two spikes."""
     for p in range(start, stop):
         total, after = count_before(words, before, p, len(light)), count_before(words, before, p, tick)
-        image[p] = np.float32(total / len(light))
+        filled = filled_between(lost, filled_words, filled_before, p, 0, len(light))
+        image[p] = np.float32((total + filled) / len(light))
         if total < 2:
             continue
         for s in range(level[p], len(starts)):
@@ -166,7 +178,8 @@ def _estimate(
                 # The spikes next to `tick` count even where the window is too short for them.
                 first = last_before(words, p, tick) if i + 1 == after else first_from(words, p, starts[s])
                 last = first_from(words, p, tick) if j == after else last_before(words, p, stops[s])
-                image[p] = np.float32((j - i) / (light[last] - light[first]))
+                filled = filled_between(lost, filled_words, filled_before, p, first, last)
+                image[p] = np.float32((j - i + filled) / (light[last] - light[first]))
                 break
 
 

@@ -30,7 +30,7 @@ def _images(make: Callable[..., Any]) -> Callable[..., Any]:
     known: dict[str, Any] = {}
 
     def kept(stream: SpikeStream, *rest: Any, **light: Any) -> Any:
-        key = _digest(stream.packed.tobytes(), stream.gaps, rest, light)
+        key = _digest(stream.packed.tobytes(), stream.gaps, stream.filled, rest, light)
         if key not in known:
             known[key] = make(stream, *rest, **light)
         return known[key]

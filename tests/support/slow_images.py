@@ -1,7 +1,7 @@
 """The slow, obvious image makers: float64 or 50 digits, one pixel after the other, straight from the definitions.
 
 The fast makers are tested against these, and the report of hard cases compares them. Arguments: spikes [T, H, W] of 0
-and 1, upright and unpacked, and a tick; they return spikes per tick [H, W].
+and 1, upright and unpacked, and a tick; they return spikes per tick [H, W]. `lost` are ticks [T] that were filled.
 """
 
 from __future__ import annotations
@@ -14,17 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows
-from spike4dgs.method.images.intervals import IntervalSettings
+from spike4dgs.method.images.intervals import FOLLOWED, LEAST, MOVED, IntervalSettings
 
 Spikes = NDArray[np.generic]
+Lost = NDArray[np.bool_] | None
 PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # TFSTP's u0, f, D, F
 
 
-def stream_of(spikes: Spikes, bottom_up: bool = True) -> SpikeStream:
+def stream_of(spikes: Spikes, bottom_up: bool = True, lost: Lost = None) -> SpikeStream:
     """Return spikes [T, H, W] as a stream in memory."""
-    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20_000.0, bottom_up)
+    filled = () if lost is None else tuple(Gap("cam_00", int(t), 1, "lost") for t in np.flatnonzero(lost))
+    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20_000.0, bottom_up, filled=filled)
 
 
 def slow_tfp(spikes: Spikes, tick: int, half_window: int) -> Float64:
@@ -54,16 +57,21 @@ def slow_tfi(spikes: Spikes, tick: int) -> Float64:
     return image
 
 
-def _window(spikes: Spikes, tick: int, half: float) -> tuple[float | None, NDArray[np.int64]]:
-    """Return the rate of one pixel [T] over a window, None with fewer than two spikes, and the window's spikes."""
-    t = np.flatnonzero(spikes)
+def _recorded(spikes: Spikes, lost: Lost) -> NDArray[np.int64]:
+    """Return the ticks of the recorded spikes of one pixel [T]."""
+    return np.flatnonzero(spikes if lost is None else (spikes != 0) & ~lost)
+
+
+def _window(spikes: Spikes, tick: int, half: float, lost: Lost) -> tuple[float | None, NDArray[np.int64]]:
+    """Return the rate of one pixel [T] over a window, None with fewer than two spikes, and its recorded spikes."""
+    t = _recorded(spikes, lost)
     near = (t >= tick - half) & (t < tick + half)
     near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=len(spikes)))
     t = t[near]
-    return (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else None, t
+    return np.count_nonzero(spikes[t[0] : t[-1]]) / (t[-1] - t[0]) if len(t) > 1 else None, t
 
 
-def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings) -> NDArray[np.int64]:
+def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings, lost: Lost) -> NDArray[np.int64]:
     """Return each pixel's longest window that a constant rate explains, [H, W]; of neighbours, the shortest."""
     n, height, width = spikes.shape
     halves, reach = half_windows(n, settings), settings.shared_px // 2
@@ -71,11 +79,13 @@ def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings) -> NDArra
     for y, x in np.ndindex(height, width):
         known = []
         for s, half in enumerate(halves):
-            rate, t = _window(spikes[:, y, x], tick, half)
+            rate, t = _window(spikes[:, y, x], tick, half, lost)
             if rate is None:
                 continue
-            k, length = len(t) - 1, t[-1] - t[0]
-            known.append((k / (length + 1), k / (length - 1) if length > 1 else math.inf))
+            k, length, doubtful = len(t) - 1, t[-1] - t[0], 0 if lost is None else int(lost[t[0] : t[-1]].sum())
+            likely = int(np.count_nonzero(spikes[t[0] : t[-1], y, x]))
+            fewest, most = (max(k, likely - 1), min(k + doubtful, likely + 1)) if doubtful else (k, k)
+            known.append((fewest / (length + 1), most / (length - 1) if length > 1 else math.inf))
             if max(a for a, _ in known) > min(b for _, b in known):
                 level[y, x] = s - 1
                 break
@@ -85,26 +95,29 @@ def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings) -> NDArra
     return shared
 
 
-def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None = None) -> Float64:
+def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None = None, lost: Lost = None) -> Float64:
     """Return the rate over the longest window that a constant rate explains, pixel by pixel, window by window."""
     settings = settings or AdaptiveSettings()
-    return _slow_rates(spikes, tick, half_windows(len(spikes), settings), slow_levels(spikes, tick, settings))
+    levels = slow_levels(spikes, tick, settings, lost)
+    return _slow_rates(spikes, tick, half_windows(len(spikes), settings), levels, lost)
 
 
-def _slow_rates(spikes: Spikes, tick: int, halves: Float64, level: NDArray[np.int64]) -> Float64:
+def _slow_rates(spikes: Spikes, tick: int, halves: Float64, level: NDArray[np.int64], lost: Lost) -> Float64:
     """Return each pixel's rate over its window, or over the next longer one that has two spikes."""
     image = np.asarray(spikes.astype(np.float64).sum(axis=0) / len(spikes))
     for y, x in np.ndindex(image.shape):
-        rates = [_window(spikes[:, y, x], tick, half)[0] for half in halves[level[y, x] :]]
+        rates = [_window(spikes[:, y, x], tick, half, lost)[0] for half in halves[level[y, x] :]]
         image[y, x] = next((r for r in rates if r is not None), image[y, x])
     return image
 
 
-def slow_intervals(spikes: Spikes, tick: int, settings: IntervalSettings | None = None) -> tuple[Float64, Float64]:
+def slow_intervals(
+    spikes: Spikes, tick: int, settings: IntervalSettings | None = None, lost: Lost = None
+) -> tuple[Float64, Float64]:
     """Return the rates and the first and last instants of their spans [2, H, W] in ticks from `tick`."""
     s = settings or IntervalSettings()
-    halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s)
-    image, spans = _slow_rates(spikes, tick, halves, level), np.empty((2, *spikes.shape[1:]))
+    halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s, lost)
+    image, spans = _slow_rates(spikes, tick, halves, level, lost), np.empty((2, *spikes.shape[1:]))
     spans[0], spans[1] = -s.half, s.half
     for y, x in np.ndindex(image.shape):
         window = float(halves[level[y, x]])
@@ -112,23 +125,54 @@ def slow_intervals(spikes: Spikes, tick: int, settings: IntervalSettings | None 
             continue
         # Half a span is a float32 number: 4.000000000000001 would tell apart two spikes that are equally near.
         half = float(np.float32(min(s.half, max(s.shortest, window / s.growth))))
-        if found := _between_spikes(spikes[:, y, x], tick, half):
+        if found := _measured(_recorded(spikes[:, y, x], lost), tick, half, lost):
             image[y, x], spans[:, y, x] = found[0], found[1:]
     return image, spans
 
 
-def _between_spikes(spikes: Spikes, tick: int, half: float) -> tuple[float, float, float] | None:
-    """Return rate, first and last instant of one pixel [T] between the spikes nearest to tick -+ half.
+def _measured(fired: NDArray[np.int64], tick: int, half: float, lost: Lost) -> tuple[float, float, float] | None:
+    """Return rate, first and last instant of a pixel's span; None with fewer than two recorded spikes, `fired`."""
+    found = _between_spikes(fired, tick - half, tick + half, tick)
+    if found is None or lost is None or not (doubtful := lost[fired[found[0]] : fired[found[1]]].sum()):
+        length = 0 if found is None else fired[found[1]] - fired[found[0]]
+        return None if found is None else _span(fired, *found, tick, length)
+    length = fired[found[1]] - fired[found[0]]
+    windows = []
+    numbers = np.cumsum(lost)  # ticks of one run have one number
+    for number in np.unique(numbers[~lost]):
+        run = np.flatnonzero((numbers == number) & ~lost)
+        start, stop = run[0], run[-1] + 1
+        low, high = max(start, tick - (1 + MOVED) * half), min(stop, tick + (1 + MOVED) * half)
+        if high - low > 2 * half:
+            middle = min(max(tick, low + half), high - half)
+            low, high = middle - half, middle + half
+        inside = np.flatnonzero((fired >= start) & (fired < stop))
+        if high <= low or len(inside) < 2:
+            continue
+        i, j = (int(inside[np.argmin(abs(fired[inside] + 0.5 - end))]) for end in (low, high))
+        if i < j and max(tick - fired[i] - 0.5, fired[j] + 0.5 - tick) <= FOLLOWED * half:
+            windows.append((low - high, start, i, j))
+    if windows:
+        *_, i, j = min(windows)  # the longest, of equally long ones the first
+        if fired[j] - fired[i] >= LEAST * length:
+            return _span(fired, i, j, tick, fired[j] - fired[i])
+    return _span(fired, *found, tick, length - doubtful)
 
-    None with fewer than two spikes.
-    """
-    instants = np.flatnonzero(spikes) + 0.5
+
+def _span(fired: NDArray[np.int64], i: int, j: int, tick: int, ticks: float) -> tuple[float, float, float]:
+    """Return the rate in `ticks` between two spikes, and the span that they bound."""
+    return (j - i) / ticks, fired[i] + 0.5 - tick, fired[j] + 0.5 - tick
+
+
+def _between_spikes(fired: NDArray[np.int64], start: float, stop: float, tick: int) -> tuple[int, int] | None:
+    """Return the numbers of a pixel's two spikes nearest to two instants; None with fewer than two spikes."""
+    instants = fired + 0.5
     if len(instants) < 2:
         return None
-    i, j = (int(np.argmin(abs(instants - end))) for end in (tick - half, tick + half))
+    i, j = (int(np.argmin(abs(instants - end))) for end in (start, stop))
     if i == j:
         i, j = (i - 1, j) if (instants[i] > tick and i > 0) or j + 1 == len(instants) else (i, j + 1)
-    return (j - i) / (instants[j] - instants[i]), instants[i] - tick, instants[j] - tick
+    return i, j
 
 
 def slow_tfstp(spikes: Spikes, tick: int) -> Float64:

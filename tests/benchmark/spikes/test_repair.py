@@ -54,6 +54,9 @@ def test_a_long_gap_goes_on_at_the_rate_and_remains_listed():
     spikes = steady(RATES)
     filled = fill_gaps(stream_of(spikes, [(100, 60), (200, 3)]))
     assert [(g.first_tick, g.ticks) for g in filled.gaps] == [(100, 60)]
+    assert [(g.first_tick, g.ticks) for g in filled.filled] == [(100, 60), (200, 3)] and fill_gaps(filled).filled == (
+        filled.filled
+    )
     assert np.abs(_counts(filled) - spikes.sum(0)).max() <= 1 + 60 / NEAR_TICKS
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from memory import peak_bytes
 
+from spike4dgs.benchmark.spikes.gaps import Gap
+from spike4dgs.benchmark.spikes.lost_spikes import filled_between, recorded_runs
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains, trains_bytes
 
@@ -33,6 +37,28 @@ def test_numbers_and_ticks_of_spikes_are_those_of_a_plain_loop(n: int, width: in
                 assert last_before(trains.words, pixel, tick) == before[-1]
             if len(after):
                 assert first_from(trains.words, pixel, tick) == after[0]
+
+
+@settings(max_examples=30, deadline=None)
+@example(64, 1.0, 0)
+@given(st.integers(1, 300), st.sampled_from([0.0, 0.05, 0.5, 1.0]), st.integers(0, 2**31))
+def test_recorded_and_filled_spikes_are_apart(n: int, share: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spikes, lost = rng.random((n, 1, 9)) < 0.3, rng.random(n) < share
+    gaps = tuple(Gap("c", int(t), 1, "lost") for t in np.flatnonzero(lost))
+    trains = spike_trains(replace(stream_of(spikes), filled=gaps))
+    np.testing.assert_array_equal(trains.lost, np.concatenate([[0], np.cumsum(lost)]))
+    for pixel in range(9):
+        for a, b in np.sort(rng.integers(0, n + 1, (8, 2)), axis=1).tolist():
+            recorded = [count_before(trains.words, trains.before, pixel, t) for t in (a, b)]
+            assert recorded[1] - recorded[0] == (spikes[a:b, 0, pixel] & ~lost[a:b]).sum()
+            filled = filled_between(trains.lost, trains.filled_words, trains.filled_before, pixel, a, b)
+            assert filled == (spikes[a:b, 0, pixel] & lost[a:b]).sum()
+    start, stop = sorted(rng.integers(-5, n + 5, 2).tolist())
+    whole = list(zip(*recorded_runs(trains.lost, start, stop), strict=True))
+    runs = [t for a, b in whole for t in range(a, b)]
+    assert [t for t in runs if start <= t < stop] == [t for t in range(max(start, 0), min(stop, n)) if not lost[t]]
+    assert all(t == 0 or t == n or lost[t - 1] != lost[t] for a, b in whole for t in (a, b)), "whole runs"
 
 
 def test_padding_bits_of_the_last_byte_are_no_pixels() -> None:
