@@ -136,10 +136,8 @@ def _choose(
                 j, last, wider = k, last_before(words, p, stops[s]), True
             if wider and j > i:
                 length = light[last] - light[first]
-                filled, doubt = (
-                    filled_between(lost, filled_words, filled_before, p, first, last),
-                    lost[last] - lost[first],
-                )
+                filled = filled_between(lost, filled_words, filled_before, p, first, last)
+                doubt = lost[last] - lost[first]
                 low = max(low, fewest(j - i, filled, doubt) / (length + 1))
                 high = min(high, most(j - i, filled, doubt) / (length - 1) if length > 1 else np.inf)
                 if low > high:
