@@ -56,15 +56,13 @@ def scenes_block(group: Group, records: Sequence[Record]) -> list[str]:
 
 
 def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
-    """Return a sentence for each row of ours: its lead over the best other row that is given as much."""
+    """Return a sentence for each row of ours, best first: its lead over the best other row that is given as much."""
     own = of_group(group, records)
-    ours = {row.name for row in group.rows if row.ours}
-    sentences = []
-    for knowledge, rows, _ in _blocks(group, own):
-        rivals = [row for row in rows if row.is_complete and row.name not in ours]
-        for row in rows:
-            if row.is_complete and row.name in ours and rivals:
-                sentences.append(f"- `{row.name}`, {knowledge}: {_lead_text(row, rivals)}.")
+    sentences = [
+        f"- `{row.name}`, {knowledge}: {_lead_text(row, rivals)}."
+        for knowledge, rows, rivals in _leaders(group, own)
+        for row in rows
+    ]
     if not sentences:
         return [NO_LEAD if own else NOTHING]
     intro = (
@@ -74,7 +72,19 @@ def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
     return [intro, "", *sentences, "", provenance(group, own)]
 
 
+def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
+    """Return a sentence for each knowledge: the lead of the best row of ours."""
+    own = of_group(group, records)
+    commits = ", ".join(sorted({_commit(r) for r in own}))
+    lines = [
+        f"- {knowledge}, `{rows[0].name}`: {_lead_text(rows[0], rivals)} (commit {commits})."
+        for knowledge, rows, rivals in _leaders(group, own)
+    ]
+    return lines or [NO_LEAD if own else NOTHING]
+
+
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
+    "headline": lambda records: headline_block(NINE, records),
     "lead": lambda records: lead_block(NINE, records),
     "nine-scenes": lambda records: table_block(NINE, records),
     "table1": lambda records: table_block(TABLE1, records),
@@ -103,6 +113,17 @@ def _blocks(group: Group, own: Sequence[Record]) -> list[tuple[str, list[Measure
         rows = rows_of([row.name for row in group.rows if row.name in there], group.scenes, records)
         if rows:
             found.append((knowledge, rows, rank([row for row in rows if row.is_complete])))
+    return found
+
+
+def _leaders(group: Group, own: Sequence[Record]) -> list[tuple[str, list[MeasuredRow], list[MeasuredRow]]]:
+    """Return each knowledge of which there are both with its complete rows, ours and those of others, best first."""
+    ours = {row.name for row in group.rows if row.ours}
+    found = []
+    for knowledge, _, ranking in _blocks(group, own):
+        mine, rivals = ([row for row in ranking.rows if (row.name in ours) is which] for which in (True, False))
+        if mine and rivals:
+            found.append((knowledge, mine, rivals))
     return found
 
 

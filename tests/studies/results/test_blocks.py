@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from spike4dgs.studies.results.blocks import BLOCKS, NINE, NO_LEAD, NOTHING, lead_block, scenes_block, table_block
+from spike4dgs.studies.results.blocks import (
+    BLOCKS,
+    NINE,
+    NO_LEAD,
+    NOTHING,
+    headline_block,
+    lead_block,
+    scenes_block,
+    table_block,
+)
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.plan import TABLE2, Group, Row
 
@@ -106,8 +115,11 @@ def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
     assert "calibrated: even with `a` where things move (0.05 ± 0.18 dB), and" in sentence(-4.9)
     assert "calibrated: 1.05 ± 0.18 dB behind `a` where things move, and" in sentence(-6)
     assert "`c`" not in sentence(0) and "tfp+stg" not in sentence(0)
+    headline = f"- calibrated, {sentence(0).removeprefix('- ').replace(', calibrated', '')}"
+    assert headline_block(GROUP, made()) == [f"{headline.removesuffix('.')} (commit c0ffee000000)."]
     nobody = [r for r in made() if r["row"] in (OURS, "tfp+stg", "c")]
-    assert lead_block(GROUP, nobody) == [NO_LEAD] and lead_block(GROUP, []) == [NOTHING]
+    for block in (lead_block, headline_block):
+        assert block(GROUP, nobody) == [NO_LEAD] and block(GROUP, []) == [NOTHING]
 
 
 @pytest.mark.parametrize("scenes", [4, 9])
