@@ -11,22 +11,44 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, update_wrapper
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
-
-import numba
-from numba.core import config as numba_config
 
 from spike4dgs.benchmark.files import user_cache
 
 _lock = threading.Lock()
-config: Any = numba_config  # its names are made from environment variables
+_deferred = threading.Lock()
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles for the CPU, see `cached_jit`."""
-    return cached_jit(numba.njit, **options)
+    """Return a decorator that compiles for the CPU, see `cached_jit`; numba is imported on the first call."""
+    return lambda function: _Deferred(function, options)
+
+
+class _Deferred:
+    """A function that numba gets on its first use, by a call or by another kernel: its import takes 0.2 s."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        update_wrapper(self, function)
+        self._function, self._options, self._compiled = function, options, None
+
+    def __call__(self, *arguments: Any) -> Any:
+        return (self._compiled or self._compile())(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what numba's dispatcher has, such as `_numba_type_`, by which kernels call each other."""
+        if name.startswith("__"):  # what copying and inspection ask for
+            raise AttributeError(name)
+        return getattr(self._compiled or self._compile(), name)
+
+    def _compile(self) -> Any:
+        import numba
+
+        with _deferred:
+            if self._compiled is None:
+                self._compiled = cached_jit(numba.njit, **self._options)(self._function)
+        return self._compiled
 
 
 def cached_jit(jit: Callable[..., Any], **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -35,6 +57,10 @@ def cached_jit(jit: Callable[..., Any], **options: Any) -> Callable[[Callable[..
     `jit` is numba.njit or numba.cuda.jit. NUMBA_CACHE_DIR goes before the user's cache folder. Where the folder cannot
     be written to, nothing is kept.
     """
+
+    from numba.core import config as numba_config
+
+    config: Any = numba_config  # its names are made from environment variables
 
     def decorate(function: Callable[..., Any]) -> Any:
         with _lock:  # the setting belongs to numba: another package must not see it

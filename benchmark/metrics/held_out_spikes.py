@@ -24,7 +24,6 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfcx, ndtr
 
 from spike4dgs.benchmark.arrays import Float64, Mask
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate
@@ -49,6 +48,8 @@ def _log_mean_triangle(d: Float64, s: Float64) -> Float64:
 
 def _log_h(u: Float64) -> Float64:
     """Return log(u Phi(u) + phi(u)) for any u: with Mills' ratio where u is negative."""
+    from scipy.special import erfcx, ndtr  # only where spikes are scored
+
     below = np.minimum(u, 0)
     mills = np.sqrt(np.pi / 2) * erfcx(-below / np.sqrt(2))
     density = -(u**2) / 2 - np.log(2 * np.pi) / 2

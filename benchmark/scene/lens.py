@@ -16,7 +16,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, uniform_filter
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Mask
 
@@ -132,6 +131,8 @@ def resample(image: Float32, at: Float64) -> Float32:
     Beyond the image its border is repeated. A value is NaN where most of what lies around it is NaN; elsewhere such
     pixels are filled from their neighbours first.
     """
+    from scipy.ndimage import map_coordinates  # it takes longer to import than what opens scenes
+
     known = np.isfinite(image)
     if not known.any():
         return np.full(at.shape[:2], np.nan, np.float32)
@@ -146,6 +147,8 @@ def resample(image: Float32, at: Float64) -> Float32:
 
 def _filled(image: Float32, known: Mask) -> Float32:
     """Return an image without NaN: unknown pixels get the mean of the known ones around, or of all."""
+    from scipy.ndimage import uniform_filter
+
     weight = uniform_filter(known.astype(np.float64), 5)
     mean = uniform_filter(np.where(known, image, 0.0).astype(np.float64), 5)
     around = np.where(weight > 0.01, mean / np.maximum(weight, 0.01), image[known].mean())

@@ -12,10 +12,10 @@ from typing import Any
 import llvmlite.binding
 from llvmlite import ir
 from numba import types
+from numba.core import config as numba_config
 from numba.extending import intrinsic
 
-from spike4dgs.benchmark.compilation import config
-
+config: Any = numba_config  # its names are made from environment variables
 F32, F64, I32, I64 = ir.FloatType(), ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 FAST = ("contract", "nsz")  # a * b + c may become one instruction; NaN and infinity keep their meaning
 BLOCK_WIDTH = 8  # pixels; a vector covers a block of 8 x (lanes / 8) pixels
