@@ -15,6 +15,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -84,13 +85,12 @@ def make_boards(reading: Reading) -> dict[str, dict[str, Any]]:
 
 
 def _public(entries: Mapping[str, Entry]) -> Iterable[dict[str, Any]]:
-    release = current_release()
+    release, known = current_release(), Known()
     places = {path: place_of(entry["record"]).tracks for path, entry in entries.items()}
     for track in release.tracks:
-        of_track = {path: entry for path, entry in entries.items() if track.name in places[path]}
-        if of_track:
+        if of_track := {path: entry for path, entry in entries.items() if track.name in places[path]}:
             facts = {"track": track.name, "title": track.title, "withheld": sorted(track.withheld), "why": ""}
-            yield _board(facts, of_track)
+            yield _board(facts, of_track, known)
 
 
 def _others(entries: Mapping[str, Entry], folder: str) -> Iterable[dict[str, Any]]:
@@ -101,34 +101,54 @@ def _others(entries: Mapping[str, Entry], folder: str) -> Iterable[dict[str, Any
         why = _BEFORE if folder == ARCHIVE else place_of(next(iter(of_board.values()))["record"]).why
         title = name.partition("/")[2].partition("@")[0]
         nothing: dict[str, Any] = {"track": None, "title": title, "withheld": [], "why": why}
-        yield _board(nothing, of_board, ranked=folder != ARCHIVE)
+        yield _board(nothing, of_board, Known(), ranked=folder != ARCHIVE)
 
 
-def _board(facts: Mapping[str, Any], entries: Mapping[str, Entry], ranked: bool = True) -> dict[str, Any]:
+def _board(facts: Mapping[str, Any], entries: Mapping[str, Entry], known: Known, ranked: bool = True) -> dict[str, Any]:
     record = next(iter(entries.values()))["record"]
     return {
         **facts,
         "dataset": on_release(record["dataset"]),
         "revision": dataset_revision(on_release(record["dataset"])),
         "protocol": record["protocol"],
-        "rows": rank_entries(entries, ranked),
+        "rows": rank_entries(entries, ranked, known),
     }
 
 
-def rank_entries(entries: Mapping[str, Entry], ranked: bool = True) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class Known:
+    """What is known of some entries, whose boards share it: a track's entries stand on most other tracks as well."""
+
+    entries: dict[str, tuple[list[str], str | None]] = field(default_factory=dict)  # path -> flags, configuration
+    rows: dict[tuple[str, ...], dict[str, Any]] = field(default_factory=dict)  # by their entries' paths
+
+    def configuration(self, path: str, entry: Entry) -> str | None:
+        """Return what the entries of one row have in common; None for an entry that may not be ranked."""
+        if path not in self.entries:
+            flags = flags_of(entry)
+            counts = is_verified(entry) and not flags
+            self.entries[path] = flags, (_configuration(entry) or path) if counts else None
+        return self.entries[path][1]
+
+    def row(self, paths: Sequence[str], entries: Mapping[str, Entry]) -> dict[str, Any]:
+        """Return the row of the entries at some paths."""
+        if (key := tuple(paths)) not in self.rows:
+            self.rows[key] = _row([entries[path] for path in paths], paths, self.entries[paths[0]][0])
+        return self.rows[key]
+
+
+def rank_entries(entries: Mapping[str, Entry], ranked: bool = True, known: Known | None = None) -> list[dict[str, Any]]:
     """Return the rows of one board, best first; of equal values the one submitted first comes first.
 
-    `entries` are by path. Without `ranked` no row has a rank.
+    `entries` are by path. Without `ranked` no row has a rank. `known` is of the same entries' other boards.
     """
+    known = known or Known()
     groups: dict[tuple[bool, str], list[str]] = {}
-    flags = {path: flags_of(entry) for path, entry in entries.items()}
     for path, entry in sorted(entries.items()):
-        counts = ranked and is_verified(entry) and not flags[path]
-        groups.setdefault((counts, counts and _configuration(entry) or path), []).append(path)
-    rows = [
-        (counts, _row([entries[path] for path in paths], paths, flags[paths[0]]))
-        for (counts, _), paths in groups.items()
-    ]
+        configuration = known.configuration(path, entry)
+        counts = ranked and configuration is not None
+        groups.setdefault((counts, configuration if counts and configuration else path), []).append(path)
+    rows = [(counts, known.row(paths, entries)) for (counts, _), paths in groups.items()]
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
 
     def order(row: tuple[bool, dict[str, Any]]) -> tuple[bool, float, str, str]:
