@@ -19,6 +19,7 @@ _OBJECTS = ("properties", "required", "additionalProperties", "propertyNames", "
 _ARRAYS = ("items", "minItems", "maxItems", "uniqueItems")
 _STRINGS = ("pattern", "minLength", "maxLength")
 _PARTS = ("if", "then", "else", "not", "anyOf", "allOf", "const", "enum")
+_NUMERIC, _CONTAINERS = (int, float), (dict, list)  # `int | float` would be made at every check
 _KNOWN_NAMES = 4096  # names whose pattern was looked for: ids, metrics and images come again and again
 
 
@@ -125,8 +126,7 @@ class _Compiler:
         if "enum" in schema:
             found.append(_equals(schema["enum"]))
         if "anyOf" in schema:
-            choices = [self.schema(part, root) for part in schema["anyOf"]]
-            found.append(lambda value: any(choice(value) for choice in choices))
+            found.append(_any([self.schema(part, root) for part in schema["anyOf"]]))
         found += [self.schema(part, root) for part in schema.get("allOf", ())]
         if "not" in schema:
             refused = self.exact(schema["not"], root)
@@ -156,7 +156,24 @@ def _all(checks: list[Check]) -> Check:
     if len(checks) == 2:
         first, second = checks
         return lambda value: first(value) and second(value)
-    return lambda value: all(check(value) for check in checks)
+
+    def check_all(value: Any) -> bool:
+        for check in checks:
+            if not check(value):
+                return False
+        return True
+
+    return check_all
+
+
+def _any(checks: list[Check]) -> Check:
+    def check_any(value: Any) -> bool:
+        for check in checks:
+            if check(value):
+                return True
+        return False
+
+    return check_any
 
 
 _CLASSES: dict[str, tuple[type, ...]] = {
@@ -182,7 +199,7 @@ def _bounds(schema: Mapping[str, Any]) -> Check:
     above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
 
     def check(value: Any) -> bool:
-        if not isinstance(value, int | float) or isinstance(value, bool):
+        if not isinstance(value, _NUMERIC) or isinstance(value, bool):
             return True
         return low <= value <= high and (above is None or value > above) and (below is None or value < below)
 
@@ -207,4 +224,4 @@ def _equals(values: list[Any]) -> Check:
 
 
 def _same(a: Any, b: Any) -> bool:
-    return type(a) is type(b) and not isinstance(a, dict | list) and bool(a == b)
+    return type(a) is type(b) and not isinstance(a, _CONTAINERS) and bool(a == b)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Iterable
 from functools import lru_cache
+from json.encoder import encode_basestring_ascii
 from typing import Any
 
 MOST_DEPTH = 64  # of nested JSON values; programs that walk along them need a depth for each
+_CONTAINERS = (dict, list, tuple)
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -24,18 +27,24 @@ def json_text(value: Any) -> str:
 def _indented(value: Any, line: str) -> str:
     """Return a JSON value as text; `line` is a line break and the indent of the line that the value is in."""
     inner = line + "  "
-    if not isinstance(value, dict | list | tuple) or not value:
-        return _encode(inner, value)
-    parts = value.values() if isinstance(value, dict) else value
-    if not any(isinstance(v, dict | list | tuple) for v in parts):
+    if not isinstance(value, _CONTAINERS) or not value:
+        return encode_basestring_ascii(value) if type(value) is str else _encode(inner, value)
+    if not _has_containers(value.values() if isinstance(value, dict) else value):
         text = _encode(inner, value)
         return f"{text[0]}{inner}{text[1:-1]}{line}{text[-1]}"
     if not isinstance(value, dict):
         return f"[{inner}{f',{inner}'.join(_indented(v, inner) for v in value)}{line}]"
     if not all(isinstance(key, str) for key in value):
         return json.dumps(value, indent=2, sort_keys=True, allow_nan=False).replace("\n", line)
-    items = [f"{_encode(inner, key)}: {_indented(value[key], inner)}" for key in sorted(value)]
+    items = [f"{encode_basestring_ascii(key)}: {_indented(value[key], inner)}" for key in sorted(value)]
     return f"{{{inner}{f',{inner}'.join(items)}{line}}}"
+
+
+def _has_containers(parts: Iterable[Any]) -> bool:
+    for part in parts:
+        if isinstance(part, _CONTAINERS):
+            return True
+    return False
 
 
 def _encode(inner: str, value: Any) -> str:
