@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.cells import cell_len
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -125,17 +126,37 @@ def ranking_table(board: Board, metric: str, width: int) -> Table:
             cells = (rank, name, m.format(comparison.means[k]), shown, *_costs(board.rows[numbers[k]].records))
             rows.append(cells)
     rows += [("-", board.rows[i].name, "", why, *_costs(board.rows[i].records)) for i, why in scores.left_out.items()]
-    _add_rows(table, rows, width)
-    return table
+    return _with_rows(table, rows, width)
 
 
-def _add_rows(table: Table, rows: Sequence[tuple[str, ...]], width: int) -> None:
-    """Add rows to a table for `width` characters: as one with many lines if no cell breaks, which takes less time."""
-    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+def _with_rows(table: Table, rows: Sequence[tuple[str, ...]], width: int) -> Table:
+    """Return a table for `width` characters with rows: their lines are laid out here if no cell breaks.
+
+    A thousand rows then take a tenth of rich's time.
+    """
     heads = [max(map(cell_len, str(column.header).split("\n"))) for column in table.columns]
-    fits = sum(map(max, widths, heads)) + len(widths) <= width
-    for cells in [tuple(map("\n".join, zip(*rows, strict=True)))] if rows and fits else rows:
-        table.add_row(*map(Text, cells))
+    widths = [max(head, *map(cell_len, cells)) for head, cells in zip(heads, zip(*rows, strict=True), strict=False)]
+    if not rows or sum(widths) + len(widths) > width:
+        for row in rows:
+            table.add_row(*map(Text, row))
+        return table
+    whole = Table(
+        title=table.title, caption=table.caption, box=None, title_justify="left", padding=0, show_header=False
+    )
+    for column, size in zip(table.columns, widths, strict=True):
+        column.width = size
+    table.title = table.caption = None
+    left = [column.justify == "left" for column in table.columns]
+    lines = (
+        " ".join(
+            f"{cell}{blanks}" if on_left else f"{blanks}{cell}"
+            for cell, size, on_left in zip(row, widths, left, strict=True)
+            for blanks in [" " * (size - cell_len(cell))]
+        )
+        for row in rows
+    )
+    whole.add_row(Group(table, Text("\n".join(lines), no_wrap=True, overflow="ignore")))
+    return whole
 
 
 def _costs(records: tuple[Mapping[str, Any], ...]) -> list[str]:

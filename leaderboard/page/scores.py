@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -69,13 +67,14 @@ def _scored(row: Row, scenes: list[str], metric: str) -> list[set[str]]:
 
 
 def _values(row: Row, scenes: list[str], images: list[list[str]], metric: str) -> list[Float64]:
-    def of(record: Mapping[str, Any], scene: str, name: str) -> float | None:
-        return rounded(record["scenes"][scene]["per_image"][name][metric])
-
-    return [
-        np.array([[of(record, scene, name) for record in row.records] for name in names], np.float64)
-        for scene, names in zip(scenes, images, strict=True)
-    ]
+    """Return the scores [images, seeds] of each scene, as `rounded` gives them: all of a scene in one text."""
+    found = []
+    for scene, names in zip(scenes, images, strict=True):
+        of_seeds = [record["scenes"][scene]["per_image"] for record in row.records]
+        scores = tuple(per_image[name][metric] for name in names for per_image in of_seeds)
+        texts = (f"%.{DIGITS}g " * len(scores) % scores).split()
+        found.append(np.array(list(map(float, texts)), np.float64).reshape(len(names), -1))
+    return found
 
 
 def compare_rows(scores: ImageScores, metric: str) -> Comparison | None:
