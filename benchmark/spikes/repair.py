@@ -4,10 +4,16 @@ Every consumer of a stream then works as it is, whatever it counts. What is fill
 pixels out (`CameraState.bad`), and the gaps that remain listed, which are long. Who looks at single spikes leaves out
 all that is filled where a spike's own tick matters (`lost_spikes`).
 
-A pixel's intervals within NEAR_TICKS on either side of a gap, two at least, give its usual interval L, and on an even
-train the places p and q of the last spike before the gap and the first after it. round((q - p) / L) - 1 spikes were
-lost; they are put at even distances. Under constant light that restores the count, but for what the tick hides of a
-spike's place.
+Lost ticks between the same two recorded spikes of a pixel are filled together. On either side of them the spikes as far
+as NEAR_TICKS tell the usual interval L, as long as they are even: as long as one interval explains them all to EVEN
+ticks. So light that changes is judged by the nearest spikes alone. On that train the two recorded spikes have the
+places P and Q. A lost spike lies in a lost tick. So m lost spikes misfit by
+
+    (Q - P - (m + 1) L)^2    their number, and
+    (t - e)^2                each of them, by the distance of its lost tick t from its even place e between P and Q,
+
+each divided by its variance, which the difference of the two sides' intervals says. The m of the least misfit is
+filled. That is done twice: the second time with what was filled beyond.
 """
 
 from __future__ import annotations
@@ -26,7 +32,12 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 LONGEST_TICKS = 10  # of a gap whose ticks count as measured once it is filled: a quarter of the windows of 40 ticks
 NEAR_TICKS = 20  # on each side of a gap whose intervals count: as far as most image makers look
-INTERVALS = 2  # that count in any case, if there are so many
+EVEN = 0.65  # ticks that even spikes may be off; a tick hides up to one, but light that changes then goes unseen
+FAR_EVEN = 1.0  # beside more than LONGEST_TICKS lost ticks, where a steady rate matters more
+HIDDEN = 0.25  # of a tick that an even place may lie off its lost tick at no cost
+LONE = 0.3  # of an interval: how far intervals may differ where one side alone is known
+STEADY = 0.05  # of an interval: how far they may differ in any case
+_PLACE, _LENGTH = 0.05, 0.1  # ticks^2: variance of a lost spike's place, and of Q - P
 _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more than it saves
 
 AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
@@ -46,7 +57,8 @@ def fill_gaps(stream: SpikeStream) -> SpikeStream:
     packed, pixels = _private(stream.packed), stream.width * stream.height
     packed[~there] = 0
     plain = packed.view(np.ndarray)
-    in_threads(_fill, packed.shape[1], plain, starts, stops, pixels, small=pixels * len(starts) < _SMALL)
+    lost = np.flatnonzero(~there)
+    in_threads(_fill, packed.shape[1], plain, starts, stops, lost, pixels, small=pixels * len(starts) < _SMALL)
     long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > LONGEST_TICKS]
     gaps = tuple(g for g in stream.gaps if any(a <= g.first_tick < b for a, b in long))
     filled = tuple(sorted({*stream.filled, *stream.gaps}))
@@ -62,58 +74,139 @@ def _private(packed: UInt8) -> UInt8:
 
 
 @kernel
-def _fill(packed: UInt8, starts: Int64, stops: Int64, pixels: int, start: int, stop: int) -> None:
+def _fill(packed: UInt8, starts: Int64, stops: Int64, lost: Int64, pixels: int, start: int, stop: int) -> None:
     for pixel in range(8 * start, min(8 * stop, pixels)):
-        for g in range(len(starts)):
-            limit = starts[g + 1] if g + 1 < len(starts) else len(packed)
-            _fill_one(packed, pixel, starts[g], stops[g], limit)
+        for known in range(2):  # what lost ticks beyond hold
+            first, n = 0, 0
+            while first < len(starts):
+                last, ticks = first, n + stops[first] - starts[first]
+                _clear(packed, pixel, starts[first], stops[first])
+                after = find_spike(packed, pixel, stops[last], 1)
+                while last + 1 < len(starts) and (after < 0 or after >= starts[last + 1]):
+                    last += 1  # no recorded spike lies between
+                    ticks += stops[last] - starts[last]
+                    _clear(packed, pixel, starts[last], stops[last])
+                    if after >= 0 and after < stops[last]:
+                        after = find_spike(packed, pixel, stops[last], 1)
+                before = find_spike(packed, pixel, starts[first] - 1, -1)
+                limit = len(packed) if known or last + 1 == len(starts) else starts[last + 1]
+                if before >= 0 and after >= 0:
+                    _fill_between(packed, pixel, before, after, lost[n:ticks], limit)
+                elif before >= 0:
+                    for g in range(first, last + 1):
+                        _go_on(packed, pixel, starts[g], stops[g], 1, limit)
+                elif after >= 0:
+                    for g in range(last, first - 1, -1):
+                        _go_on(packed, pixel, starts[g], stops[g], -1, limit)
+                first, n = last + 1, ticks
 
 
 @kernel
-def _fill_one(packed: UInt8, pixel: int, start: int, stop: int, limit: int) -> None:
-    """Fill the gap [start, stop) of one stored pixel. All ticks before it are known, those after it up to `limit`."""
-    before, after = find_spike(packed, pixel, start - 1, -1), find_spike(packed, pixel, stop, 1)
-    if after >= limit:
-        after = -1
-    n_before, span_before, sum_before = _train(packed, pixel, before, -1, limit)
-    n_after, span_after, sum_after = _train(packed, pixel, after, 1, limit)
+def _clear(packed: UInt8, pixel: int, start: int, stop: int) -> None:
+    for tick in range(start, stop):
+        packed[tick, pixel >> 3] &= np.uint8(~(1 << (pixel & 7)) & 255)
+
+
+@kernel
+def _set(packed: UInt8, pixel: int, tick: int) -> None:
+    packed[tick, pixel >> 3] |= np.uint8(1 << (pixel & 7))
+
+
+@kernel
+def _fill_between(packed: UInt8, pixel: int, before: int, after: int, lost: Int64, limit: int) -> None:
+    """Fill the lost ticks between two recorded spikes. All ticks before them are known, those after up to `limit`."""
+    even = EVEN if len(lost) <= LONGEST_TICKS else FAR_EVEN
+    n_before, span_before, sum_before, low_before, high_before = _train(packed, pixel, before, -1, limit, even)
+    n_after, span_after, sum_after, low_after, high_after = _train(packed, pixel, after, 1, limit, even)
     if n_before + n_after == 0:
         return  # hardly any light: nothing tells that a spike was lost
     length = (span_before + span_after) / (n_before + n_after)
-    p = before + _shift(sum_before, n_before, length)
-    q = after - _shift(sum_after, n_after, length)
-    if before >= 0 and after >= 0:
-        lost = min(max(int(np.floor((q - p) / length + 0.5)) - 1, 0), stop - start)
-        step = (q - p) / (lost + 1)
-    else:
-        silence = start - p if before >= 0 else q - stop
-        lost, step = stop - start, length if silence < 2 * length else silence
-        if before < 0:
-            lost = int((q - start + 0.5) / step)
-            p = q - (lost + 1) * step
-    last = start - 1
-    for k in range(1, lost + 1):
-        tick = int(np.floor(p + k * step + 0.5))
-        if after >= 0 and before >= 0:
-            tick = min(max(tick, last + 1), stop - 1 - (lost - k))
-        if tick >= stop:
-            break
-        if tick > last:
-            packed[tick, pixel >> 3] |= np.uint8(1 << (pixel & 7))
-            last = tick
+    left = right = length
+    change = LONE * length
+    if n_before > 0 and n_after > 0:
+        change = (span_after / n_after - span_before / n_before) / 2
+        if max(low_before, low_after) > min(high_before, high_after):  # no one interval explains both sides
+            left, right = span_before / n_before, span_after / n_after
+            length = (left + right) / 2
+    p = before + _shift(sum_before, n_before, left)
+    q = after - _shift(sum_after, n_after, right)
+    guess = int(np.floor((q - p) / length)) - 1
+    best, least = 0, np.inf  # none where the lost ticks hold too few: the light was lower between
+    for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
+        misfit = _misfit(p, q, m, length, change, lost)
+        if misfit < least:
+            best, least = m, misfit
+    j = -1
+    for i in range(1, best + 1):
+        j = _nearest(lost, j + 1, len(lost) - best + i, p + (q - p) * i / (best + 1))
+        _set(packed, pixel, lost[j])
 
 
 @kernel
-def _train(packed: UInt8, pixel: int, first: int, step: int, limit: int) -> tuple[int, int, int]:
-    """Return the intervals beyond a spike in direction `step`, their ticks, and the sum of their ends' distances."""
-    n, total, at = 0, 0, first
-    while at >= 0 and (n < INTERVALS or abs(at - first) < NEAR_TICKS):
+def _misfit(p: float, q: float, m: int, length: float, change: float, lost: Int64) -> float:
+    """Return minus the log likelihood of m lost spikes, but for a constant."""
+    variance = _LENGTH + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
+    misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + np.log(variance) / 2
+    variance = _PLACE + (STEADY * length) ** 2 + change**2 / 4
+    j = -1
+    for i in range(1, m + 1):
+        even = p + (q - p) * i / (m + 1)
+        j = _nearest(lost, j + 1, len(lost) - m + i, even)
+        misfit += max(abs(lost[j] - even) - HIDDEN, 0.0) ** 2 / (2 * variance)
+    return misfit
+
+
+@kernel
+def _nearest(lost: Int64, start: int, stop: int, place: float) -> int:
+    """Return which of lost[start:stop] is nearest to a place, the first of two."""
+    j = start
+    while j + 1 < stop and abs(lost[j + 1] - place) < abs(lost[j] - place):
+        j += 1
+    return j
+
+
+@kernel
+def _go_on(packed: UInt8, pixel: int, start: int, stop: int, step: int, limit: int) -> None:
+    """Fill a gap [start, stop) from the spikes on one side, as they go on in direction `step`."""
+    first = find_spike(packed, pixel, start - 1 if step > 0 else stop, -step)
+    even = EVEN if stop - start <= LONGEST_TICKS else FAR_EVEN
+    n, span, total, _, _ = _train(packed, pixel, first, -step, limit, even)
+    if n == 0:
+        return
+    length = span / n
+    place = first + step * _shift(total, n, length)
+    silence = start - place if step > 0 else place - stop
+    if silence >= 2 * length:
+        length = silence
+    tick = int(np.floor(place + step * length + 0.5))
+    while tick < stop if step > 0 else tick >= start:
+        if start <= tick < stop:
+            _set(packed, pixel, tick)
+        place += step * length
+        tick = int(np.floor(place + step * length + 0.5))
+
+
+@kernel
+def _train(
+    packed: UInt8, pixel: int, first: int, step: int, limit: int, even: float
+) -> tuple[int, int, int, float, float]:
+    """Return the even intervals beyond a spike in direction `step`.
+
+    That is their number, their ticks, the sum of their ends' distances, and the least and the greatest one interval
+    that explains them all.
+    """
+    n, total, at, low, high = 0, 0, first, 0.0, np.inf
+    while abs(at - first) < NEAR_TICKS:
         following = find_spike(packed, pixel, at + step, step)
         if following < 0 or following >= limit:
             break
-        n, at = n + 1, following
-        total += abs(at - first)
-    return n, abs(at - first), total
+        distance = abs(following - first)
+        lower, higher = max(low, (distance - even) / (n + 1)), min(high, (distance + even) / (n + 1))
+        if lower > higher:
+            break
+        n, at, low, high = n + 1, following, lower, higher
+        total += distance
+    return n, abs(at - first), total, low, high
 
 
 @kernel

@@ -7,10 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from memory import STATUS, resident_bytes
 
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.benchmark.spikes.repair import INTERVALS, NEAR_TICKS, fill_gaps, fill_pixels
+from spike4dgs.benchmark.spikes.repair import (
+    EVEN,
+    FAR_EVEN,
+    HIDDEN,
+    LONE,
+    LONGEST_TICKS,
+    NEAR_TICKS,
+    STEADY,
+    fill_gaps,
+    fill_pixels,
+)
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 
 WIDTH, HEIGHT, TICKS = 21, 6, 400
@@ -68,57 +80,141 @@ def test_gaps_at_the_ends_take_the_rate_beside_them(gap):
     assert np.abs(_counts(filled) - known).max() <= 1 + 2 * 30 / NEAR_TICKS
 
 
-def _near(times):
-    """Return the first time and those whose predecessor is near it, or among the first intervals."""
-    last = [abs(t - times[0]) for t in times[:-1]]
-    return times[:1] + [t for i, t in enumerate(times[1:]) if i < INTERVALS or last[i] < NEAR_TICKS]
+def even_train(times, lost):
+    """Return the times that even spikes explain, away from the gap, and the bounds of their interval."""
+    even = EVEN if lost <= LONGEST_TICKS else FAR_EVEN
+    kept, bounds = times[:1], (0.0, math.inf)
+    for n, t in enumerate(times[1:], 1):
+        distance = abs(t - times[0])
+        bounds_n = max(bounds[0], (distance - even) / n), min(bounds[1], (distance + even) / n)
+        if abs(kept[-1] - times[0]) >= NEAR_TICKS or bounds_n[0] > bounds_n[1]:
+            break
+        kept, bounds = [*kept, t], bounds_n
+    return kept, bounds
 
 
-def twin(fired, start, stop, limit):
-    """Return the ticks that one pixel gets in a gap, in plain Python."""
-    before = _near([t for t in range(start) if fired[t]][::-1])
-    after = _near([t for t in range(stop, limit) if fired[t]])
-    # The nearest spike after the gap counts only before the next gap, the ones before it always.
-    intervals = max(len(before) - 1, 0) + max(len(after) - 1, 0)
-    if not intervals:
+def place(times, length):
+    """Return where the first of even spikes lies, by the mean of all."""
+    sign = 1 if len(times) < 2 or times[1] < times[0] else -1
+    return min(max(np.mean([t + sign * j * length for j, t in enumerate(times)]), times[0] - 1), times[0] + 1)
+
+
+def nearest_places(lost, evens):
+    """Return each spike's lost tick: the nearest that is left, with one for each that follows."""
+    out, free = [], list(lost)
+    for i, e in enumerate(evens):
+        tick = min(free[: len(free) - (len(evens) - i - 1)], key=lambda t: abs(t - e))
+        out, free = [*out, tick], [t for t in free if t > tick]
+    return out
+
+
+def between(before, after, lost):
+    """Return the ticks that a pixel gets in ticks lost between two spikes, in plain Python; trains away from them."""
+    (before, low), (after, high) = even_train(before, len(lost)), even_train(after, len(lost))
+    n = len(before) + len(after) - 2
+    if n == 0:
         return []
-    spans = [abs(side[-1] - side[0]) for side in (before, after) if side]
-    length = sum(spans) / intervals
-    p = q = None
-    if before:
-        p = np.mean([t + j * length for j, t in enumerate(before)])
-        p = min(max(p, before[0] - 1), before[0] + 1)
-    if after:
-        q = np.mean([t - j * length for j, t in enumerate(after)])
-        q = min(max(q, after[0] - 1), after[0] + 1)
-    if p is not None and q is not None:
-        lost = min(max(math.floor((q - p) / length + 0.5) - 1, 0), stop - start)
-        out = []
-        for k in range(1, lost + 1):
-            tick = math.floor(p + k * (q - p) / (lost + 1) + 0.5)
-            out.append(min(max(tick, (out[-1] if out else start - 1) + 1), stop - 1 - (lost - k)))
-        return out
-    silence = start - p if q is None else q - stop
-    length = length if silence < 2 * length else silence
-    places = [p + k * length for k in range(1, 2000)] if q is None else [q - k * length for k in range(1, 2000)]
-    return sorted({t for t in (math.floor(x + 0.5) for x in places) if start <= t < stop})
+    length = (before[0] - before[-1] + after[-1] - after[0]) / n
+    left = right = length
+    change = LONE * length
+    if len(before) > 1 and len(after) > 1:
+        sides = (before[0] - before[-1]) / (len(before) - 1), (after[-1] - after[0]) / (len(after) - 1)
+        change = (sides[1] - sides[0]) / 2
+        if max(low[0], high[0]) > min(low[1], high[1]):
+            (left, right), length = sides, sum(sides) / 2
+    p, q = place(before, left), place(after, right)
+    guess = math.floor((q - p) / length) - 1
+    found = [(math.inf, [])]
+    for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
+        evens = [p + (q - p) * i / (m + 1) for i in range(1, m + 1)]
+        ticks = nearest_places(lost, evens)
+        variance = 0.1 + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
+        own = 0.05 + (STEADY * length) ** 2 + change**2 / 4
+        misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + math.log(variance) / 2
+        off = [max(abs(t - e) - HIDDEN, 0) ** 2 / (2 * own) for t, e in zip(ticks, evens, strict=True)]
+        found.append((misfit + sum(off), ticks))
+    return min(found, key=lambda x: x[0])[1]
 
 
-@pytest.mark.parametrize("gaps", [[(50, 1), (53, 1), (120, 4)], [(0, 5), (60, 40)], [(300, 100)], [(10, 2), (12, 3)]])
-def test_the_kernel_is_its_twin_on_random_spikes(gaps):
-    rng = np.random.default_rng(len(gaps))
-    spikes = (rng.random((TICKS, HEIGHT, WIDTH)) < rng.random((HEIGHT, WIDTH)) ** 2).astype(np.uint8)
+def go_on(times, start, stop):
+    """Return the ticks that a pixel gets in a gap beyond its spikes `times`, the nearest first."""
+    times, _ = even_train(times, stop - start)
+    if len(times) < 2:
+        return []
+    step = (times[0] - times[-1]) / (len(times) - 1)  # with its sign
+    at = place(times, abs(step))
+    silence = start - at if step > 0 else at - stop
+    if silence >= 2 * abs(step):
+        step = math.copysign(silence, step)
+    return [t for t in (math.floor(at + k * step + 0.5) for k in range(1, TICKS)) if start <= t < stop]
+
+
+def twin(fired, lost):
+    """Return one pixel's spikes [T] with those of its lost ticks, in plain Python."""
+    fired, recorded = fired.copy(), [int(t) for t in np.flatnonzero(fired & ~lost)]
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]]).astype(int))).reshape(-1, 2).tolist()
+    for known in (False, True):
+        for p, q in zip([None, *recorded], [*recorded, None], strict=True):
+            low, high = -1 if p is None else p, len(fired) if q is None else q
+            own = [(a, b) for a, b in runs if low < a and b <= high]
+            if not own:
+                continue
+            fired[low + 1 : high] = 0
+            later = min([a for a, b in runs if a >= high], default=len(fired)) if not known else len(fired)
+            past = [t for t in range(high, later) if fired[t]]
+            if p is not None and q is not None:
+                ticks = [t for a, b in own for t in range(a, b)]
+                fired[between([t for t in range(high) if fired[t]][::-1], past, ticks)] = 1
+            elif p is not None:
+                for a, b in own:
+                    fired[go_on([t for t in range(a) if fired[t]][::-1], a, b)] = 1
+            elif q is not None:
+                for a, b in own[::-1]:
+                    fired[go_on([t for t in range(b, later) if fired[t]], a, b)] = 1
+    return fired
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 130), st.integers(1, 14)), min_size=1, max_size=12),
+    st.booleans(),
+    st.integers(0, 2**31),
+)
+def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
+    rng, lost = np.random.default_rng(seed), np.zeros(140, bool)
+    rates = rng.random((HEIGHT, WIDTH)) ** 2
+    spikes = (rng.random((140, HEIGHT, WIDTH)) < rates).astype(np.uint8)
+    if even:
+        spikes = steady(rates, 140, seed)
     spikes[:, 0, 0], spikes[:, 0, 1], spikes[:, 0, 2] = 0, 1, 0
-    spikes[[40, 333], 0, 2] = 1
-    merged = [(10, 5)] if gaps[0] == (10, 2) else gaps
-    expected = stream_of(spikes, gaps).window(0, TICKS).copy()
-    for y in range(HEIGHT):
-        for x in range(WIDTH):
-            for i, (first, ticks) in enumerate(merged):
-                limit = merged[i + 1][0] if i + 1 < len(merged) else TICKS
-                expected[twin(expected[:, y, x], first, first + ticks, limit), y, x] = 1
-    found = fill_gaps(stream_of(spikes, gaps)).window(0, TICKS)
-    assert (found != expected).any(axis=0).mean() <= 0.01, "an exact half may round to either side"
+    spikes[[40, 133], 0, 2] = 1
+    for first, ticks in gaps:
+        lost[first : first + ticks] = True
+    spikes[lost] = 0
+    expected = np.stack([twin(s, lost) for s in spikes.reshape(140, -1).T], axis=1).reshape(spikes.shape)
+    runs = [(int(t), 1) for t in np.flatnonzero(lost)]
+    found = fill_gaps(stream_of(spikes, runs)).window(0, 140)
+    assert (found != expected).any(axis=0).mean() <= 0.01, "what is as near may round to either side"
+
+
+def filled_ticks(spikes, lost):
+    """Return what one pixel's lost ticks hold once they are filled."""
+    fired = np.zeros((TICKS, HEIGHT, WIDTH), np.uint8)
+    fired[spikes] = 1
+    found = fill_gaps(stream_of(fired, [(t, 1) for t in lost])).window(0, TICKS)[:, 0, 0]
+    return [t for t in lost if found[t]]
+
+
+def test_a_lost_spike_lies_in_a_lost_tick():
+    """Even spikes every ten ticks: one that is lost comes back, and no other lost tick gets one."""
+    every = list(range(5, 400, 10))
+    assert filled_ticks(every, [205]) == [205]
+    assert filled_ticks(every, [203, 205, 212, 225]) == [205, 225], "several gaps between two spikes"
+    assert filled_ticks(every, [201, 209]) == []
+    late = [
+        t if t <= 200 else t + 5 for t in every[:-1]
+    ]  # an interval of 15 ticks: light was lower, or a spike is lost
+    assert filled_ticks(late, [196]) == [], "far from the middle"
 
 
 def test_a_stream_without_gaps_is_itself():
