@@ -37,6 +37,7 @@ FAR_EVEN = 1.0  # beside more than LONGEST_TICKS lost ticks, where a steady rate
 HIDDEN = 0.25  # of a tick that an even place may lie off its lost tick at no cost
 LONE = 0.3  # of an interval: how far intervals may differ where one side alone is known
 STEADY = 0.05  # of an interval: how far they may differ in any case
+TIE = 1e-9  # a difference below it is none: the first of two counts, however sums were rounded
 _PLACE, _LENGTH = 0.05, 0.1  # ticks^2: variance of a lost spike's place, and of Q - P
 _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more than it saves
 
@@ -130,11 +131,11 @@ def _fill_between(packed: UInt8, pixel: int, before: int, after: int, lost: Int6
             length = (left + right) / 2
     p = before + _shift(sum_before, n_before, left)
     q = after - _shift(sum_after, n_after, right)
-    guess = int(np.floor((q - p) / length)) - 1
+    guess = int(np.floor((q - p) / length + TIE)) - 1
     best, least = 0, np.inf  # none where the lost ticks hold too few: the light was lower between
     for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
         misfit = _misfit(p, q, m, length, change, lost)
-        if misfit < least:
+        if misfit < least - TIE:
             best, least = m, misfit
     j = -1
     for i in range(1, best + 1):
@@ -160,7 +161,7 @@ def _misfit(p: float, q: float, m: int, length: float, change: float, lost: Int6
 def _nearest(lost: Int64, start: int, stop: int, place: float) -> int:
     """Return which of lost[start:stop] is nearest to a place, the first of two."""
     j = start
-    while j + 1 < stop and abs(lost[j + 1] - place) < abs(lost[j] - place):
+    while j + 1 < stop and abs(lost[j + 1] - place) < abs(lost[j] - place) - TIE:
         j += 1
     return j
 
@@ -176,14 +177,14 @@ def _go_on(packed: UInt8, pixel: int, start: int, stop: int, step: int, limit: i
     length = span / n
     place = first + step * _shift(total, n, length)
     silence = start - place if step > 0 else place - stop
-    if silence >= 2 * length:
+    if silence >= 2 * length - TIE:
         length = silence
-    tick = int(np.floor(place + step * length + 0.5))
+    tick = int(np.floor(place + step * length + 0.5 + TIE))
     while tick < stop if step > 0 else tick >= start:
         if start <= tick < stop:
             _set(packed, pixel, tick)
         place += step * length
-        tick = int(np.floor(place + step * length + 0.5))
+        tick = int(np.floor(place + step * length + 0.5 + TIE))
 
 
 @kernel

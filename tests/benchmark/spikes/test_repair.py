@@ -20,6 +20,7 @@ from spike4dgs.benchmark.spikes.repair import (
     LONGEST_TICKS,
     NEAR_TICKS,
     STEADY,
+    TIE,
     fill_gaps,
     fill_pixels,
 )
@@ -103,7 +104,8 @@ def nearest_places(lost, evens):
     """Return each spike's lost tick: the nearest that is left, with one for each that follows."""
     out, free = [], list(lost)
     for i, e in enumerate(evens):
-        tick = min(free[: len(free) - (len(evens) - i - 1)], key=lambda t: abs(t - e))
+        near = free[: len(free) - (len(evens) - i - 1)]
+        tick = next(t for t in near if abs(t - e) <= min(abs(u - e) for u in near) + TIE)
         out, free = [*out, tick], [t for t in free if t > tick]
     return out
 
@@ -123,7 +125,7 @@ def between(before, after, lost):
         if max(low[0], high[0]) > min(low[1], high[1]):
             (left, right), length = sides, sum(sides) / 2
     p, q = place(before, left), place(after, right)
-    guess = math.floor((q - p) / length) - 1
+    guess = math.floor((q - p) / length + TIE) - 1
     found = [(math.inf, [])]
     for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
         evens = [p + (q - p) * i / (m + 1) for i in range(1, m + 1)]
@@ -133,7 +135,7 @@ def between(before, after, lost):
         misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + math.log(variance) / 2
         off = [max(abs(t - e) - HIDDEN, 0) ** 2 / (2 * own) for t, e in zip(ticks, evens, strict=True)]
         found.append((misfit + sum(off), ticks))
-    return min(found, key=lambda x: x[0])[1]
+    return next(ticks for misfit, ticks in found if misfit <= min(found)[0] + TIE)
 
 
 def go_on(times, start, stop):
@@ -144,9 +146,9 @@ def go_on(times, start, stop):
     step = (times[0] - times[-1]) / (len(times) - 1)  # with its sign
     at = place(times, abs(step))
     silence = start - at if step > 0 else at - stop
-    if silence >= 2 * abs(step):
+    if silence >= 2 * abs(step) - TIE:
         step = math.copysign(silence, step)
-    return [t for t in (math.floor(at + k * step + 0.5) for k in range(1, TICKS)) if start <= t < stop]
+    return [t for t in (math.floor(at + k * step + 0.5 + TIE) for k in range(1, TICKS)) if start <= t < stop]
 
 
 def twin(fired, lost):
