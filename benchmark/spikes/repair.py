@@ -38,7 +38,7 @@ HIDDEN = 0.25  # of a tick that an even place may lie off its lost tick at no co
 LONE = 0.3  # of an interval: how far intervals may differ where one side alone is known
 STEADY = 0.05  # of an interval: how far they may differ in any case
 TIE = 1e-9  # a difference below it is none: the first of two counts, however sums were rounded
-_PLACE, _LENGTH = 0.05, 0.1  # ticks^2: variance of a lost spike's place, and of Q - P
+PLACE, LENGTH = 0.05, 0.1  # ticks^2: variance of a lost spike's place, and of Q - P
 _SMALL = 1 << 16  # pixels times gaps below which starting threads costs more than it saves
 
 AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
@@ -146,9 +146,9 @@ def _fill_between(packed: UInt8, pixel: int, before: int, after: int, lost: Int6
 @kernel
 def _misfit(p: float, q: float, m: int, length: float, change: float, lost: Int64) -> float:
     """Return minus the log likelihood of m lost spikes, but for a constant."""
-    variance = _LENGTH + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
+    variance = LENGTH + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
     misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + np.log(variance) / 2
-    variance = _PLACE + (STEADY * length) ** 2 + change**2 / 4
+    variance = PLACE + (STEADY * length) ** 2 + change**2 / 4
     j = -1
     for i in range(1, m + 1):
         even = p + (q - p) * i / (m + 1)

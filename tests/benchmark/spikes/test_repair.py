@@ -16,9 +16,11 @@ from spike4dgs.benchmark.spikes.repair import (
     EVEN,
     FAR_EVEN,
     HIDDEN,
+    LENGTH,
     LONE,
     LONGEST_TICKS,
     NEAR_TICKS,
+    PLACE,
     STEADY,
     TIE,
     fill_gaps,
@@ -130,8 +132,8 @@ def between(before, after, lost):
     for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
         evens = [p + (q - p) * i / (m + 1) for i in range(1, m + 1)]
         ticks = nearest_places(lost, evens)
-        variance = 0.1 + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
-        own = 0.05 + (STEADY * length) ** 2 + change**2 / 4
+        variance = LENGTH + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
+        own = PLACE + (STEADY * length) ** 2 + change**2 / 4
         misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + math.log(variance) / 2
         off = [max(abs(t - e) - HIDDEN, 0) ** 2 / (2 * own) for t, e in zip(ticks, evens, strict=True)]
         found.append((misfit + sum(off), ticks))
