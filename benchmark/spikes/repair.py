@@ -154,7 +154,7 @@ def _misfit(p: float, q: float, m: int, length: float, change: float, lost: Int6
         even = p + (q - p) * i / (m + 1)
         j = _nearest(lost, j + 1, len(lost) - m + i, even)
         misfit += max(abs(lost[j] - even) - HIDDEN, 0.0) ** 2 / (2 * variance)
-    return misfit
+    return float(misfit)
 
 
 @kernel
