@@ -145,9 +145,9 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True, known: Known
     known = known or Known()
     groups: dict[tuple[bool, str], list[str]] = {}
     for path, entry in sorted(entries.items()):
-        configuration = known.configuration(path, entry)
-        counts = ranked and configuration is not None
-        groups.setdefault((counts, configuration if counts and configuration else path), []).append(path)
+        found = known.configuration(path, entry)
+        configuration = found if ranked else None
+        groups.setdefault((configuration is not None, configuration or path), []).append(path)
     rows = [(counts, known.row(paths, entries)) for (counts, _), paths in groups.items()]
     sign = -1.0 if METRICS[PRIMARY].higher_is_better else 1.0
 

@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from ideal_spikes import fire, gathered, sweeping
 from slow_images import slow_adaptive, slow_intervals, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.images.adaptive import AdaptiveSettings, adaptive_image, half_windows
 from spike4dgs.method.images.intervals import IntervalSettings, intervals
-
-
-def fire(rates, charge):
-    """Spikes [T, H, W] of an ideal pixel: rates [T, H, W] in spikes per tick, charges [H, W] at the start."""
-    total = charge + np.cumsum(rates, axis=0)
-    return np.diff(np.floor(total), axis=0, prepend=np.floor(charge)[None]) > 0
 
 
 @settings(max_examples=40, deadline=None)
@@ -81,16 +76,6 @@ def test_the_last_window_covers_the_clip_from_anywhere():
         assert half_windows(n)[0] == 2
 
 
-def sweeping(n, height, width, px_per_tick, seed=0):
-    """Rates [n, H, W] of a smooth texture that moves to the right, between 0.1 and 0.9 spikes per tick."""
-    rng = np.random.default_rng(seed)
-    waves = rng.uniform(0.05, 0.25, (4, 2)), rng.uniform(0, 2 * np.pi, 4)
-    t, y, x = np.mgrid[:n, :height, :width]
-    u = x - px_per_tick * (t + 0.5)
-    total = sum(np.sin(2 * np.pi * (a * u + b * y) + p) for (a, b), p in zip(*waves, strict=True))
-    return 0.5 + 0.1 * total
-
-
 @settings(max_examples=30, deadline=None)
 @example(105, False, 9.7, 30.0, 105)  # two spikes that are equally near
 @given(
@@ -129,19 +114,13 @@ def errors(n=160, half=10.0, seed=0):
     """Of pixels of moving light that change: rate minus the exact mean over its span, rate, and length of the span."""
     rng = np.random.default_rng(seed)
     rates = sweeping(n, 24, 40, 0.1, seed)
-    gathered = np.concatenate([np.zeros((1, 24, 40)), np.cumsum(rates, axis=0)])  # by the start of each tick
-    stream = stream_of(fire(rates, rng.random((24, 40))))
+    stream, by = stream_of(fire(rates, rng.random((24, 40)))), gathered(rates)
     found = []
     for tick in range(30, n - 30, 7):
         rate, (first, last) = intervals(stream, tick, IntervalSettings(half=half))
         y, x = np.nonzero((first != -half) | (last != half))
         a, b = tick + first[y, x], tick + last[y, x]
-
-        def by(t, y=y, x=x):  # light gathered by an instant, in the middle of a tick
-            k = np.floor(t).astype(int)
-            return gathered[k, y, x] + (t - k) * rates[k, y, x]
-
-        found.append((rate[y, x] - (by(b) - by(a)) / (b - a), rate[y, x], b - a))
+        found.append((rate[y, x] - (by(b, y, x) - by(a, y, x)) / (b - a), rate[y, x], b - a))
     return (np.concatenate(column) for column in zip(*found, strict=True))
 
 

@@ -8,18 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from ideal_spikes import fire, gathered, sweeping
 from slow_images import slow_adaptive, slow_intervals, stream_of
 
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.method.images.adaptive import adaptive_image
 from spike4dgs.method.images.intervals import FOLLOWED, IntervalSettings, intervals
-
-
-def fire(rates, charge):
-    """Spikes [T, H, W] of an ideal pixel: rates [T, H, W] in spikes per tick, charges [H, W] at the start."""
-    total = charge + np.cumsum(rates, axis=0)
-    return np.diff(np.floor(total), axis=0, prepend=np.floor(charge)[None]) > 0
 
 
 def lost_at(n, gaps):
@@ -103,31 +98,19 @@ def test_a_pixel_of_no_recorded_spike_has_what_it_was_filled_with():
     assert not intervals(nothing, 10)[0].any() and not adaptive_image(nothing, 10).any()
 
 
-def moving(n=200, height=24, width=40, seed=0):
-    """Rates of a texture that moves, and the light that each pixel gathers by the start of each tick."""
-    rng = np.random.default_rng(seed)
-    waves = rng.uniform(0.05, 0.25, (4, 2)), rng.uniform(0, 2 * np.pi, 4)
-    t, y, x = np.mgrid[:n, :height, :width]
-    rates = 0.5 + 0.1 * sum(
-        np.sin(2 * np.pi * (a * (x - 0.1 * t) + b * y) + p) for (a, b), p in zip(*waves, strict=True)
-    )
-    return rates, np.concatenate([np.zeros((1, height, width)), np.cumsum(rates, axis=0)])
-
-
 @pytest.mark.parametrize("burst", [1, 5])
 def test_moving_light_is_measured_better_than_by_filled_spikes(burst):
     """Spans end at recorded spikes, and the rate is right on average; filled spikes that count as recorded err more."""
-    rates, total = moving(400)
+    rates = sweeping(400, 24, 40, 0.1)
     spikes, lost = fire(rates, np.random.default_rng(0).random((24, 40))), drawn(400, 0.05, burst, 3)
     assert lost.sum() >= 15, "a test of nothing"
     stream, y, x = recording(spikes, lost), *np.mgrid[:24, :40]
-    error, kept = {"filled": [], "lost": []}, ~lost
+    error, kept, by = {"filled": [], "lost": []}, ~lost, gathered(rates)
     for tick in range(30, 370, 7):
         for name, own in (("filled", replace(stream, filled=())), ("lost", stream)):
             rate, span = intervals(own, tick)
             a, b = (np.clip(tick + end.astype(float), 0, 399.9) for end in span)
-            by = [total[np.floor(t).astype(int), y, x] + t % 1 * rates[np.floor(t).astype(int), y, x] for t in (a, b)]
-            error[name].append(rate - (by[1] - by[0]) / (b - a))
+            error[name].append(rate - (by(b, y, x) - by(a, y, x)) / (b - a))
             if name == "lost":
                 ends = np.concatenate([(a - 0.5)[span[0] != -6], (b - 0.5)[span[1] != 6]]).astype(int)
                 assert kept[ends].all() and abs(span).max() < 30
