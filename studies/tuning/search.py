@@ -5,7 +5,7 @@ OUT/ROW.json keeps a row's trials; a killed search goes on from them. OUT/tuning
 
 The first trial is the recipe as it is, so that the same fits measure what the search gains. Optuna's tree of Parzen
 estimators proposes the others; a trial ends after a scene at which it lies below the median of the earlier ones. Fits
-have a quarter of the steps that they have in tables, or what `--budget` says.
+have the steps that they have in tables: what is best at a quarter of them is not best there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.environment import command_line, cpu_name, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
-from spike4dgs.benchmark.method import choose_device_for, get_method, make_budget
+from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
@@ -39,7 +39,6 @@ from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import Values, as_settings, knobs_of, start_of
 
 TRIALS = 24
-BUDGET = "0.25"
 _RANDOM = 8  # trials before the search follows what it has seen
 _METRICS = ("psnr", "psnr_dynamic")
 Trial = dict[str, Any]  # number, knobs, scores by scene (dB), seconds
@@ -52,7 +51,7 @@ def tuning(
     rows: tuple[str, ...],
     out: Path = Path("runs/tuning"),
     trials: int = TRIALS,
-    budget: str = BUDGET,
+    budget: str = DEFAULT_BUDGET,
     seed: int = 0,
     device: str = "auto",
     write: bool = False,
@@ -217,13 +216,14 @@ def _recipe(name: str) -> RecipeMethod:
 
 def write_results(out: Path) -> None:
     """Write OUT/tuning.md, what each search in OUT found, and its trials as OUT/ROW.csv."""
-    columns = ("row", "as it is: whole / moving, dB", "best: whole / moving, dB", "trials", "hours", "changed")
+    columns = ("row", "steps", "as it is: whole / moving, dB", "best: whole / moving, dB", "trials", "hours", "changed")
     rows = []
     for record in _records(out):
         done = record["trials"]
         first, best = done[0], best_of(done, len(record["scenes"]))
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
-        rows.append((f"`{record['row']}`", _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-"))
+        cells = (str(record["budget"]), _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
+        rows.append((f"`{record['row']}`", *cells))
         heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
         write_csv(out / f"{record['row']}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
     write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
@@ -236,7 +236,10 @@ def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
 
 
 def publish(out: Path, root: Path) -> None:
-    """Write the best settings of the searches in OUT into a checkout, and the table and the trials into its docs."""
+    """Write the best settings of the searches in OUT into a checkout, and the table and the trials into its docs.
+
+    What the page has of other rows stays.
+    """
     for folder, rows in (
         ("method", ours.RECIPES),
         ("baselines", (*theirs.RECIPES, *theirs.CALIBRATED, *theirs.PUBLISHED)),
@@ -248,9 +251,13 @@ def publish(out: Path, root: Path) -> None:
                 found[record["row"]] = _found(record)
         write_json(path, dict(sorted(found.items())))
     page = root / "docs" / "results" / "tuning.md"
-    table = (out / "tuning.md").read_text(encoding="utf-8")
-    block = f"<!-- searches -->\n{table}<!-- end searches -->"
-    write_text(page, pattern("searches").sub(lambda _: block, page.read_text(encoding="utf-8")))
+    text = page.read_text(encoding="utf-8")
+    here = [line for block in pattern("searches").finditer(text) for line in block[0].splitlines() if line[:3] == "| `"]
+    head, rule, *new = (out / "tuning.md").read_text(encoding="utf-8").splitlines()
+    lines = {line.split("`")[1]: line for line in [*here, *new]}
+    rows = [lines[row] for row in sorted(lines)]
+    block = "\n".join(["<!-- searches -->", head, rule, *rows, "<!-- end searches -->"])
+    write_text(page, pattern("searches").sub(lambda _: block, text))
     for path in sorted(out.glob("*.csv")):
         write_text(root / "docs" / "results" / "tables" / "tuning" / path.name, path.read_text(encoding="utf-8"))
 

@@ -136,7 +136,9 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
         (tmp_path / folder / "tuned.json").write_text("{}")
     page = tmp_path / "docs" / "results" / "tuning.md"
     page.parent.mkdir(parents=True)
-    page.write_text("before\n<!-- searches -->\nold\n<!-- end searches -->\nafter\n")
+    kept = "| `spike4dgs` | quick | of another search |"
+    old = "\n".join(["| row |", "| --- |", "| `tfp+stg` | old |", kept])
+    page.write_text(f"before\n<!-- searches -->\n{old}\n<!-- end searches -->\nafter\n")
     write_results(out)
     publish(out, tmp_path)
     assert read_tuned(tmp_path / "method" / "tuned.json") == {}
@@ -145,7 +147,8 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
     assert row.name == "tfp+stg.tuned"
     assert row.settings["trainer.lr_means"] == pytest.approx(1.6e-4 * best["knobs"]["rates"])
     text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "| `tfp+stg` |" in text and "old" not in text
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert text.index(kept) < text.index("| `tfp+stg` | 0.25 |") and text.count("\n| ") == 4
     assert (page.parent / "tables" / "tuning" / "tfp+stg.csv").read_text().count("\n") == TRIALS + 1
 
 
