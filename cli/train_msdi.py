@@ -41,8 +41,9 @@ def train_msdi(
         data: Folder of shards; those of the hidden variants are only scored.
         out: Folder for all output.
         config: small, paper (a GPU's work), or bottleneck (the network that matches views: of the other options it
-            takes data, out, steps and seed, and a larger --steps goes on where the training ended).
-        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file.
+            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended).
+        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. The
+            steps of bottleneck's weights count.
         steps: Steps.
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
         rate: Adam's learning rate, after the warm-up, of the layers that make points.
@@ -53,7 +54,7 @@ def train_msdi(
         raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
     learned, hidden = training_shards(data)
     if config in MATCHERS:
-        return _train_matcher(learned, config, steps, compute.seed, out)
+        return _train_matcher(learned, config, start, steps, compute.seed, out)
     settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     device = choose_device(compute.device, rasterizes=False)
     training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
@@ -66,8 +67,9 @@ def train_msdi(
     return 0
 
 
-def _train_matcher(files: list[BurstFile], config: str, steps: int, seed: int, out: Path) -> int:
+def _train_matcher(files: list[BurstFile], config: str, start: Path | None, steps: int, seed: int, out: Path) -> int:
     settings = MatcherTraining()
-    training = MatchTraining(files, MATCHERS[config], settings, seed)
-    run(training, steps, training_key(MATCHERS[config], settings, seed), out)
+    training = MatchTraining(files, MATCHERS[config], settings, seed, start)
+    key = training_key(MATCHERS[config], settings, seed, sha256_file(start) if start else None)
+    run(training, steps, key, out)
     return 0

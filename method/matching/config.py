@@ -35,6 +35,6 @@ class MatcherTraining:
     unknown_sensors: float = 0.3  # of the samples
     longest: int = 400  # ticks of a window, where nothing moves
 
-    def learning_rate(self, step: int) -> float:
-        """Return Adam's learning rate at a step."""
-        return self.lr * min(1.0, (step + 1) / self.warm_up) * (self.hold / max(step, self.hold)) ** 0.5
+    def learning_rate(self, step: int, warm_steps: int) -> float:
+        """Return Adam's learning rate at a step; Adam itself has seen `warm_steps`."""
+        return self.lr * min(1.0, (warm_steps + 1) / self.warm_up) * (self.hold / max(step, self.hold)) ** 0.5

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,14 +36,30 @@ _SAVE_EVERY_S = 120.0
 class MatchTraining:
     """A training in progress."""
 
-    def __init__(self, files: Sequence[BurstFile], config: MatcherConfig, settings: MatcherTraining, seed: int) -> None:
+    def __init__(
+        self,
+        files: Sequence[BurstFile],
+        config: MatcherConfig,
+        settings: MatcherTraining,
+        seed: int,
+        start: Path | None = None,
+    ) -> None:
+        """Begin at step 0, or at the step of the weights `start`, whose optimiser is found anew by a warm-up.
+
+        Raises UserError for a damaged or foreign file, or one of another configuration.
+        """
         self.files, self.settings, self.seed = list(files), settings, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             live = Matcher(config)
+        self.step, self.shards = 0, frozenset[str]()
+        if start:
+            card = WEIGHTS.read_card(start)
+            WEIGHTS.fill(start, live, f"configuration {config.name}")
+            live.train().requires_grad_(True)
+            self.step, self.shards = card.steps, frozenset(card.trained_on)
         self.networks = nn.ModuleDict({"live": live, "mean": copy.deepcopy(live)})
         self.adam = make_adam({"all": list(live.parameters())}, (0.9, 0.999))
-        self.step = 0
 
     @property
     def network(self) -> Matcher:
@@ -51,6 +67,12 @@ class MatchTraining:
         mean = self.networks["mean"]
         assert isinstance(mean, Matcher)
         return mean
+
+    @property
+    def warm_steps(self) -> int:
+        """The steps that the optimiser has seen: fewer than `step` where weights began the training."""
+        state = next(iter(self.adam.state.values()), None)
+        return int(state["step"]) if state else 0
 
     def train_step(self) -> MatchLosses:
         """Train for one step and return its losses."""
@@ -64,7 +86,7 @@ class MatchTraining:
         losses.total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(live.parameters(), 1.0)
         for group in self.adam.param_groups:
-            group["lr"] = self.settings.learning_rate(self.step)
+            group["lr"] = self.settings.learning_rate(self.step, self.warm_steps)
         if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
             self.adam.step()
         self.step += 1
@@ -83,9 +105,12 @@ class MatchTraining:
         self.step = resume_training(path, self.networks, self.adam, key)
 
 
-def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int) -> str:
-    """Return the hash that ties a checkpoint to its training; the number of steps is no part of it."""
-    return sha256_json([asdict(config), asdict(settings), seed])
+def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int, start: str | None = None) -> str:
+    """Return the hash that ties a checkpoint to its training; `start` is the SHA-256 of the weights that began it.
+
+    The number of steps is no part of it.
+    """
+    return sha256_json([asdict(config), asdict(settings), seed, *([start] if start else [])])
 
 
 def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float = _SAVE_EVERY_S) -> None:
@@ -96,8 +121,9 @@ def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: 
 
 def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float) -> None:
     checkpoint, losses = out / "checkpoint.safetensors", out / "losses.csv"
+    begins = not checkpoint.is_file()
     training.resume(checkpoint, key)
-    seen = note_shards(out / "trained_on.json", training.files, fresh=training.step == 0)
+    seen = note_shards(out / "trained_on.json", training.files, training.shards, fresh=begins)
     curve = Curve(losses, training.step)
     recent: list[MatchLosses] = []
     saved = start = time.perf_counter()
@@ -121,9 +147,12 @@ def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s:
             saved = now
 
 
-def note_shards(path: Path, files: Sequence[BurstFile], *, fresh: bool) -> tuple[str, ...]:
-    """Return the training's shards as ID@SHA256, with those of its earlier starts; keep them in a file."""
-    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files}
+def note_shards(path: Path, files: Sequence[BurstFile], earlier: Set[str], *, fresh: bool) -> tuple[str, ...]:
+    """Return the training's shards as ID@SHA256, with the `earlier` ones of its weights and those of its other starts.
+
+    They are kept in a file.
+    """
+    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files} | earlier
     if path.is_file() and not fresh:
         names |= set(read_json(path, "what was trained on")["shards"])
     write_json(path, {"shards": sorted(names)})

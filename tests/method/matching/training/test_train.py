@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
@@ -17,6 +18,7 @@ from spike4dgs.method.checkpoint import load_checkpoint
 from spike4dgs.method.matching.config import TINY, MatcherTraining
 from spike4dgs.method.matching.training.data import at_light, draw, drawn, record, seen_by_network
 from spike4dgs.method.matching.training.train import MatchTraining, run, training_key
+from spike4dgs.method.matching.weights import WEIGHTS
 from spike4dgs.method.matching.window_inputs import window_inputs
 
 SETTINGS = MatcherTraining(samples=1, views=2, warm_up=5, hold=100)
@@ -105,3 +107,21 @@ def test_a_killed_run_goes_on_with_the_same_bits_and_further(tmp_path: Path, fil
     assert saved[0] is not None and saved[1] is not None and set(saved[0].tensors) == set(saved[1].tensors)
     for name, tensor in saved[0].tensors.items():  # of the network, of its mean and of Adam
         assert torch.equal(tensor, saved[1].tensors[name]), name
+
+
+def test_weights_begin_a_training_at_their_step_with_a_warm_up(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
+    run(MatchTraining(files[:1], TINY, SETTINGS, 0), 8, "key", tmp_path)
+    weights = tmp_path / "matcher.safetensors"
+    training = MatchTraining(files[1:], TINY, SETTINGS, 0, weights)
+    kept = load_file(weights)
+    for networks in (training.networks["live"], training.networks["mean"]):
+        for name, tensor in networks.state_dict().items():
+            assert torch.equal(tensor, kept[name].float()), name
+    assert (training.step, training.warm_steps) == (8, 0)
+    training.train_step()
+    assert training.adam.param_groups[0]["lr"] == pytest.approx(SETTINGS.lr / SETTINGS.warm_up)
+    assert (training.step, training.warm_steps) == (9, 1)
+    run(training, 10, "another", tmp_path / "on")
+    assert len(WEIGHTS.read_card(tmp_path / "on" / "matcher.safetensors").trained_on) == 3
+    other = training_key(TINY, SETTINGS, 0, "sha")
+    assert other != training_key(TINY, SETTINGS, 0)
