@@ -102,7 +102,8 @@ class MatchTraining:
 
     def resume(self, path: Path, key: str) -> None:
         """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
-        self.step = resume_training(path, self.networks, self.adam, key)
+        if path.is_file():
+            self.step = resume_training(path, self.networks, self.adam, key)
 
 
 def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int, start: str | None = None) -> str:

@@ -122,6 +122,8 @@ def test_weights_begin_a_training_at_their_step_with_a_warm_up(tmp_path: Path, f
     assert training.adam.param_groups[0]["lr"] == pytest.approx(SETTINGS.lr / SETTINGS.warm_up)
     assert (training.step, training.warm_steps) == (9, 1)
     run(training, 10, "another", tmp_path / "on")
-    assert len(WEIGHTS.read_card(tmp_path / "on" / "matcher.safetensors").trained_on) == 3
+    assert (training.step, training.warm_steps) == (10, 2)
+    card = WEIGHTS.read_card(tmp_path / "on" / "matcher.safetensors")
+    assert card.steps == 10 and len(card.trained_on) == 3
     other = training_key(TINY, SETTINGS, 0, "sha")
     assert other != training_key(TINY, SETTINGS, 0)
