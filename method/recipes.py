@@ -17,7 +17,8 @@ from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.images.msdi import MSDI
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.starts.base import Initialization
-from spike4dgs.method.starts.msdi import MsdiMatchedSettings, MsdiSettings, msdi, msdi_matched
+from spike4dgs.method.starts.matching import MatchedSettings, matched
+from spike4dgs.method.starts.msdi import MsdiSettings, msdi
 from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.tuned import read_tuned, tuned
@@ -31,10 +32,10 @@ PARTS = Parts(
         "msdi": Initialization(
             lambda r: msdi(r.scene, r.settings, r.device), MsdiSettings(), label="points by MSDI", calibrated=True
         ),
-        "msdi-matched": Initialization(
-            lambda r: msdi_matched(r.scene, r.seed, r.settings, r.device),
-            MsdiMatchedSettings(),
-            label="poses by MSDI and matching",
+        "matched": Initialization(
+            lambda r: matched(r.scene, r.seed, r.settings, r.device),
+            MatchedSettings(),
+            label="poses by the matching network and features",
             estimates_poses=True,
             calibrated=True,
         ),
@@ -68,7 +69,7 @@ SPIKE4DGS = (
     Recipe("msdi+4dgs", "msdi", "msdi", "hexplane", "pixel", MSDI_SETTINGS),
     Recipe("msdi+4dgs+spike", "msdi", "msdi", "hexplane", "spike", MSDI_SETTINGS),
     Recipe("msdi+4dgs+pixel+spike", "msdi", "msdi", "hexplane", "pixel+spike", MSDI_SETTINGS),
-    Recipe("spike4dgs-uncalibrated", "msdi", "msdi-matched", "hexplane", "spss", MSDI_SETTINGS),
+    Recipe("spike4dgs-uncalibrated", "msdi", "matched", "hexplane", "spss", MSDI_SETTINGS),
 )
 
 # Images and first points corrected by the cameras' calibrations: what method names call rig-flat.

@@ -21,8 +21,8 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.method.msdi.pose import solve_poses
 from spike4dgs.method.starts.clip import window_means
-from spike4dgs.method.starts.matching import match_and_solve
-from spike4dgs.method.starts.msdi import DEFAULTS, infer, matched_poses
+from spike4dgs.method.starts.matching import match_and_solve, refined_poses
+from spike4dgs.method.starts.msdi import DEFAULTS, infer
 from spike4dgs.method.starts.rig import rig
 from spike4dgs.method.starts.structure_from_motion import FOCAL_PRIOR, clip_means, map_views
 from spike4dgs.method.training_views.pinholes import as_pinholes, undistorted
@@ -53,10 +53,10 @@ def _msdi(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) ->
     return Posed(cameras, found.points[found.sure(DEFAULTS)])
 
 
-def _msdi_matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Any:
+def _matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool) -> Any:
     if not calibrated:
-        raise problem("msdi-matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
-    return matched_poses(scene, infer(scene, calibrated=True), seed)
+        raise problem("matched", "known intrinsics", "--unknown-intrinsics", "leave one of them out")
+    return refined_poses(scene, seed)
 
 
 ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Any]] = {  # of what has `cameras` and `points`
@@ -66,8 +66,8 @@ ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Any]] = {  #
     ),
     "dust3r": lambda scene, images, seed, known: estimate_dust3r(scene, images, seed, calibrated=known),
     "msdi": _msdi,
-    "msdi-matched": _msdi_matched,
     "matching": lambda scene, images, seed, known: match_and_solve(scene, seed, calibrated=known),
+    "matched": _matched,
 }
 COLUMNS = {  # key of the row -> heading, format
     "registered": ("views", "{}"),
@@ -103,8 +103,8 @@ def poses(
 
     Args:
         scenes: Scene folders.
-        initialization: What estimates: rig, colmap, dust3r, msdi (the network alone), msdi-matched (its points of one
-            view, and what views match), matching (the matching network and geometry).
+        initialization: What estimates: rig, colmap, dust3r, msdi (its network alone), matching (the matching network),
+            matched (its poses, refined by features).
         images: What colmap and dust3r see: clip (means of the whole clip), flat (those, corrected by the cameras'
             calibrations, as in recipes with flat_field), or images of the clip's middle, such as tfp.
         unknown_intrinsics: Estimate one focal length too, instead of keeping the calibrated intrinsics.

@@ -1,11 +1,9 @@
-"""Poses from a rough guess of one view's points, and from matches of all views: a network's depth, COLMAP's geometry.
+"""Poses that begin where a network found them, and end where the features that views match put them.
 
-MSDI knows the points of view 0 to a tenth, and an array is small beside its distance to the scene: seen from the other
-views such points fall only a few pixels beside their images. So the features that a view has in common with view 0
-give that view's pose to a degree or two, by PnP, where the network's points of that view itself do not
-(`method.msdi.pose`). Triangulation and bundle adjustment of all matches do the rest. A view may then have a wrong but
-locally best pose: therefore each pose is solved again, by points that the others agree on, and everything is adjusted
-once more.
+The features of corrected means of the clip are more exact than what the matching network sees in one short window, but
+alone they may not tell where to begin: an array is small beside its distance. Triangulation and bundle adjustment of
+all matches start from the network's poses. A view may then have a wrong but locally best pose: therefore each pose is
+solved again, by points that the others agree on, and everything is adjusted once more.
 """
 
 from __future__ import annotations
@@ -40,8 +38,7 @@ Pose = tuple[Float64, Float64]  # world to camera, R [3, 3] and t [3]
 class MatchSettings(FeatureSettings):
     """Numbers of poses by matches (prefix `initialization`)."""
 
-    guess_px: float = 2.0  # of a guessed point to its feature, at the sensor's own size
-    resect_px: float = 1.0  # of a triangulated one
+    resect_px: float = 1.0  # of a triangulated point to its feature, at the sensor's own size
     rough_error_px: float = 16.0  # of an observation of a point, in enlarged pixels, while poses are rough
     rough_angle_deg: float = 4.0  # of its ray
 
@@ -75,23 +72,20 @@ class Seen:
 
 
 def bundle(
-    scene: TrainingScene, guess: Float64, factor: int, images: Float32, seed: int, settings: MatchSettings = DEFAULTS
+    scene: TrainingScene, poses: Sequence[Pose | None], images: Float32, seed: int, settings: MatchSettings = DEFAULTS
 ) -> Mapping:
     """Return poses of the training cameras, whose intrinsics are taken as given, and the points that they match.
 
-    guess: [h, w, 3] points of the pixels of view 0, in view 0's frame, at any scale, NaN where unknown; a pixel is a
-    block of `factor` x `factor` of the camera's. images: [C, H, W] linear radiance. The same seed gives the same
-    poses. A view without a pose is left out.
+    poses: the first ones, in any frame and at any scale, None where unknown. images: [C, H, W] linear radiance. The
+    same seed gives the same poses. A view without a pose is left out.
     """
     with find_features(scene.cameras, images, seed, settings) as found:
         seen = read_matches(found, settings.enlarge)
-        intrinsics = [camera.K for camera in scene.cameras]
-        first = _first_poses(seen, guess, factor, intrinsics, seed, settings.guess_px)
         rough = Tolerance(settings.rough_error_px, settings.rough_angle_deg)
-        model = _adjust(found, seen, first, rough, settings.min_angle_deg)
+        model = _adjust(found, seen, poses, rough, settings.min_angle_deg)
         if model is None:
             return NOTHING
-        again = _poses_again(model, seen, intrinsics, seed, settings.resect_px)
+        again = _poses_again(model, seen, [camera.K for camera in scene.cameras], seed, settings.resect_px)
         model = _adjust(found, seen, again, FINE, settings.min_angle_deg)
         return NOTHING if model is None else in_scene(model, scene.cameras, found.names, images, settings.enlarge)
 
@@ -109,19 +103,6 @@ def read_matches(found: Features, enlarge: int) -> Seen:
             for i, j in combinations(range(len(ids)), 2)
         }
     return Seen(ids, pixels, same)
-
-
-def _first_poses(
-    seen: Seen, guess: Float64, factor: int, intrinsics: Sequence[Float64], seed: int, reach_px: float
-) -> list[Pose | None]:
-    """Return view 0's pose, the identity, and the others' by PnP on the guessed points of its features."""
-    u, v = np.floor(seen.pixels[0] / factor).astype(np.int64).T
-    points = guess[v.clip(0, guess.shape[0] - 1), u.clip(0, guess.shape[1] - 1)]
-    poses: list[Pose | None] = [(np.eye(3), np.zeros(3))]
-    for view in range(1, len(seen.ids)):
-        first, other = seen.partners(0, view)
-        poses.append(_solve(points[first], seen.pixels[view][other], intrinsics[view], reach_px, seed))
-    return poses
 
 
 def _poses_again(

@@ -1,14 +1,15 @@
-"""Poses and points by the matching network alone: spikes in, geometry solved from what views match.
+"""The initialisation `matched`: poses by the matching network and by features, points as `msdi` finds them.
 
 All training views are seen at the middle of the clip, through `adaptive`'s windows (`method.matching.window_inputs`),
 corrected by the cameras' calibrations where a scene has them. The network matches all pairs of views; the poses follow
 (`method.matching.poses`) with the calibrated intrinsics, or with one focal length for all that is estimated too. As
-for COLMAP, everything is then moved to the scene's frame.
+for COLMAP, everything is then moved to the scene's frame. From there the features of the corrected means of the clip
+are adjusted (`matched_poses`). Where they leave a view out, as in the dark, the network's poses stay.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,8 +22,36 @@ from spike4dgs.method.matching.matches import learned_matches
 from spike4dgs.method.matching.poses import Solved, solve, solve_unknown
 from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
 from spike4dgs.method.matching.window_inputs import window_inputs
+from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.clip import window_means
+from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
+from spike4dgs.method.starts.msdi import MsdiSettings, msdi
 from spike4dgs.method.starts.structure_from_motion import NOTHING, Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
+
+
+@dataclass(frozen=True)
+class MatchedSettings(MsdiSettings, MatchSettings):
+    """Numbers of `matched` (prefix `initialization`)."""
+
+
+DEFAULTS = MatchedSettings()
+
+
+def matched(scene: TrainingScene, seed: int, settings: MatchedSettings = DEFAULTS, device: str = "auto") -> Start:
+    """Return estimated poses, and points at them; see the module. Raises as `msdi` and `refined_poses` do."""
+    return msdi(replace(scene, cameras=refined_poses(scene, seed, settings, device).cameras), settings, device)
+
+
+def refined_poses(scene: TrainingScene, seed: int, settings: MatchSettings = DEFAULTS, device: str = "auto") -> Mapping:
+    """Return the training cameras, whose intrinsics are known, and the points that they match.
+
+    Raises WeightsError where there are no weights, UserError where the network finds no poses.
+    """
+    first = match_and_solve(scene, seed, device, calibrated=True).of_all(scene, "the matching network")
+    images = window_means(scene, 0, scene.n_ticks, flat_field=True)
+    better = bundle(scene, [(c.R, c.t) for c in first.cameras], images, seed, settings)
+    return better if len(better.cameras) == len(scene.cameras) else first
 
 
 def seen_inputs(scene: TrainingScene) -> Float32:

@@ -1,17 +1,13 @@
-"""The initialisations `msdi` and `msdi-matched`: points and poses by MSDI's network (section 3.3).
+"""The initialisation `msdi`: points by MSDI's network (section 3.3).
 
 The network sees the ticks around the middle of the clip in all training views at once, shrunk to about the size that it
 was trained at, and corrected by the cameras' calibrations where a scene has them. It gives the point of every pixel in
 view 0's frame, at a scale of its own.
 
-`msdi` keeps the calibrated poses, which are better than any estimate. From known poses, matches of the views are
-measured better than a network guesses them: those are the points of `rig` with `flat_field`. Where nothing matches, for
-lack of texture, the network's points replace the nearest depth: those of view 0, as inverse depths that a line brings
-to the matched ones.
-
-`msdi-matched` has the calibrated intrinsics and no poses: they follow from the network's points of view 0 and from what
-views match in corrected means of the clip (`bundle`), and are moved to the scene's frame as COLMAP's are. From there on
-it is `msdi`.
+Poses are the calibrated ones, which are better than any estimate. From known poses, matches of the views are measured
+better than a network guesses them: those are the points of `rig` with `flat_field`. Where nothing matches, for lack of
+texture, the network's points replace the nearest depth: those of view 0, as inverse depths that a line brings to the
+matched ones.
 """
 
 from __future__ import annotations
@@ -35,10 +31,8 @@ from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.starts.base import Start
-from spike4dgs.method.starts.clip import SpikeClip, window_means
-from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
+from spike4dgs.method.starts.clip import SpikeClip
 from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched
-from spike4dgs.method.starts.structure_from_motion import Mapping
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
 
@@ -53,12 +47,7 @@ class MsdiSettings(PointSettings):
     farthest: float = 2.0  # times the farthest match: points beyond it are left out
 
 
-@dataclass(frozen=True)
-class MsdiMatchedSettings(MsdiSettings, MatchSettings):
-    """Numbers of `msdi-matched` (prefix `initialization`)."""
-
-
-DEFAULTS, MATCHED = MsdiSettings(), MsdiMatchedSettings()
+DEFAULTS = MsdiSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,34 +71,9 @@ def msdi(scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = 
 
     Raises WeightsError where there are no weights, UserError where all cameras have one centre.
     """
-    return _given(scene, infer(scene, settings, device, calibrated=True), settings)
-
-
-def _given(scene: TrainingScene, estimate: Estimate, settings: MsdiSettings) -> Start:
+    estimate = infer(scene, settings, device, calibrated=True)
     cloud, mean = matched(scene, settings, SpikeClip(scene, settings.window_ticks, flat_field=True))
     return filled(scene, completed(cloud, estimate, settings), mean, settings)
-
-
-def msdi_matched(
-    scene: TrainingScene, seed: int, settings: MsdiMatchedSettings = MATCHED, device: str = "auto"
-) -> Start:
-    """Return poses by the network's points of view 0 and by matches, and points; raises as `matched_poses` too."""
-    estimate = infer(scene, settings, device, calibrated=True)
-    cameras = matched_poses(scene, estimate, seed, settings).cameras
-    small = tuple(shrunk(camera, estimate.factor) for camera in cameras)
-    return _given(replace(scene, cameras=cameras), replace(estimate, cameras=small), settings)
-
-
-def matched_poses(
-    scene: TrainingScene, estimate: Estimate, seed: int, settings: MsdiMatchedSettings = MATCHED
-) -> Mapping:
-    """Return the training cameras, whose intrinsics are known, and the points that they match.
-
-    Raises UserError unless all have poses.
-    """
-    guess = np.where(estimate.sure(settings)[0][..., None], estimate.points[0], np.nan)
-    images = window_means(scene, 0, scene.n_ticks, flat_field=True)
-    return bundle(scene, guess, estimate.factor, images, seed, settings).of_all(scene, "MSDI")
 
 
 def infer(

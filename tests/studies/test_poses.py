@@ -63,7 +63,7 @@ def test_a_perfect_network_finds_the_rig_again(calibrated: bool, monkeypatch: py
 
 
 def test_unknown_names_are_refused(small_scene: Path) -> None:
-    with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, msdi-matched, matching, found sift"):
+    with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, matching, matched, found sift"):
         poses((small_scene,), initialization=("sift",))
     with pytest.raises(UserError, match="one of clip, flat, tfp"):
         poses((small_scene,), images="photo")

@@ -17,7 +17,7 @@ from spike4dgs.method.matching.poses import solve
 from spike4dgs.method.matching.tracks import Matches, PairMatches
 from spike4dgs.method.matching.training.truth import correspond
 from spike4dgs.method.matching.weights import VARIABLE, WEIGHTS, MatcherCard, load_matcher
-from spike4dgs.method.starts.matching import in_scene, match_and_solve, seen_inputs
+from spike4dgs.method.starts.matching import in_scene, match_and_solve, matched, refined_poses, seen_inputs
 
 WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
 SCENE = WORLD.training
@@ -51,6 +51,35 @@ def test_true_matches_give_the_cameras_and_the_points_of_the_scene() -> None:
     u, v = uv[inside].astype(int).T
     truth = np.asarray(WORLD.trace(camera, 0.5)[1])[v, u]
     assert np.median(np.abs(z[inside] / truth - 1)) < 0.01
+
+
+def test_the_shipped_network_places_the_cameras_of_a_world_that_it_never_saw() -> None:
+    errors = pose_errors(match_and_solve(SCENE, 0, "cpu", calibrated=True).cameras, SCENE.cameras)
+    assert errors.rotation_deg.max() < 0.5 and errors.translation_m.max() < 0.03 * errors.array_m
+    free = match_and_solve(SCENE, 0, "cpu", calibrated=False)
+    errors = pose_errors(free.cameras, SCENE.cameras)
+    assert errors.rotation_deg.max() < 1 and errors.translation_m.max() < 0.06 * errors.array_m
+    assert len({camera.fx for camera in free.cameras}) == 1 and free.cameras[0].fx != SCENE.cameras[0].fx
+
+
+def test_points_of_the_start_lie_on_the_surfaces() -> None:
+    start = matched(SCENE, 0, device="cpu")
+    errors = pose_errors(start.cameras, SCENE.cameras)
+    assert errors.rotation_deg.max() < 0.5 and errors.translation_m.max() < 0.03 * errors.array_m
+    assert all(a.fx == b.fx for a, b in zip(start.cameras, SCENE.cameras, strict=True))
+    uv, z = WORLD.held_out.project(start.points.astype(np.float64))
+    u, v = np.floor(uv).astype(int).T
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 96) & (v < 61)
+    expected = WORLD.trace(WORLD.held_out, 0.5)[1][v[inside], u[inside]]
+    assert inside.sum() > 1000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
+
+
+def test_where_features_find_nothing_the_networks_poses_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = match_and_solve(SCENE, 0, "cpu", calibrated=True).cameras
+    dark = np.zeros((8, 61, 96), np.float32)
+    monkeypatch.setattr("spike4dgs.method.starts.matching.window_means", lambda *args, **options: dark)
+    found = refined_poses(SCENE, 0, device="cpu").cameras
+    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(found, first, strict=True))
 
 
 def test_inputs_are_those_of_all_views() -> None:
