@@ -10,6 +10,11 @@ MEASUREMENTS: dict[str, Command] = {
         "measure every approximation beside its exact twin, and write one page",
         "report speed-error --quick --out runs/speed-error",
     ),
+    "report dark-poses": Command(
+        "spike4dgs.cli.studies:dark_poses",
+        "estimate poses from less and less light: the matching network, SIFT and COLMAP on the same spikes",
+        "report dark-poses data/matching --out runs/dark-poses",
+    ),
     "report hard-cases": Command(
         "spike4dgs.cli.studies:hard_cases",
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",

@@ -45,9 +45,9 @@ def colmap(scene: TrainingScene, seed: int, settings: ColmapSettings = DEFAULTS)
     """
     if settings.flat_field:
         images = window_means(scene, 0, scene.n_ticks, flat_field=True)
-        found = map_views(scene, images, seed, settings).of_all(scene, WHO)
+        found = map_views(scene.cameras, images, seed, settings).of_all(scene, WHO)
         return rig(replace(scene, cameras=found.cameras), settings)
-    found = map_views(scene, clip_means(scene), seed, settings).of_all(scene, WHO)
+    found = map_views(scene.cameras, clip_means(scene), seed, settings).of_all(scene, WHO)
     if len(found.points) < settings.min_points:
         posed = replace(scene, cameras=found.cameras)
         return swept(posed, settings, SpikeClip(posed, settings.window_ticks, flat_field=False))

@@ -85,7 +85,7 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     scene = surveyed.scene
     rates = clip_means(scene)
     white = max(float(np.percentile(rates, WHITE_PERCENTILE)), 1e-6)
-    cameras = map_views(scene, rates / np.float32(white), seed, FEATURES, FOCAL_PRIOR).cameras
+    cameras = map_views(scene.cameras, rates / np.float32(white), seed, FEATURES, FOCAL_PRIOR).cameras
     if len(cameras) < 2:
         fix = "calibrate the array with `spike4dgs calibrate-rig`, and record with its calibration"
         raise problem(root, "poses, or views in which COLMAP finds them", f"poses of {len(cameras)} views", fix)

@@ -183,7 +183,7 @@ def clip_means(scene: TrainingScene) -> Float32:
 
 
 def map_views(
-    scene: TrainingScene,
+    cameras: Sequence[Camera],
     images: Float32,
     seed: int,
     settings: FeatureSettings = FEATURES,
@@ -191,19 +191,19 @@ def map_views(
 ) -> Mapping:
     """Return the structure from motion on one image of each training view [C, H, W], linear radiance.
 
-    Intrinsics are the calibrated ones; with `focal_prior`, in image widths, they are unknown and one is estimated.
-    The same seed gives the same poses: everything runs in one thread. Where fewer than two views are registered,
-    nothing can be aligned and the mapping is empty.
+    All views have the intrinsics of the first of `cameras`; with `focal_prior`, in image widths, they are unknown and
+    one focal length is estimated. The same seed gives the same poses: everything runs in one thread. Where fewer than
+    two views are registered, nothing can be aligned and the mapping is empty.
     """
     import pycolmap
 
-    with find_features(scene.cameras, images, seed, settings, focal_prior) as found:
+    with find_features(cameras, images, seed, settings, focal_prior) as found:
         options = _options(seed, settings.min_angle_deg, refine_focal=focal_prior is not None)
         models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", options)
         if not models:
             return NOTHING
         largest = max(models.values(), key=lambda m: m.num_reg_images())
-        return in_scene(largest, scene.cameras, found.names, images, settings.enlarge)
+        return in_scene(largest, cameras, found.names, images, settings.enlarge)
 
 
 def _options(seed: int, min_angle_deg: float, *, refine_focal: bool) -> pycolmap.GlobalPipelineOptions:

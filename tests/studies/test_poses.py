@@ -12,7 +12,7 @@ from spike4dgs.cli import main
 from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.starts.msdi import Estimate, shrunk
 from spike4dgs.method.starts.structure_from_motion import clip_means
-from spike4dgs.studies.poses import measure_poses, poses
+from spike4dgs.studies.poses.estimators import measure_poses, poses
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
 
@@ -53,7 +53,7 @@ def test_a_perfect_network_finds_the_rig_again(calibrated: bool, monkeypatch: py
     relative = np.stack([c.w2c @ np.linalg.inv(small[0].w2c) for c in small])
     points = points_of(depth, np.stack([c.K for c in small]), relative).astype(np.float64) / 3.7
     perfect = Estimate(2, small, depth, points, np.full(depth.shape, 9.0))
-    monkeypatch.setattr("spike4dgs.studies.poses.infer", lambda scene, calibrated: perfect)
+    monkeypatch.setattr("spike4dgs.studies.poses.estimators.infer", lambda scene, calibrated: perfect)
     row = measure_poses(WORLD.training, depth, "msdi", 0, calibrated=calibrated)
     assert row["registered"] == "8 of 8" and float(row["rotation_max_deg"] or 9) < 0.1
     assert float(row["translation_m"] or 9) < 0.01 and row["focal_ratio"] == pytest.approx(1, abs=0.01)

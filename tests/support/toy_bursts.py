@@ -28,13 +28,16 @@ def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
     )
 
 
-def write_toy_shard(folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2) -> Path:
-    """Write the shard `toy-VARIANT` of one rig and return its path."""
+def write_toy_shard(
+    folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2, resting: int = 0
+) -> Path:
+    """Write the shard `toy-VARIANT` of one rig and return its path; it sees the world at rest too, `resting` times."""
     world = ToyWorld(width=width, height=height, seed=variant)
     bursts = [toy_burst(world, t) for t in np.linspace(0.3, 0.7, instants)]
     traced = [world.trace(camera, 1e3) for camera in world.cameras]  # the board is far outside all images
     static = [tuple(np.array([maps[k] for maps in traced], np.float32) for k in range(2))]
-    facts = BurstFacts("toy", variant, 0, width, height, len(world.cameras), 1, instants, 1, GAIN, 5e4)
+    sizes = width, height, len(world.cameras), 1, instants
+    facts = BurstFacts("toy", variant, 0, *sizes, 1, GAIN, 5e4, resting)
     path = burst_path(folder, "toy", variant)
-    write_bursts(path, facts, stack_bursts([bursts], static))
+    write_bursts(path, facts, stack_bursts([bursts], static, bursts[:1] * resting))
     return path

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.starts.structure_from_motion import Mapping, clip_means, map_views
@@ -26,7 +26,7 @@ WORLD = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1)
 
 @pytest.fixture(scope="module")
 def mapping() -> Mapping:
-    return map_views(WORLD.training, clip_means(WORLD.training), 0)
+    return map_views(WORLD.training.cameras, clip_means(WORLD.training), 0)
 
 
 def test_means_are_the_radiance_of_what_stands_still() -> None:
@@ -61,7 +61,7 @@ def test_the_same_seed_gives_the_same_poses_and_nothing_stays_behind(
     mapping: Mapping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    again = map_views(WORLD.training, clip_means(WORLD.training), 0)
+    again = map_views(WORLD.training.cameras, clip_means(WORLD.training), 0)
     for a, b in zip(again.cameras, mapping.cameras, strict=True):
         assert np.array_equal(a.w2c, b.w2c)
     assert not os.listdir(tmp_path)
@@ -126,9 +126,9 @@ def test_features_are_sought_in_images_without_the_pixels_pattern(monkeypatch: p
     scene = replace(world.training, recordings=tuple(world.recordings(c) for c in world.training.cameras))
     seen: list[NDArray[np.float32]] = []
 
-    def watched(scene: TrainingScene, images: NDArray[np.float32], seed: int, settings: ColmapSettings) -> Mapping:
+    def watched(cameras: Sequence[Camera], images: NDArray[np.float32], seed: int, own: ColmapSettings) -> Mapping:
         seen.append(images)
-        return map_views(scene, images, seed, settings)
+        return map_views(cameras, images, seed, own)
 
     monkeypatch.setattr(module, "map_views", watched)
     assert len(colmap(scene, 0, ColmapSettings(flat_field=True)).cameras) == 8

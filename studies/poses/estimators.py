@@ -62,7 +62,7 @@ def _matched(scene: TrainingScene, images: Float32, seed: int, calibrated: bool)
 ESTIMATORS: dict[str, Callable[[TrainingScene, Float32, int, bool], Any]] = {  # of what has `cameras` and `points`
     "rig": lambda scene, images, seed, known: rig(scene),
     "colmap": lambda scene, images, seed, known: map_views(
-        scene, images, seed, focal_prior=None if known else FOCAL_PRIOR
+        scene.cameras, images, seed, focal_prior=None if known else FOCAL_PRIOR
     ),
     "dust3r": lambda scene, images, seed, known: estimate_dust3r(scene, images, seed, calibrated=known),
     "msdi": _msdi,

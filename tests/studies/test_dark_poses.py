@@ -1,0 +1,81 @@
+"""Poses in less and less light: a pair's errors, what estimators see, and the table of a toy world."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_bursts import write_toy_shard
+from toy_world import ToyWorld
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.metrics.pose_error import Sim3
+from spike4dgs.benchmark.scene.training_bursts import open_bursts
+from spike4dgs.studies.poses import dark
+from spike4dgs.studies.poses.dark import ESTIMATORS, dark_poses, errors_of, see
+
+TRUE = ToyWorld(width=96, height=61, seed=1).training.cameras
+
+
+def turned(degrees: float) -> np.ndarray:
+    a = np.radians(degrees)
+    return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+
+
+def test_pairs_are_compared_in_any_frame_and_order() -> None:
+    move = Sim3(2.0, turned(40), np.array([1.0, 2.0, 3.0]))
+    for error in errors_of([move.camera(c) for c in TRUE][::-1], TRUE):
+        assert error.shape == (28,) and error.max() < 1e-4
+
+
+def test_a_turned_camera_and_an_absent_one_count_in_their_pairs_alone() -> None:
+    R = turned(3) @ TRUE[2].R
+    found = [*TRUE[:2], replace(TRUE[2], R=R, t=-R @ TRUE[2].center), *TRUE[3:7]]
+    rotation, _ = errors_of(found, TRUE)
+    i, j = np.triu_indices(8, 1)
+    absent, off = (i == 7) | (j == 7), ((i == 2) | (j == 2)) & (j != 7)
+    assert (rotation[absent] == 180).all()
+    np.testing.assert_allclose(rotation[off], 3, atol=1e-6)
+    assert rotation[~absent & ~off].max() < 1e-6
+    assert all((error == 180).all() for error in errors_of(found[:1], TRUE))
+
+
+def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(tmp_path: Path) -> None:
+    file = open_bursts(write_toy_shard(tmp_path, 12, width=96, height=61, resting=1))
+    burst, rng = file.read(2), np.random.default_rng(0)
+    still = burst.keys[0, :8]
+    for light in (1.0, 0.25):
+        sight = see(burst, file, light, 401, rng)
+        assert len(sight.cameras) == 8 and sight.inputs.shape == (8, 4, 61, 96)
+        expected = still * file.facts.radiance_gain * light
+        assert np.sqrt(np.mean((sight.means - expected) ** 2)) < 0.004 + 0.02 * light
+        assert np.median(np.abs(sight.intervals / expected - 1)) < 0.2
+    rotation, direction = errors_of(ESTIMATORS["matching network"](see(burst, file, 1.0, 401, rng), 0), sight.cameras)
+    assert rotation.max() < 1 and direction.max() < 5
+
+
+def test_the_table_has_shares_of_pairs_in_each_condition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for variant in (12, 13):  # one hidden, one to train on
+        write_toy_shard(tmp_path, variant, width=96, height=61, resting=2)
+    monkeypatch.setattr(dark, "LIGHTS", (1.0, 1 / 4096))
+    monkeypatch.setattr(dark, "TICKS", (41,))
+    assert dark_poses(tmp_path, bursts=1, out=tmp_path / "out") == 0
+    rows = json.loads((tmp_path / "out" / "poses.json").read_text())["rows"]
+    assert [row["world"] for row in rows] == ["toy-12"] * 2 * len(ESTIMATORS)
+    assert all(len(row["rotation_deg"]) == len(row["direction_deg"]) == 28 for row in rows)
+    _, _, bright, black = (tmp_path / "out" / "poses.md").read_text().splitlines()
+    assert bright.startswith("| 1 | 2 | 100 % / 100 % |")
+    assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(ESTIMATORS)
+    assert (tmp_path / "out" / "poses.png").stat().st_size > 1000
+    assert "1/1 arrays" in capsys.readouterr().out
+
+
+def test_a_folder_without_hidden_arrays_at_rest_is_refused(tmp_path: Path) -> None:
+    write_toy_shard(tmp_path, 12)
+    with pytest.raises(UserError, match="expected shards of hidden variants with arrays of more than 8 views at rest"):
+        dark_poses(tmp_path)
