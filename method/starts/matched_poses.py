@@ -147,12 +147,13 @@ def _adjust(
     posed = [(i, n, p) for i, n, p in zip(seen.ids, found.names, poses, strict=True) if p is not None]
     if len(posed) < 2:
         return None
-    with pycolmap.Database.open(found.database) as database:
-        (camera,) = database.read_all_cameras()
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera)
+    with pycolmap.Database.open(found.database) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        camera_of = {image: database.read_image(image).camera_id for image, _, _ in posed}
     for image, name, (R, t) in posed:
-        view = pycolmap.Image(image_id=image, camera_id=camera.camera_id, name=name)
+        view = pycolmap.Image(image_id=image, camera_id=camera_of[image], name=name)
         model.add_image_with_trivial_frame(view, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
     model = pycolmap.triangulate_points(
         model, found.database, found.folder, found.folder, options=_triangulation(tolerance, min_angle_deg)

@@ -81,7 +81,7 @@ def find_features(
 ) -> Iterator[Features]:
     """Yield features and matches of images [C, H, W], linear radiance, while the context lasts; COLMAP is silent in it.
 
-    All views share one camera: the calibrated one, or one whose focal length is a guess, `focal_prior` image widths.
+    Views have their calibrated intrinsics, or share a camera whose focal length is a guess, `focal_prior` image widths.
     """
     import pycolmap
 
@@ -89,7 +89,8 @@ def find_features(
         names = _write_images(Path(folder), cameras, images, settings.enlarge)
         database = Path(folder) / "database.db"
         pycolmap.set_random_seed(seed)
-        _match(database, Path(folder), cameras[0], seed, settings, focal_prior)
+        _extract(database, Path(folder), cameras, names, settings, focal_prior)
+        _match(database, seed, settings)
         yield Features(Path(folder), database, tuple(names))
 
 
@@ -101,39 +102,59 @@ def _write_images(folder: Path, cameras: Sequence[Camera], images: Float32, enla
     return names
 
 
-def _match(
-    database: Path, folder: Path, camera: Camera, seed: int, settings: FeatureSettings, focal_prior: float | None
+def _extract(
+    database: Path,
+    folder: Path,
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    settings: FeatureSettings,
+    focal_prior: float | None,
 ) -> None:
-    """Write features and matches of all pairs into the database; all views share one camera."""
+    """Write cameras and features into the database; views share one camera where their intrinsics are equal."""
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
-    enlarge = settings.enlarge
+    camera, enlarge = cameras[0], settings.enlarge
     size = (camera.width * enlarge / 2, camera.height * enlarge / 2)
+    intrinsics = [[float(x) * enlarge for x in (c.fx, c.fy, c.cx, c.cy)] for c in cameras]
+    alike = focal_prior is not None or all(own == intrinsics[0] for own in intrinsics)
     if focal_prior is None:
         reader.camera_model = "PINHOLE"
-        intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
-        reader.camera_params = ",".join(repr(float(x) * enlarge) for x in intrinsics)
+        reader.camera_params = ",".join(map(repr, intrinsics[0]))
     else:
         reader.camera_model = "SIMPLE_PINHOLE"
         reader.camera_params = f"{focal_prior * camera.width * enlarge},{size[0]},{size[1]}"
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
     extraction.sift.peak_threshold = settings.peak_threshold
-    cpu = pycolmap.Device.cpu
     pycolmap.extract_features(
         database,
         folder,
-        camera_mode=pycolmap.CameraMode.SINGLE,
+        camera_mode=pycolmap.CameraMode.SINGLE if alike else pycolmap.CameraMode.PER_IMAGE,
         reader_options=reader,
         extraction_options=extraction,
-        device=cpu,
+        device=pycolmap.Device.cpu,
     )
+    if alike:
+        return
+    with pycolmap.Database.open(database) as written:
+        for name, own in zip(names, intrinsics, strict=True):
+            view = written.read_camera(written.read_image_with_name(name).camera_id)
+            view.params = own
+            written.update_camera(view)
+
+
+def _match(database: Path, seed: int, settings: FeatureSettings) -> None:
+    """Write the matches of all pairs into the database."""
+    import pycolmap
+
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = 1
     verification.ransac.random_seed = seed
     verification.ransac.max_error = settings.pair_error_px
-    pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification, device=cpu)
+    pycolmap.match_exhaustive(
+        database, matching_options=matching, verification_options=verification, device=pycolmap.Device.cpu
+    )
 
 
 def in_scene(
@@ -144,12 +165,12 @@ def in_scene(
     With fewer than two views nothing can be aligned: then it is `NOTHING`.
     """
     posed = {i.name: i for i in model.images.values() if i.has_pose}
-    camera = next(iter(model.cameras.values()))  # all views share it
     found = [k for k, name in enumerate(names) if name in posed]
     if len(found) < 2:
         return NOTHING
-    K = camera.calibration_matrix() / enlarge
-    estimated = [_camera(posed[names[k]], K, cameras[k]) for k in found]
+    intrinsics = {number: camera.calibration_matrix() / enlarge for number, camera in model.cameras.items()}
+    views = [posed[names[k]] for k in found]
+    estimated = [_camera(view, intrinsics[view.camera_id], cameras[k]) for view, k in zip(views, found, strict=True)]
     move = align_cameras(estimated, [cameras[k] for k in found])
     view = {posed[names[k]].image_id: k for k in found}
     points, values = [], []
@@ -191,8 +212,8 @@ def map_views(
 ) -> Mapping:
     """Return the structure from motion on one image of each training view [C, H, W], linear radiance.
 
-    All views have the intrinsics of the first of `cameras`; with `focal_prior`, in image widths, they are unknown and
-    one focal length is estimated. The same seed gives the same poses: everything runs in one thread. Where fewer than
+    Views have the intrinsics of their `cameras`; with `focal_prior`, in image widths, they are unknown and one focal
+    length for all is estimated. The same seed gives the same poses: everything runs in one thread. Where fewer than
     two views are registered, nothing can be aligned and the mapping is empty.
     """
     import pycolmap

@@ -40,6 +40,7 @@ class ToyWorld:
     travel: float = 0.25
     seed: int = 0
     lens: tuple[float, ...] = ()  # of every camera
+    spread: float = 0.0  # of the cameras' focal lengths, and of their principal points in image widths
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -51,11 +52,12 @@ class ToyWorld:
                     np.array([x, -3.0, 1.0 + z]),
                     np.array([0.0, 0.3, 0.7]),
                     np.array([0.0, 0.0, 1.0]),
-                    focal=1.2 * self.width,
+                    focal=1.2 * self.width * (1 + self.spread * (i % 4 - 1.5)),
                     width=self.width,
                     height=self.height,
                 ),
                 distortion=self.lens,
+                cx=self.width * (0.5 + self.spread * (i % 3 - 1)),
             )
             for i, (z, x) in enumerate((z, x) for z in offsets for x in offsets)
         )

@@ -46,6 +46,16 @@ def test_poses_of_all_views_are_found(mapping: Mapping) -> None:
     assert (first.fx, first.fy, first.cx, first.cy) == pytest.approx((true.fx, true.fy, true.cx, true.cy))
 
 
+def test_views_keep_the_intrinsics_that_each_has() -> None:
+    cameras = (world := ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1, spread=0.05)).training.cameras
+    found = map_views(cameras, clip_means(world.training), 0).cameras
+    summary = pose_errors(found, cameras).summary()
+    assert summary["rotation_max_deg"] < 0.5 and summary["translation_of_array"] < 0.05, summary
+    for a, true in zip(found, cameras, strict=True):
+        assert (a.fx, a.fy, a.cx, a.cy) == pytest.approx((true.fx, true.fy, true.cx, true.cy))
+    assert len({camera.fx for camera in found}) > 2
+
+
 def test_points_lie_on_the_surfaces_in_the_scenes_frame_with_their_gray_values(mapping: Mapping) -> None:
     assert len(mapping.points) == len(mapping.values) >= 50
     uv, z = WORLD.held_out.project(mapping.points)

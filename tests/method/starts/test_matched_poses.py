@@ -13,6 +13,7 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import PoseErrors, pose_errors
+from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.pose_refinement import rigid_motion
 from spike4dgs.method.starts.matched_poses import Pose, bundle
 from spike4dgs.method.starts.structure_from_motion import Mapping, clip_means
@@ -22,10 +23,10 @@ SCENE = WORLD.training
 SCALE = 3.7
 
 
-def begin(off_deg: float = 1.5, off_m: float = 0.02) -> list[Pose | None]:
+def begin(off_deg: float = 1.5, off_m: float = 0.02, scene: TrainingScene = SCENE) -> list[Pose | None]:
     """Poses in a frame of another scale, each turned and moved at random by so much."""
     rng, poses = np.random.default_rng(0), list[Pose | None]()
-    for camera in SCENE.cameras:
+    for camera in scene.cameras:
         steps = [rng.standard_normal(3) for _ in range(2)]
         turn, move = (s / np.linalg.norm(s) * off for s, off in zip(steps, (np.radians(off_deg), off_m), strict=True))
         w2c = rigid_motion(torch.from_numpy(np.concatenate([turn, move]))).numpy() @ camera.w2c
@@ -51,6 +52,14 @@ def test_poses_that_are_off_by_degrees_become_good_ones(found: Mapping) -> None:
     summary = errors(found).summary()
     assert summary["rotation_max_deg"] < 0.3 and summary["translation_of_array"] < 0.03, summary
     assert all(c.fx == true.fx for c, true in zip(found.cameras, SCENE.cameras, strict=True))
+
+
+def test_views_keep_the_intrinsics_that_each_has() -> None:
+    scene = ToyWorld(width=120, height=76, n_ticks=96, travel=0.1, seed=1, spread=0.05).training
+    found = bundle(scene, begin(scene=scene), clip_means(scene), 0).cameras
+    summary = pose_errors(found, scene.cameras).summary()
+    assert summary["rotation_max_deg"] < 0.3 and summary["translation_of_array"] < 0.03, summary
+    assert [c.fx for c in found] == pytest.approx([c.fx for c in scene.cameras])
 
 
 def test_points_lie_on_the_surfaces(found: Mapping) -> None:
