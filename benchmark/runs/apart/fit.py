@@ -194,11 +194,17 @@ class _Child:
 
 @contextmanager
 def _training_part(job: Job, work: Path) -> Iterator[Path]:
-    """Write the training part and remove it at the end. It is on the scene's disk, where its files are links."""
-    root, folder = job.scene.root.absolute(), work / "part"
+    """Write the training part and remove it at the end. It is on the scene's disk, where its files are links.
+
+    Each has a folder of its own: the process of a fit whose caller was killed may still be removing another.
+    """
+    root, own = job.scene.root.absolute(), uuid4().hex[:16]
+    for left in work.glob("part-*"):
+        shutil.rmtree(left, ignore_errors=True)
+    folder = work / f"part-{own}"
     other_disk = root.stat().st_dev != work.stat().st_dev
     if other_disk and os.access(root.parent, os.W_OK):
-        folder = root.parent / f".spike4dgs-fit-{uuid4().hex[:16]}"
+        folder = root.parent / f".spike4dgs-fit-{own}"
     given = getattr(job.method, "given", DEFAULT_GIVEN)
     try:
         yield write_nameless_part(job.scene, folder, given).root

@@ -24,7 +24,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, get_method
-from spike4dgs.benchmark.runs.apart.fit import Apart, fit_apart
+from spike4dgs.benchmark.runs.apart.fit import Apart, _training_part, fit_apart
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -148,7 +148,7 @@ def test_failures_come_back_as_from_this_process(small_scene: Path, tmp_path: Pa
     assert [r["scenes"] for r in apart[:3]] == [r["scenes"] for r in here]
     assert apart[3]["scenes"]["pattern-0"]["status"] == "ok"
     assert "ValueError: no luck" in (tmp_path / "apart/logs/value__pattern-0.log").read_text()
-    assert not list((tmp_path / "apart").glob("work/*/part"))
+    assert not list((tmp_path / "apart").glob("work/*/part-*"))
 
 
 @pytest.mark.parametrize(
@@ -217,13 +217,13 @@ def caller(out: Path, scene: Path, folder: Path) -> subprocess.Popen[bytes]:
 @pytest.mark.parametrize("how", ["kill", "interrupt"])
 def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path, tmp_path: Path, how: str) -> None:
     process = caller(tmp_path / "out", small_scene, tmp_path)
-    assert len(list(tmp_path.glob("out/work/*/part/scene.json"))) == 1
+    assert len(list(tmp_path.glob("out/work/*/part-*/scene.json"))) == 1
     if how == "kill":
         process.kill()
     else:
         os.killpg(process.pid, signal.SIGINT)
     assert process.wait(60) in (-signal.SIGKILL, 1, -signal.SIGINT)
-    wait_for(lambda: not list(tmp_path.glob("out/work/*/part")))
+    wait_for(lambda: not list(tmp_path.glob("out/work/*/part-*")))
     assert process.stderr is not None
     if how == "interrupt":
         text = process.stderr.read().decode()  # ends when no process holds the pipe
@@ -233,6 +233,16 @@ def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path
     waits = dummy_methods.WaitingMethod("waits", tmp_path)
     assert cell_of(run(tmp_path / "out", [small_scene], waits, **APART))["status"] == "ok"
     assert files_in(tmp_path / "out/work") == {}
+
+
+def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(small_scene: Path, tmp_path: Path) -> None:
+    job, work = Job(CountMethod(), open_scene(small_scene), 0, "cpu", Budget()), tmp_path / "work"
+    work.mkdir()
+    with _training_part(job, work) as killed, _training_part(job, work) as again:
+        assert not killed.exists(), "what killed fits left is removed"
+        shutil.rmtree(killed, ignore_errors=True)  # what its process does at its end
+        assert (again / "scene.json").is_file()
+    assert files_in(work) == {}
 
 
 def test_progress_and_notes_reach_the_caller(small_scene: Path, tmp_path: Path) -> None:
