@@ -79,23 +79,15 @@ def test_flow_and_depth_of_a_scene_carry_its_images_over(tiny_data):
 
 
 @pytest.mark.slow
-def test_mitsuba_scene_survives_sigkill_and_more_workers(whole, tmp_path):
-    """Killed among the key frames, then finished by two workers: the same bytes."""
-    work = tmp_path / ".work/car-0-tiny"
-    kill_when(start(tmp_path), "keys/0*.npz", work, 2)
-    assert not (tmp_path / "car-0-tiny").exists()
-    output, _ = (process := start(tmp_path, "--workers", "2")).communicate(timeout=300)
-    assert process.returncode == 0, output.decode()
-    found = files_in(tmp_path / "car-0-tiny")
-    assert found["manifest.json"] == whole["manifest.json"] and found == whole
-
-
-@pytest.mark.slow
-def test_a_cluster_makes_the_same_scene(whole, tmp_path):
+def test_a_scene_killed_on_two_workers_is_finished_by_a_cluster(whole, tmp_path):
+    """Killed among the key frames: the same bytes."""
     from distributed import LocalCluster
 
+    kill_when(start(tmp_path, "--workers", "2"), "keys/0*.npz", tmp_path / ".work/car-0-tiny", 2)
+    assert not (tmp_path / "car-0-tiny").exists()
     quiet = {"processes": True, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(**quiet, silence_logs=50) as cluster:
         output, _ = (process := start(tmp_path, "--scheduler", cluster.scheduler_address)).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
-    assert files_in(tmp_path / "car-0-tiny") == whole
+    found = files_in(tmp_path / "car-0-tiny")
+    assert found["manifest.json"] == whole["manifest.json"] and found == whole
