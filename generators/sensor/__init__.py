@@ -1,1 +1,1 @@
-"""The spike camera: simulator, fixed-pattern maps, calibration recordings, statistics."""
+"""The spike camera: simulator, fixed-pattern maps, calibration recordings."""

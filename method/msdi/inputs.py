@@ -48,12 +48,6 @@ def shrink(spikes: Tensor, factor: int) -> Tensor:
     return fired.reshape(*spikes.shape[:-2], *fired.shape[-2:])
 
 
-def shrink_intrinsics(intrinsics: Tensor, factor: int) -> Tensor:
-    """Return intrinsics [..., 3, 3] in blocks, which start at the corner of the first pixel, from those in pixels."""
-    scale = torch.tensor([1 / factor, 1 / factor, 1.0], dtype=intrinsics.dtype, device=intrinsics.device)
-    return intrinsics * scale[:, None]
-
-
 def _block_sums(x: Tensor, factor: int) -> Tensor:
     """Return the sums over blocks of [N, C, H, W], exact for whole numbers."""
     return functional.avg_pool2d(x, factor, divisor_override=1)
