@@ -129,15 +129,14 @@ def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, tmp_path:
 
 
 @pytest.fixture
-def outdated(tmp_path: Path) -> Iterator[Path]:
-    """The example package as it was written against the earlier protocol, installed."""
-    source, target = shutil.copytree(EXAMPLES / "external_method", tmp_path / "source"), tmp_path / "site"
-    module = source / "plane_blend.py"
+def outdated(installed: Path, tmp_path: Path) -> Iterator[Path]:
+    """The installed example package as it was written against the earlier protocol."""
+    target = Path(shutil.copytree(installed, tmp_path / "site", ignore=shutil.ignore_patterns("__pycache__")))
+    module = target / "plane_blend.py"
     text = module.read_text()
     earlier = text.replace("(self, scene, request)", "(self, scene, budget, device, seed, progress, checkpoint=None)")
     module.write_text(earlier.replace("request.progress(", "progress("))
     assert module.read_text() != text
-    install(source, target)
     loaded = sys.modules.pop("plane_blend", None)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(target))
