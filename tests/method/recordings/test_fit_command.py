@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -84,10 +85,13 @@ def fitted(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.fixture(autouse=True)
-def _short_videos(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tenth of the frames, but in `fitted`: rendering and packing them takes longer than a fit."""
-    monkeypatch.setattr(fit_module, "FPS", 3.0)
+@pytest.fixture(scope="module", autouse=True)
+def _short_videos() -> Iterator[None]:
+    """A tenth of the frames: rendering and packing them takes longer than a fit."""
+    assert fit_module.FPS == 30
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "FPS", 3.0)
+        yield
 
 
 def tensors(out: Path) -> dict[str, torch.Tensor]:
@@ -106,7 +110,7 @@ def test_a_fit_leaves_a_model_a_sheet_a_video_and_a_report(fitted: Path) -> None
     with Image.open(fitted / SHEET) as sheet:
         assert sheet.width > 1000 and len(set(sheet.convert("L").getdata())) > 100
     video = cv2.VideoCapture(str(fitted / VIDEO))
-    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 300
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 30
     ok, frame = video.read()
     assert ok and frame.shape == (120, 192, 3) and frame.std() > 10
 

@@ -7,23 +7,28 @@ from spike4dgs.studies.kit.measurement import Request
 from spike4dgs.studies.speed_error import rendering
 from spike4dgs.studies.speed_error.rendering import soft_light, split_light
 
+REQUEST = Request("tiny", 0, lambda: pytest.fail("no scene is needed"))
+
+
+@pytest.fixture(autouse=True)
+def _one_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the size whose times are of one image each."""
+    monkeypatch.setitem(rendering.OF_SIZE, "tiny", ("car",))
+
 
 @pytest.mark.slow
 def test_light_as_a_ratio_is_nearer_to_the_traced_light_than_none() -> None:
-    request = Request("quick", 0, lambda: pytest.fail("no scene is needed"))
-    for series in soft_light.run(request):
+    for series in soft_light.run(REQUEST):
         exact, chosen, without = series.points
         assert [p.role for p in series.points] == ["exact", "chosen", ""] and exact.values["all"] == 0
         assert chosen.values["soft"] < without.values["soft"], series.name
 
 
 @pytest.mark.slow
-def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_of_soft_light_have_less_noise_than_paths_and_the_same_light() -> None:
     if load_mitsuba().variant().startswith("scalar"):
         pytest.skip("maps need a variant that compiles kernels")
-    monkeypatch.setitem(rendering.OF_SIZE, "tiny", ("car",))  # its times are of one image each
-    request = Request("tiny", 0, lambda: pytest.fail("no scene is needed"))
-    for series in split_light.run(request):
+    for series in split_light.run(REQUEST):
         paths, exact, maps, truth = series.points
         assert [p.role for p in series.points] == ["", "exact", "chosen", ""] and exact.values["paths"] is None
         for key in ("noise", "object"):
