@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -53,46 +53,44 @@ def name_of(path: Path) -> str:
 MODULES = {name_of(path): path for path in SOURCES}
 
 
-def imported(source: str, package: str, strings: bool = True) -> Iterator[tuple[int, str]]:
-    """Yield (line, module) of every import at any depth, and with `strings` of every string that names our modules."""
-    tree = ast.parse(source)
-    docstrings = {
-        id(node.body[0].value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and node.body
-        and isinstance(node.body[0], ast.Expr)
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+@cache
+def imported(source: str, package: str) -> list[tuple[int, str, bool]]:
+    """Return (line, module, is a string) of every import at any depth, and of every string that names our modules."""
+    found: list[tuple[int, str, bool]] = []
+    docstrings = set()
+    for node in ast.walk(ast.parse(source)):  # parents come first
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            if node.body and isinstance(node.body[0], ast.Expr):
+                docstrings.add(id(node.body[0].value))
+        elif isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name, False) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             parts = package.split(".")
             base = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
             module = ".".join(filter(None, (base, node.module)))
-            yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
-        elif strings and isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            found += [(node.lineno, f"{module}.{alias.name}", False) for alias in node.names]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             if re.fullmatch(r"spike4dgs(\.\w+)+(:\w+)?", node.value):
-                yield node.lineno, node.value
+                found.append((node.lineno, node.value, True))
+    return found
 
 
 def violations(source: str, package: str) -> list[tuple[int, str]]:
     """Return the imports that the room of `package` may not make, and the strings that name another room."""
-    room = package.split(".")[1]
-    statements = set(imported(source, package, strings=False))
-    ours = [
-        (found, found[1].split("."), MAY_IMPORT[room] | {room} if found in statements else {room})
-        for found in imported(source, package)
-        if found[1].split(".")[0] in ("spike4dgs", "tests")
-    ]
-    return [
-        found
-        for found, parts, allowed in ours
-        if parts[0] == "tests"
-        or len(parts) < 2
-        or parts[1].split(":")[0] in MAY_IMPORT.keys() - allowed
-        or (found in statements and parts[1] not in MAY_IMPORT)  # a name of the front
-    ]
+    room, wrong = package.split(".")[1], []
+    for line, name, is_string in imported(source, package):
+        top, *rest = name.split(".")
+        allowed = {room} if is_string else MAY_IMPORT[room] | {room}
+        if top == "tests" or (
+            top == "spike4dgs"
+            and (
+                not rest
+                or rest[0].split(":")[0] in MAY_IMPORT.keys() - allowed
+                or (not is_string and rest[0] not in MAY_IMPORT)  # a name of the front
+            )
+        ):
+            wrong.append((line, name))
+    return wrong
 
 
 def package_of(path: Path) -> str:
@@ -133,8 +131,9 @@ def test_the_check_itself_catches_what_it_should(source: str, package: str, caug
 def imports_of(module: str) -> set[str]:
     """Return our modules that a module imports, by their names in MODULES. Strings do not count here."""
     path = MODULES[module]
-    statements = imported(path.read_text(encoding="utf-8"), package_of(path), strings=False)
-    ours = [name.removeprefix("spike4dgs.").split(".") for _, name in statements if name.startswith("spike4dgs.")]
+    found = imported(path.read_text(encoding="utf-8"), package_of(path))
+    names = [name for _, name, is_string in found if not is_string and name.startswith("spike4dgs.")]
+    ours = [name.removeprefix("spike4dgs.").split(".") for name in names]
     prefixes = ([".".join(parts[:n]) for n in range(len(parts), 0, -1)] for parts in ours)
     return {next(name for name in longest_first if name in MODULES) for longest_first in prefixes}
 
