@@ -27,6 +27,12 @@ def small_scene(tmp_path: Path) -> Path:
     return write_small_scene(tmp_path / "scene")
 
 
+@pytest.fixture
+def no_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No sheets, videos and scatter of `run-benchmark`, which take four fifths of the time of a small run."""
+    monkeypatch.setattr("spike4dgs.benchmark.reports.benchmark._write_images", lambda *_: [])
+
+
 @pytest.fixture(scope="session")
 def one_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     with browser(tmp_path_factory.mktemp("profile")) as page:

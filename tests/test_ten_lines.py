@@ -20,11 +20,12 @@ def test_there_are_at_most_ten() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_images")
 def test_they_give_what_they_say(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the scene of `make-dataset car --profile tiny` and a model of `run-benchmark`, fitted with a few steps."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data").symlink_to(tiny_data)
-    fit = ["--methods", "tfp+static", "--budget", "0.01", "--metrics", "psnr", "--device", "cpu"]
+    fit = ["--methods", "tfp+static", "--budget", "0.01", "--metrics", "psnr", "--device", "cpu", "--in-process"]
     assert main(["run-benchmark", "data/car-0-tiny", *fit, "--out", "runs/tiny"]) == 0
     block = TEXT.removeprefix("```python\n").removesuffix("```\n")
     test = doctest.DocTestParser().get_doctest(block, {}, "ten_lines", "docs/snippets/ten_lines.md", 0)

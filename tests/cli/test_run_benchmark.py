@@ -39,12 +39,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
 
 
-@pytest.fixture
-def no_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without sheets, their videos and the scatter, which take four fifths of the time of such a run."""
-    monkeypatch.setattr(benchmark, "_write_images", lambda *_: [])
-
-
 @pytest.mark.usefixtures("installed")
 def test_run_benchmark_leaves_results_images_and_entries(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

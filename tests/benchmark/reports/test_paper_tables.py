@@ -272,6 +272,7 @@ def seen_as(scene: Scene, split: str) -> Scene:
     )
 
 
+@pytest.mark.usefixtures("no_images")
 def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,6 +66,7 @@ def test_the_method_is_found_through_its_entry_point(installed: Path) -> None:
     assert set(METHODS) <= set(methods), "beside those of this distribution"
 
 
+@pytest.mark.usefixtures("no_images")
 def test_it_is_fitted_scored_and_ranked_beside_others(installed: Path, scene: Scene, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = [str(scene.root), "--methods", "plane-blend", "nearest-view", "--out", str(out)]

@@ -61,12 +61,14 @@ def test_an_emulated_capture_is_the_scene_bit_by_bit(scene, tmp_path, capsys, ho
     assert out.index("armed") < out.index("triggered") < out.index("closed") < out.index("80 ticks of 4 cameras")
 
 
+@pytest.mark.usefixtures("no_images")
 def test_a_benchmark_on_the_capture_gives_the_scores_of_the_scene(scene, tmp_path):
     assert record("--emulate", scene, "--out", tmp_path / "pattern-0") == 0  # named as the scene is
     scores = []
     for folder in (scene, tmp_path / "pattern-0"):
         out = tmp_path / f"runs-{len(scores)}"
-        assert main(["run-benchmark", str(folder), "--methods", "nearest-view", "--out", str(out)]) == 0
+        method = ["--methods", "nearest-view", "--in-process"]
+        assert main(["run-benchmark", str(folder), *method, "--out", str(out)]) == 0
         cell = json.loads((out / "results" / "nearest-view.json").read_text())["scenes"]["pattern-0"]
         scores.append((cell["metrics"], cell["per_image"], cell["predictions_sha256"]))
     assert scores[0][0]["psnr"] > 15 and len(scores[0][1]) == 3
