@@ -1,7 +1,8 @@
 """`report tuning`: one search for every row over the same knobs, on scenes that no table has.
 
-OUT/ROW.json keeps a row's trials; a killed search goes on from them. OUT/tuning.md compares, OUT/ROW.csv lists. With
-`--write` a checkout gets the best settings as rows X.tuned (`tuned.json` beside the recipes), the table and the trials.
+OUT/ROW.json keeps a row's trials; a killed search goes on from them. OUT/tuning.md compares, OUT/ROW@STEPS.csv lists.
+With `--write` a checkout gets the best settings as rows X.tuned (`tuned.json` beside the recipes), the table and the
+trials.
 
 The first trial is the recipe as it is, so that the same fits measure what the search gains. Optuna's tree of Parzen
 estimators proposes the others; a trial ends after a scene at which it lies below the median of the earlier ones. Fits
@@ -215,17 +216,19 @@ def _recipe(name: str) -> RecipeMethod:
 
 
 def write_results(out: Path) -> None:
-    """Write OUT/tuning.md, what each search in OUT found, and its trials as OUT/ROW.csv."""
+    """Write OUT/tuning.md, what each search in OUT found, and its trials as OUT/ROW@STEPS.csv."""
     columns = ("row", "steps", "as it is: whole / moving, dB", "best: whole / moving, dB", "trials", "hours", "changed")
     rows = []
     for record in _records(out):
         done = record["trials"]
         first, best = done[0], best_of(done, len(record["scenes"]))
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
-        cells = (str(record["budget"]), _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
+        cells = (f"{record['budget']:g}", _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
         rows.append((f"`{record['row']}`", *cells))
         heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
-        write_csv(out / f"{record['row']}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
+        write_csv(
+            out / f"{record['row']}@{record['budget']:g}.csv", heads, [_line(trial, record["scenes"]) for trial in done]
+        )
     write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
 
 
@@ -238,7 +241,7 @@ def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
 def publish(out: Path, root: Path) -> None:
     """Write the best settings of the searches in OUT into a checkout, and the table and the trials into its docs.
 
-    What the page has of other rows stays.
+    What the page has of other rows, and of the same rows at other numbers of steps, stays.
     """
     for folder, rows in (
         ("method", ours.RECIPES),
@@ -254,8 +257,8 @@ def publish(out: Path, root: Path) -> None:
     text = page.read_text(encoding="utf-8")
     here = [line for block in pattern("searches").finditer(text) for line in block[0].splitlines() if line[:3] == "| `"]
     head, rule, *new = (out / "tuning.md").read_text(encoding="utf-8").splitlines()
-    lines = {line.split("`")[1]: line for line in [*here, *new]}
-    rows = [lines[row] for row in sorted(lines)]
+    lines = {tuple(line.split(" | ")[:2]): line for line in [*here, *new]}
+    rows = [lines[key] for key in sorted(lines)]
     block = "\n".join(["<!-- searches -->", head, rule, *rows, "<!-- end searches -->"])
     write_text(page, pattern("searches").sub(lambda _: block, text))
     for path in sorted(out.glob("*.csv")):

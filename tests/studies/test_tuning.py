@@ -136,8 +136,8 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
         (tmp_path / folder / "tuned.json").write_text("{}")
     page = tmp_path / "docs" / "results" / "tuning.md"
     page.parent.mkdir(parents=True)
-    kept = "| `spike4dgs` | quick | of another search |"
-    old = "\n".join(["| row |", "| --- |", "| `tfp+stg` | old |", kept])
+    kept = "| `tfp+stg` | 1 | of another search |"
+    old = "\n".join(["| row |", "| --- |", "| `tfp+stg` | 0.25 | old |", kept])
     page.write_text(f"before\n<!-- searches -->\n{old}\n<!-- end searches -->\nafter\n")
     write_results(out)
     publish(out, tmp_path)
@@ -148,8 +148,8 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
     assert row.settings["trainer.lr_means"] == pytest.approx(1.6e-4 * best["knobs"]["rates"])
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    assert text.index(kept) < text.index("| `tfp+stg` | 0.25 |") and text.count("\n| ") == 4
-    assert (page.parent / "tables" / "tuning" / "tfp+stg.csv").read_text().count("\n") == TRIALS + 1
+    assert text.index("| `tfp+stg` | 0.25 |") < text.index(kept) and text.count("\n| ") == 4
+    assert (page.parent / "tables" / "tuning" / "tfp+stg@0.25.csv").read_text().count("\n") == TRIALS + 1
 
 
 def test_scenes_of_tables_are_refused(small_scene):
