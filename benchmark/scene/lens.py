@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,18 +58,46 @@ def fold_radius(lens: Distortion) -> float:
 def distort(xy: Float64, lens: Distortion) -> Float64:
     """Return the lens's coordinates [..., 2] of a pinhole's [..., 2]; NaN beyond the fold."""
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, p1, p2, k3 = lens
     with np.errstate(over="ignore", invalid="ignore"):
+        bent = np.stack(bend(x, y, lens), axis=-1)
         s = x * x + y * y
-        radial = 1 + s * (k1 + s * (k2 + s * k3))
-        bent = np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
-                y * radial + 2 * p2 * x * y + p1 * (s + 2 * y * y),
-            ],
-            axis=-1,
-        )
     return np.where((s < fold_radius(lens) ** 2)[..., None], bent, np.nan)
+
+
+# The three below are arithmetic alone: on arrays, on tensors, and on numbers in kernels that are compiled.
+
+
+def bend(x: Any, y: Any, lens: Any) -> tuple[Any, Any]:
+    """Return x', y' of the module's text, beyond the fold too. `lens`: the five coefficients."""
+    k1, k2, p1, p2, k3 = lens
+    s = x * x + y * y
+    radial = 1 + s * (k1 + s * (k2 + s * k3))
+    return x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + 2 * p2 * x * y + p1 * (s + 2 * y * y)
+
+
+def slopes(x: Any, y: Any, lens: Any) -> tuple[Any, Any, Any]:
+    """Return the derivatives of `bend`: dx'/dx, dx'/dy = dy'/dx, dy'/dy."""
+    k1, k2, p1, p2, k3 = lens
+    s = x * x + y * y
+    radial = 1 + s * (k1 + s * (k2 + s * k3))
+    slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))  # d radial / dx = slope x
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return xx, xy, yy
+
+
+def curvatures(x: Any, y: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the derivatives of `slopes`: d xx/dx, d xx/dy = d xy/dx, d xy/dy = d yy/dx, d yy/dy."""
+    k1, k2, p1, p2, k3 = lens
+    s = x * x + y * y
+    slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
+    bow = 8 * (k2 + 3 * s * k3)  # d slope / dx = bow x
+    xxx = 3 * slope * x + bow * x * x * x + 6 * p2
+    xxy = slope * y + bow * x * x * y + 2 * p1
+    xyy = slope * x + bow * x * y * y + 2 * p2
+    yyy = 3 * slope * y + bow * y * y * y + 6 * p1
+    return xxx, xxy, xyy, yyy
 
 
 def undistort(xy: Float64, lens: Distortion) -> Float64:
@@ -108,14 +136,7 @@ def _within(xy: Float64, limit: float) -> Float64:
 
 def _newton_step(xy: Float64, missing: Float64, lens: Distortion) -> Float64:
     """Return J^-1 missing [..., 2] with the derivatives J of `distort`, which are symmetric."""
-    x, y = xy[..., 0], xy[..., 1]
-    k1, k2, p1, p2, k3 = lens
-    s = x * x + y * y
-    radial = 1 + s * (k1 + s * (k2 + s * k3))
-    slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))  # d radial / dx = slope x
-    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    xy_ = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    xx, xy_, yy = slopes(xy[..., 0], xy[..., 1], lens)
     a, b = missing[..., 0], missing[..., 1]
     return np.stack([yy * a - xy_ * b, xx * b - xy_ * a], axis=-1) / (xx * yy - xy_ * xy_)[..., None]
 

@@ -41,11 +41,10 @@ class Background:
         if splats.means.device.type != "cpu":
             self._on_device = self._on_device or make_layer(self.splats, self.views, self.pixel_filter)
             return render_over(self._on_device, splats, chosen)
-        index = list(chosen)
-        views = Views(self.views.w2c[index], self.views.K[index], self.views.width, self.views.height)
+        views = self.views.some(chosen)
         settings = cpu.Settings(views.width, views.height, self.pixel_filter, depth=False)
         self._layer = self._layer or _make_layer(self.splats, self.views, settings)
-        layer = self._layer._replace(chosen=np.array(index))
+        layer = self._layer._replace(chosen=np.array(list(chosen)))
         return cpu.rasterize(Splats(*splats.geometry, splats.colors.float()), views, settings, torch.float32, layer)
 
 
@@ -63,7 +62,8 @@ class Repeated:
 
     def in_view(self, view: Views) -> Background | None:
         """Return the background in a single view, or None where it was not rendered lately."""
-        key = b"".join(t.cpu().numpy().tobytes() for t in (view.w2c, view.K)) + f"{view.width}x{view.height}".encode()
+        tensors = [t for t in (view.w2c, view.K, view.lenses) if t is not None]
+        key = b"".join(t.cpu().numpy().tobytes() for t in tensors) + f"{view.width}x{view.height}".encode()
         again, kept = key in self._kept, self._kept.pop(key, None)
         if again and kept is None:
             kept = Background(self.splats, view, self.pixel_filter)
@@ -81,7 +81,7 @@ def join(a: Splats, b: Splats) -> Splats:
 def _make_layer(splats: Splats, views: Views, s: cpu.Settings) -> Layer:
     """Render the background once into all views, and keep its lists."""
     geometry = Geometry(*(t.float().contiguous().numpy() for t in splats.geometry))
-    cameras = s.cameras(cpu.camera_entries(views.w2c, views.K))
+    cameras = s.cameras(views.w2c, views.K, views.lenses)
     sides = len(views), len(splats)
     colors = cpu.pack_colors(splats.colors.float().numpy(), None)
     p = cpu.project_views(geometry, cameras, s, np.empty((*sides, 2), np.float32), np.empty(sides, np.float32))

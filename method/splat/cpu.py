@@ -54,10 +54,12 @@ class Settings:
         """Tiles across and down the image."""
         return -(-self.width // TILE_WIDTH), -(-self.height // TILE_HEIGHT)
 
-    def cameras(self, entries: Array) -> Cameras:
-        """Return the kernels' cameras from their entries [V, 16], see `camera_entries`."""
-        f = self.pixel_filter
-        return Cameras(entries, self.width, self.height, f.variance, f.compensated)
+    def cameras(self, w2c: Tensor, K: Tensor, lenses: Tensor | None) -> Cameras:
+        """Return the kernels' cameras from [V, 4, 4], [V, 3, 3] and the lenses [V, 10] if there are any."""
+        pose, k, f = w2c.detach().double().numpy(), K.detach().double().numpy(), self.pixel_filter
+        entries = [pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3], k[:, [0, 1, 0, 1], [0, 1, 2, 2]]]
+        rows = np.empty((0, 10)) if lenses is None else lenses.detach().double().contiguous().numpy()
+        return Cameras(np.concatenate(entries, axis=1), rows, self.width, self.height, f.variance, f.compensated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +105,6 @@ def _new_memory() -> tuple[Array, ...]:
     lanes = np.empty(project_kernels.BLOCK, np.int64)
     digits = np.empty(1024, np.int32)
     return np.empty(rows), lanes, aligned((planes,), np.float32), *block_list, *runs, digits
-
-
-def camera_entries(w2c: Tensor, K: Tensor) -> Array:
-    """Return cameras as the kernels take them, [V, 16]: R row by row, t, fx, fy, cx, cy; from [V, 4, 4], [V, 3, 3]."""
-    pose, k = w2c.detach().double().numpy(), K.detach().double().numpy()
-    return np.concatenate([pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3], k[:, [0, 1, 0, 1], [0, 1, 2, 2]]], axis=1)
 
 
 def chunking(channels: int) -> tuple[int, int]:
@@ -214,10 +210,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, w2c: Tensor,
-        probe: Tensor, K: Tensor, settings: Settings, layer: Layer, radii: Tensor,
+        probe: Tensor, K: Tensor, lenses: Tensor | None, settings: Settings, layer: Layer, radii: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         geometry = Geometry(*(t.detach().contiguous().numpy() for t in (means, quats, scales, opacities)))
-        cameras, layers = settings.cameras(camera_entries(w2c, K)), colors.shape[1] + settings.depth
+        cameras, layers = settings.cameras(w2c, K, lenses), colors.shape[1] + settings.depth
         p = project_views(geometry, cameras, settings, probe.detach().numpy(), radii.numpy())
         packed = pack_colors(colors.detach().numpy(), p.depths if settings.depth else None)
         frames = composite(p, packed, chunking(layers)[0], layer, settings)
@@ -240,7 +236,7 @@ class _Rasterize(torch.autograd.Function):
             d_w2c = torch.zeros(len(poses), 4, 4, dtype=ctx.pose_dtype)
             d_w2c[:, :3] = torch.from_numpy(np.stack([pose.sum(0) for pose in total.poses])).reshape(-1, 3, 4)
         own = (means, quats, scales, opacities, colors.to(ctx.colors_dtype), d_w2c, centers)
-        return (*own, None, None, None, None)
+        return (*own, None, None, None, None, None)
 
 
 def render_cpu(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
@@ -258,7 +254,8 @@ def rasterize(splats: Splats, views: Views, settings: Settings, dtype: torch.dty
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in (*splats.tensors, views.w2c))
     means2d = torch.zeros(len(views), len(splats), 2, dtype=dtype, requires_grad=wanted)
     radii = torch.zeros(len(views), len(splats))
-    layers, alpha = _Rasterize.apply(*geometry, splats.colors, views.w2c, means2d, views.K, settings, layer, radii)
+    cameras = views.w2c, means2d, views.K, views.lenses
+    layers, alpha = _Rasterize.apply(*geometry, splats.colors, *cameras, settings, layer, radii)
     layers = layers.permute(0, 2, 3, 1)
     image, far = (layers[..., :-1], layers[..., -1]) if settings.depth else (layers, None)
     return RenderOutput(image, alpha, far, radii, means2d)

@@ -2,8 +2,9 @@
 
 It defines the semantics that the other back ends are tested against (those of gsplat 1.5):
 
-    p = R m + t,  culled where p_z < NEAR
+    p = R m + t,  culled where p_z < NEAR, and where a lens shows nothing
     S2 = J R S R^T J^T + eps2d I,  J the projection's Jacobian at p, at most 0.3 half images outside the image
+        with a lens J = diag(f) D [[1, 0, -u], [0, 1, -v]] / p_z,  D its derivatives at (u, v) = (p_x, p_y) / p_z
     alpha = min(0.999, o exp(-d^T S2^-1 d / 2)),  skipped where below 1/255
     compensated: o *= sqrt(|S2 - eps2d I| / |S2|)
     front to back by float32 depth, ties by index:  C += T alpha c,  T *= 1 - alpha,  until T would fall to 1e-4
@@ -18,11 +19,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from spike4dgs.method.splat.lens import FRUSTUM_MARGIN, bent, bent_slopes
 from spike4dgs.method.splat.types import (
     ALPHA_MAX,
     ALPHA_MIN,
     CUSTOMARY,
-    FRUSTUM_MARGIN,
     NEAR,
     T_MIN,
     PixelFilter,
@@ -57,8 +58,15 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def project(splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], pixel_filter: PixelFilter) -> Projection:
-    """Project float64 Gaussians into one view of size (width, height)."""
+def project(
+    splats: Splats,
+    w2c: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    pixel_filter: PixelFilter,
+    lens: Tensor | None = None,
+) -> Projection:
+    """Project float64 Gaussians into one view of size (width, height), through a lens [10] where it has one."""
     eps2d, antialiased = pixel_filter.variance, pixel_filter.compensated
     p = splats.means @ w2c[:3, :3].T + w2c[:3, 3]  # [N, 3]
     index = torch.nonzero((p[:, 2] >= NEAR) & (splats.quats.square().sum(-1) > 0))[:, 0]
@@ -67,17 +75,25 @@ def project(splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], pixel
     z = p[:, 2:]
     slope = p[:, :2] / z  # [M, 2] tangent of the viewing angle
     image = torch.tensor(size, dtype=p.dtype)
-    margin = FRUSTUM_MARGIN * 0.5 * image / f
-    inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
-    J = torch.cat([torch.diag_embed(f / z), (-f * inside / z)[:, :, None]], -1)  # [M, 2, 3]
+    if lens is None:
+        margin = FRUSTUM_MARGIN * 0.5 * image / f
+        inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
+        J = torch.cat([torch.diag_embed(f / z), (-f * inside / z)[:, :, None]], -1)  # [M, 2, 3]
+        shown, center = torch.ones_like(z[:, 0], dtype=torch.bool), f * slope + c
+    else:
+        inside = torch.minimum(torch.maximum(slope, lens[[5, 7]]), lens[[6, 8]])
+        flat = torch.cat([torch.diag_embed(1 / z.expand(-1, 2)), (-inside / z)[:, :, None]], -1)
+        J = f[:, None] * bent_slopes(inside, lens) @ flat
+        lying, shown = bent(slope, lens)
+        center = f * lying + c
     half = J @ w2c[:3, :3] @ (rotation_matrices(splats.quats[index]) * splats.scales[index, None, :])
     cov = half @ half.transpose(1, 2)  # [M, 2, 2]
     # The determinant as a sum of squares (Cauchy-Binet): xx * yy - xy^2 would cancel for needles.
     det_sharp = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
     xx, xy, yy = cov[:, 0, 0] + eps2d, cov[:, 0, 1], cov[:, 1, 1] + eps2d
     det = det_sharp + eps2d * (cov[:, 0, 0] + cov[:, 1, 1]) + eps2d**2
-    opacity, center = splats.opacities[index], f * slope + c
-    keep = (opacity >= ALPHA_MIN) & (det > 0)
+    opacity = splats.opacities[index]
+    keep = (opacity >= ALPHA_MIN) & (det > 0) & shown
     if antialiased:
         keep &= opacity * (det_sharp / det).detach().sqrt() >= ALPHA_MIN
     reach = 2 * (255 * opacity.detach() * ((det_sharp / det).detach().sqrt() if antialiased else 1)).clamp(min=1).log()
@@ -91,6 +107,13 @@ def project(splats: Splats, w2c: Tensor, K: Tensor, size: tuple[int, int], pixel
         opacity = opacity[keep]
     cov3 = torch.stack([xx, xy, yy], -1)[keep]
     return Projection(index[keep], center[keep], cov3, det[keep], opacity, p[keep, 2], extent[keep].amax(-1))
+
+
+def project_view(splats: Splats, views: Views, view: int, pixel_filter: PixelFilter) -> Projection:
+    """Project float64 Gaussians into one of some views."""
+    lens = None if views.lenses is None else views.lenses[view].double()
+    size = views.width, views.height
+    return project(splats, views.w2c[view].double(), views.K[view].double(), size, pixel_filter, lens)
 
 
 def alphas(view: Projection, center: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -139,8 +162,7 @@ def render_reference(splats: Splats, views: Views, pixel_filter: PixelFilter, de
     require_finite(splats)
     dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
     wide = Splats(*(t.double() for t in splats.tensors))
-    w2c, K = views.w2c.double(), views.K.double()
-    seen = [project(wide, w2c[c], K[c], size, pixel_filter) for c in range(len(views))]
+    seen = [project_view(wide, views, c, pixel_filter) for c in range(len(views))]
     blank = torch.zeros(n, 2, dtype=torch.float64)
     means2d = torch.stack([blank.index_copy(0, s.index, s.center) for s in seen])
     if means2d.requires_grad:
@@ -168,7 +190,7 @@ def cutoff_margin(splats: Splats, views: Views, pixel_filter: PixelFilter = CUST
     wide = Splats(*(t.double() for t in splats.tensors))
     out = torch.full((len(views), views.height, views.width), torch.inf, dtype=torch.float64)
     for c in range(len(views)):
-        s = project(wide, views.w2c[c].double(), views.K[c].double(), size, pixel_filter)
+        s = project_view(wide, views, c, pixel_filter)
         if not len(s.index):
             continue
         raw, live = alphas(s, s.center, size)

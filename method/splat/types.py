@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.splat.lens import lens_rows
 
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian fainter than this at a pixel is skipped there
 ALPHA_MAX = 0.999  # no Gaussian is more opaque than this, so that T never becomes 0
 T_MIN = 1e-4  # a pixel is finished before the Gaussian that would bring T down to this
-FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
 
 NEAR = 0.01  # Gaussians whose centre is nearer than this (in world units) are not rendered
 EPS2D = 0.3  # variance of the customary pixel filter, px^2
@@ -81,17 +81,20 @@ class Splats:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """C pinhole cameras of one image size: OpenCV world-to-camera poses, pixel centres at +0.5."""
+    """C cameras of one image size: OpenCV world-to-camera poses, pixel centres at +0.5."""
 
     w2c: Tensor  # [C, 4, 4]
     K: Tensor  # [C, 3, 3]
     width: int
     height: int
+    lenses: Tensor | None = None  # [C, 10], see lens.py; None: pinholes
 
     def __post_init__(self) -> None:
         n = self.w2c.shape[0] if self.w2c.ndim else 0
-        for name, shape in (("w2c", (n, 4, 4)), ("K", (n, 3, 3))):
-            found = tuple(getattr(self, name).shape)
+        for name, shape in (("w2c", (n, 4, 4)), ("K", (n, 3, 3)), ("lenses", (n, 10))):
+            if (value := getattr(self, name)) is None:
+                continue
+            found = tuple(value.shape)
             if found != shape or n == 0:
                 raise problem(
                     f"Views.{name}", f"shape {shape} with at least one camera", str(found), "stack the cameras"
@@ -108,16 +111,28 @@ class Views:
     def from_cameras(
         cls, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
     ) -> Views:
-        """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp."""
-        if bent := [c.id for c in cameras if c.distortion]:
-            fix = "render pinholes and resample them, see `method.training_views.pinholes`"
-            raise problem("cameras", "pinholes", f"lens distortion of {', '.join(bent)}", fix)
+        """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp.
+
+        Raises UserError for cameras of several sizes, and for a lens whose model does not hold up to the corners.
+        """
         sizes = sorted({(c.width, c.height) for c in cameras})
         if len(sizes) != 1:
             raise problem("cameras", "one image size", f"{sizes}", "render the cameras of each size on their own")
         w2c = torch.stack([torch.as_tensor(c.w2c, dtype=dtype) for c in cameras]).to(device)
         K = torch.stack([torch.as_tensor(c.K, dtype=dtype) for c in cameras]).to(device)
-        return cls(w2c, K, *sizes[0])
+        return cls(w2c, K, *sizes[0], lens_rows(cameras, device, dtype))
+
+    def some(self, chosen: Sequence[int]) -> Views:
+        """Return some of the views, in the order of `chosen`."""
+        # Not w2c[list(chosen)]: that list would be copied to a device, which waits.
+        w2c, K = (torch.stack([matrices[view] for view in chosen]) for matrices in (self.w2c, self.K))
+        lenses = None if self.lenses is None else torch.stack([self.lenses[view] for view in chosen])
+        return replace(self, w2c=w2c, K=K, lenses=lenses)
+
+    def to(self, device: torch.device | str) -> Views:
+        """Return the same views on a device."""
+        lenses = None if self.lenses is None else self.lenses.to(device)
+        return replace(self, w2c=self.w2c.to(device), K=self.K.to(device), lenses=lenses)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numba.cuda.simulator import kernel
 from splat_parity import compare
-from splat_scenes import HARD, HEIGHT, WIDTH, random_splats, views
+from splat_scenes import HARD, HEIGHT, LENSES, WIDTH, changed, random_splats, through, views
 
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.cuda.background import make_layer, render_over
@@ -108,11 +108,24 @@ def random_case(seed: int, channels: int, depth: bool, antialiased: bool) -> Cal
     )
 
 
+def lens_case(lens: tuple[float, ...]) -> Callable[[], None]:
+    """Return the comparison of random Gaussians, in the image and far beyond it, through a lens."""
+
+    def compared() -> None:
+        s, v = small(random_splats(24, 1, seed=33), views(1))
+        aside = torch.where(torch.arange(24) % 3 > 0, 1.0, 4.0)[:, None] ** torch.tensor([1.0, 1.0, 0.0])
+        wide = changed(s, means=s.means * aside, scales=s.scales * aside[:, :1])
+        compare(wide, through(v, lens), "cuda", depth=True, antialiased=True)
+
+    return compared
+
+
 CASES: dict[str, Callable[[], None]] = {
     **{f.__name__: (lambda f=f: compare(*small(*f()), "cuda")) for f in HARD},
     "one channel": random_case(1, 1, False, False),
     "three channels with depth": random_case(2, 3, True, True),
     "five channels": random_case(3, 5, False, False),
+    **{name: lens_case(lens) for name, lens in LENSES.items()},
     "behind and over": behind_and_over,
     "same bits": same_bits,
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ def differentiate(
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
     """Render and pull back a fixed random cotangent of every output; keep [C, H, W] masks pixels on a cut-off."""
     leaves = [t.detach().to(device, copy=True).requires_grad_() for t in (*splats.tensors, v.w2c)]
-    seen = Views(leaves[5], v.K, v.width, v.height)
+    seen = replace(v, w2c=leaves[5])
     f = PixelFilter(compensated=compensated)
     out = render(Splats(*leaves[:5]), seen, f, backend=backend, depth=depth)  # type: ignore[arg-type]
     g = torch.Generator().manual_seed(0)

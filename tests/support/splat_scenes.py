@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.splat import Splats, Views
 
 WIDTH, HEIGHT, FOCAL = 100, 70, 100.0
@@ -36,6 +39,20 @@ def views(count: int = 2) -> Views:
         w2c[c, 0, 3], w2c[c, 2, 3] = -3.5 * math.sin(a), 3.5 - 3.5 * math.cos(a)
     K = torch.tensor([[FOCAL, 0.0, WIDTH / 2], [0.0, 1.1 * FOCAL, 0.45 * HEIGHT], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return Views(w2c, K.repeat(count, 1, 1), WIDTH, HEIGHT)
+
+
+BARREL = (-0.35, 0.05, 0.01, -0.02, 0.0)  # folds at 1.16, a little beyond the image's corners, and is decentred
+CUSHION = (0.3, 0.1, -0.01, 0.02, 0.05)
+LENSES = {"barrel": BARREL, "cushion": CUSHION, "tangential": (0.0, 0.0, 0.05, -0.08, 0.0)}
+
+
+def through(v: Views, *lenses: tuple[float, ...]) -> Views:
+    """Return the same views through lenses, one for each or one for all."""
+    fx, fy, cx, cy = v.K[0][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    own = lenses * (len(v) // len(lenses))
+    pose = np.eye(3), np.zeros(3)
+    cameras = [Camera(str(i), v.width, v.height, fx, fy, cx, cy, *pose, lens) for i, lens in enumerate(own)]
+    return replace(Views.from_cameras(cameras), w2c=v.w2c)
 
 
 def changed(splats: Splats, **tensors: Tensor) -> Splats:

@@ -33,8 +33,7 @@ class Layer:
 @torch.no_grad()
 def make_layer(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Layer:
     """Render the background once into all views."""
-    device = splats.means.device
-    views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
+    views = views.to(splats.means.device)
     p = project_splats(splats, views, pixel_filter)
     layers = splats.colors[p.seen.index].float()
     lists = sort_pairs(p.grid, p.pairs.keys, p.pairs.rows, torch.full_like(p.pairs.rows, -1))
@@ -46,8 +45,7 @@ def render_over(layer: Layer, splats: Splats, chosen: Sequence[int]) -> RenderOu
     """Render `splats` and the background into the views `chosen`: see `Background.render`."""
     device = splats.means.device
     pick = torch.tensor(list(chosen)).to(device, non_blocking=True)  # the copy is queued; nothing waits for the device
-    views = Views(layer.views.w2c[pick], layer.views.K[pick], layer.views.width, layer.views.height)
-    p = project_splats(splats, views, layer.pixel_filter)
+    p = project_splats(splats, layer.views.some(chosen), layer.pixel_filter)
     own = p.pairs
     touched = torch.unique(own.keys >> 32)
     keys, rows = _behind_pairs(layer, pick, touched)

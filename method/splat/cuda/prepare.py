@@ -22,8 +22,9 @@ from numba.core import config
 from torch import Tensor
 
 from spike4dgs.benchmark.environment import numba_stream
+from spike4dgs.method.splat.lens import FRUSTUM_MARGIN, bent, bent_slopes
 from spike4dgs.method.splat.reference import rotation_matrices
-from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, NEAR, PixelFilter, Splats, Views
+from spike4dgs.method.splat.types import ALPHA_MIN, NEAR, PixelFilter, Splats, Views
 
 # A small image has few tiles. That a grid could be larger is no news to the user.
 warnings.filterwarnings("ignore", message=".*Grid size")
@@ -94,17 +95,26 @@ def project(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Seen:
     z = p[:, 2:]
     slope = p[:, :2] / z  # [M, 2] tangent of the viewing angle
     image = _row(p, views.width, views.height)
-    margin = FRUSTUM_MARGIN * 0.5 * image / f
-    inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
+    lens = None if views.lenses is None else views.lenses.double()[view]
+    if lens is None:
+        margin = FRUSTUM_MARGIN * 0.5 * image / f
+        inside = torch.minimum(torch.maximum(slope, -c / f - margin), (image - c) / f + margin)
+    else:
+        inside = torch.minimum(torch.maximum(slope, lens[:, 5:9:2]), lens[:, 6:9:2])
     local = product(turn, axes)[view, index]  # [M, 3, 3] the ellipsoid's axes in the view
     # [M, 2, 3]: the Jacobian of the projection, f/z (1, 0, -slope_x) and f/z (0, 1, -slope_y), times the axes
     half = (f / z)[:, :, None] * (local[:, :2] - inside[:, :, None] * local[:, 2:])
+    lying, shown = slope, None
+    if lens is not None:
+        D = bent_slopes(inside, lens) * f[:, :, None] / f[:, None]
+        half = D[:, :, :1] * half[:, :1] + D[:, :, 1:] * half[:, 1:]
+        lying, shown = bent(slope, lens)
     b0, b1 = half.unbind(1)
     det_sharp = torch.linalg.cross(b0, b1).square().sum(-1)
     xx, xy, yy = (b0 * b0).sum(-1), (b0 * b1).sum(-1), (b1 * b1).sum(-1)
     det = det_sharp + eps2d * (xx + yy) + eps2d**2
     xx, yy = xx + eps2d, yy + eps2d
-    center, opacity = f * slope + c, opacities[index]
+    center, opacity = f * lying + c, opacities[index]
     with torch.no_grad():
         share = (det_sharp / det).sqrt() if antialiased else torch.ones_like(det)
         reach = 2 * (255 * opacity * share).clamp(min=1).log()
@@ -112,7 +122,7 @@ def project(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Seen:
         first = torch.ceil(center - extent - 0.5).clamp(min=0)
         last = torch.minimum(torch.floor(center + extent + 0.5), image)
         visible = (opacity * share >= ALPHA_MIN) & (det > 0) & torch.isfinite(det) & (first < last).all(-1)
-        keep = torch.nonzero(visible)[:, 0]
+        keep = torch.nonzero(visible if shown is None else visible & shown)[:, 0]
         box = torch.stack([first, last], -1)[keep].flatten(1).long()
     xx, xy, det, opacity = (t.index_select(0, keep) for t in (xx, xy, det, opacity))
     if antialiased:  # after the selection: the root's slope is infinite at 0

@@ -163,8 +163,7 @@ def render_cuda(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: 
         if missing := missing_rasterizer(str(device)):
             fix = f"{missing.fix}, or move the tensors to the CPU"
             raise problem("back end cuda", missing.expected, missing.found, fix)
-    views = Views(views.w2c.to(device), views.K.to(device), views.width, views.height)
-    p = project_splats(splats, views, pixel_filter)
+    p = project_splats(splats, views.to(device), pixel_filter)
     layers = splats.colors[p.seen.index].float()
     if depth:
         layers = torch.cat([layers, p.seen.depth[:, None].float()], -1)

@@ -17,8 +17,11 @@ import numpy as np
 
 from spike4dgs.method.splat.kernels.blend_ir import TILE_HEIGHT, TILE_WIDTH
 from spike4dgs.method.splat.kernels.jit import helper, kernel
+from spike4dgs.method.splat.kernels.lens import curved, held, lens_constants, straight
+from spike4dgs.method.splat.kernels.triples import cross, dot
 from spike4dgs.method.splat.kernels.vector_ir import bits_double, double_bits, fetch_add, float_bits
-from spike4dgs.method.splat.types import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
+from spike4dgs.method.splat.lens import FRUSTUM_MARGIN
+from spike4dgs.method.splat.types import ALPHA_MIN, NEAR
 
 BLOCK = 128  # Gaussians per work item
 CULLED = np.uint32(0xFFFFFFFF)  # depth key of an invisible Gaussian
@@ -43,6 +46,7 @@ class Cameras(NamedTuple):
     """V cameras of one image size, a row of `entries` for each, and the pixel filter of their images."""
 
     entries: np.ndarray  # [V, 16] float64: R row by row (9), t (3), fx, fy, cx, cy
+    lenses: np.ndarray  # [V, 10] float64, see method/splat/lens.py; [0, 10]: pinholes
     width: int
     height: int
     eps2d: float
@@ -117,7 +121,7 @@ def camera_constants(cameras: Any, view: int) -> Any:
 @helper
 def jacobian(f: Any, limits: Any, u: float, v: float, inverse_z: float) -> Any:
     """Return jx, jxz, jy, jyz of the projection at the point (u, v) = (x/z, y/z), held inside the limits."""
-    held_u, held_v = min(max(u, limits[0]), limits[1]), min(max(v, limits[2]), limits[3])
+    held_u, held_v = held(limits, u, v)
     jx, jy = f[0] * inverse_z, f[1] * inverse_z
     return jx, -jx * held_u, jy, -jy * held_v
 
@@ -141,18 +145,6 @@ def half_covariance(R: Any, j: Any, a: Any) -> Any:
 
 
 @helper
-def dot(a: Any, b: Any) -> float:
-    """Return a . b of two 3-tuples."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@helper
-def cross(a: Any, b: Any) -> Any:
-    """Return a x b of two 3-tuples."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@helper
 def gather_parameters(s: np.ndarray, l: int, i: int, geometry: Any) -> None:  # noqa: E741
     """Copy Gaussian i into lane l."""
     means, quats, scales, opacities = geometry
@@ -164,7 +156,7 @@ def gather_parameters(s: np.ndarray, l: int, i: int, geometry: Any) -> None:  # 
 @kernel
 def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any) -> None:
     """Project all Gaussians (a `Geometry`) into all `Cameras` and fill `out` (a `Projected`)."""
-    views, (_, width, height, eps2d, antialiased) = len(cameras.entries), cameras
+    views, (_, _, width, height, eps2d, antialiased) = len(cameras.entries), cameras
     n_all, across = len(geometry.means), (width + TILE_WIDTH - 1) // TILE_WIDTH
     blocks = (n_all + BLOCK - 1) // BLOCK
     while True:
@@ -181,8 +173,13 @@ def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any)
             gather_parameters(s, l, first + l, geometry)
         for l in range(n, BLOCK):  # noqa: E741
             gather_parameters(s, l, first, geometry)
-        for l in range(BLOCK):  # noqa: E741
-            project_lane(s, l, R, t, f, limits, width, height, eps2d, antialiased)
+        if len(cameras.lenses):
+            lens, limits = lens_constants(cameras, view)
+            for l in range(BLOCK):  # noqa: E741
+                project_lane(s, l, R, t, f, limits, width, height, eps2d, antialiased, curved, lens)
+        else:
+            for l in range(BLOCK):  # noqa: E741
+                project_lane(s, l, R, t, f, limits, width, height, eps2d, antialiased, straight, None)
         histogram[block, :] = 0
         invalid[block] = -1
         total = 0
@@ -219,9 +216,9 @@ def project_forward(geometry: Any, cameras: Any, out: Any, counter: Any, s: Any)
 @helper
 def project_lane(
     s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, width: int, height: int, eps2d: float,  # noqa: E741
-    antialiased: bool,
+    antialiased: bool, through: Any, lens: Any,
 ) -> None:  # fmt: skip
-    """Project one lane; DEPTH becomes -1 where the Gaussian is invisible."""
+    """Project one lane `through` a lens; DEPTH becomes -1 where the Gaussian is invisible."""
     mx, my, mz, o = s[MX + l], s[MY + l], s[MZ + l], s[OP + l]
     qw, qx, qy, qz = s[QW + l], s[QX + l], s[QY + l], s[QZ + l]
     sx, sy, sz = s[SX + l], s[SY + l], s[SZ + l]
@@ -234,6 +231,7 @@ def project_lane(
     q = rotation(qw, qx, qy, qz)
     a = (q[0] * sx, q[1] * sy, q[2] * sz, q[3] * sx, q[4] * sy, q[5] * sz, q[6] * sx, q[7] * sy, q[8] * sz)
     _, _, b0, b1 = half_covariance(R, jacobian(f, limits, u, v, inverse_z), a)
+    u, v, shown, b0, b1 = through(lens, f, limits, u, v, b0, b1)
     g = cross(b0, b1)
     det_sharp = dot(g, g)  # = |B B^T| by Cauchy-Binet; xx yy - xy^2 would cancel for needles
     xx, xy, yy = dot(b0, b0), dot(b0, b1), dot(b1, b1)
@@ -246,7 +244,7 @@ def project_lane(
     across = (cx + half_width >= 0.5) & (cx - half_width <= width - 0.5)
     down = (cy + half_height >= 0.5) & (cy - half_height <= height - 0.5)
     visible = (o >= ALPHA_MIN) & (det > 0.0) & (det < math.inf) & (qw * qw + qx * qx + qy * qy + qz * qz > 0.0)
-    s[DEPTH + l] = z if (z >= NEAR) & visible & across & down else -1.0
+    s[DEPTH + l] = z if (z >= NEAR) & shown & visible & across & down else -1.0
     s[CX + l], s[CY + l], s[SLOPE + l] = cx, cy, xy / xx
     s[HX + l], s[HY + l], s[XTOP + l] = half_width, half_height, xy / yy * half_height
     s[XIS + l], s[ETAS + l] = math.sqrt(HALF_LOG2E / xx), math.sqrt(HALF_LOG2E * xx / det)

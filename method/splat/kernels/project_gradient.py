@@ -19,6 +19,7 @@ import numpy as np
 
 from spike4dgs.method.splat.kernels.blend_ir import MOMENTS
 from spike4dgs.method.splat.kernels.jit import helper, kernel
+from spike4dgs.method.splat.kernels.lens import curved, curved_gradient, lens_constants, straight, straight_gradient
 from spike4dgs.method.splat.kernels.project import (
     BLOCK,
     CULLED,
@@ -34,13 +35,12 @@ from spike4dgs.method.splat.kernels.project import (
     SY,
     SZ,
     camera_constants,
-    cross,
-    dot,
     gather_parameters,
     half_covariance,
     jacobian,
     rotation,
 )  # fmt: skip
+from spike4dgs.method.splat.kernels.triples import cross, dot
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 ROWS = 43  # rows of the scratch array: the 11 parameters, then
@@ -119,8 +119,14 @@ def differentiate_lanes(s: np.ndarray, n: int, some: int, geometry: Any, cameras
         gather_parameters(s, l, some, geometry)
         for row in range(MOMENTS + 1):
             s[M0 + row * BLOCK + l] = 0.0
-    for l in range(rounded):  # noqa: E741
-        differentiate_lane(s, l, R, t, f, limits, cameras.eps2d, cameras.antialiased)
+    eps2d, antialiased = cameras.eps2d, cameras.antialiased
+    if len(cameras.lenses):
+        lens, limits = lens_constants(cameras, view)
+        for l in range(rounded):  # noqa: E741
+            differentiate_lane(s, l, R, t, f, limits, eps2d, antialiased, curved, curved_gradient, lens)
+    else:
+        for l in range(rounded):  # noqa: E741
+            differentiate_lane(s, l, R, t, f, limits, eps2d, antialiased, straight, straight_gradient, None)
 
 
 @helper
@@ -222,8 +228,9 @@ def quaternion_gradient(w: float, x: float, y: float, z: float, m: Any) -> Any:
 @helper
 def differentiate_lane(
     s: np.ndarray, l: int, R: Any, t: Any, f: Any, limits: Any, eps2d: float, antialiased: bool,  # noqa: E741
+    through: Any, back_through: Any, lens: Any,
 ) -> None:  # fmt: skip
-    """Chain the moments of lane l, which is visible, to its parameters and to the pose."""
+    """Chain the moments of lane l, which is visible, `back_through` a lens to its parameters and to the pose."""
     mx, my, mz = s[MX + l], s[MY + l], s[MZ + l]
     sx, sy, sz = s[SX + l], s[SY + l], s[SZ + l]
     x, y = R[0] * mx + R[1] * my + R[2] * mz + t[0], R[3] * mx + R[4] * my + R[5] * mz + t[1]
@@ -233,7 +240,10 @@ def differentiate_lane(
     q = rotation(s[QW + l], s[QX + l], s[QY + l], s[QZ + l])
     a = (q[0] * sx, q[1] * sy, q[2] * sz, q[3] * sx, q[4] * sy, q[5] * sz, q[6] * sx, q[7] * sy, q[8] * sz)
     t0, t1, b0, b1 = half_covariance(R, j, a)
-    d_cx, d_cy, d_b0, d_b1 = covariance_gradient(s, l, b0, b1, eps2d, antialiased)
+    _, _, _, c0, c1 = through(lens, f, limits, u, v, b0, b1)
+    d_cx, d_cy, d_b0, d_b1 = covariance_gradient(s, l, c0, c1, eps2d, antialiased)
+    s[GCX + l], s[GCY + l], s[GOP + l] = d_cx, d_cy, s[M0 + l] / s[OP + l]
+    d_cx, d_cy, d_b0, d_b1 = back_through(lens, f, limits, u, v, b0, b1, d_cx, d_cy, d_b0, d_b1)
     # B = T A: dL/dT = dB A^T, dL/dA = T^T dB, and T = J R: dL/dJ = dT R^T, dL/dR = J^T dT
     w0, w1 = outer_rows(d_b0, d_b1, a)
     j0, j1 = outer_rows(w0, w1, R)
@@ -246,7 +256,6 @@ def differentiate_lane(
     gz = gz - (d_jxz * (1.0 + free_u) * j[1] + d_jyz * (1.0 + free_v) * j[3]) * inverse_z
     s[GX + l], s[GY + l] = R[0] * gx + R[3] * gy + R[6] * gz, R[1] * gx + R[4] * gy + R[7] * gz
     s[GZ + l] = R[2] * gx + R[5] * gy + R[8] * gz
-    s[GCX + l], s[GCY + l], s[GOP + l] = d_cx, d_cy, s[M0 + l] / s[OP + l]
     m = (
         t0[0] * d_b0[0] + t1[0] * d_b1[0], t0[0] * d_b0[1] + t1[0] * d_b1[1], t0[0] * d_b0[2] + t1[0] * d_b1[2],
         t0[1] * d_b0[0] + t1[1] * d_b1[0], t0[1] * d_b0[1] + t1[1] * d_b1[1], t0[1] * d_b0[2] + t1[1] * d_b1[2],

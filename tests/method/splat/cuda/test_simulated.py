@@ -11,7 +11,7 @@ SUPPORT = Path(__file__).resolve().parents[3] / "support"
 # All in one process, because it starts slowly; hard scenes by the name of their function in splat_scenes.
 CASES = ["near_plane", "needles", "pancakes", "tiny_and_huge", "opacities", "equal_depths", "off_screen", "nothing"]
 CASES += ["far_origin", "opaque_stack", "zero_quaternions", "one channel", "three channels with depth", "five channels"]
-CASES += ["behind and over", "same bits"]
+CASES += ["barrel", "cushion", "tangential", "behind and over", "same bits"]
 
 
 def test_images_and_gradients() -> None:
