@@ -32,6 +32,7 @@ from spike4dgs.method.gaussians.parameters import Edit, Gaussians, concatenate, 
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSettings, move_to
 from spike4dgs.method.splat import RenderOutput, Views, render
+from spike4dgs.method.splat.lens import lens_rays
 from spike4dgs.method.splat.ssim import ssim
 from spike4dgs.method.training_views.changes import POINTS
 from spike4dgs.method.training_views.points import look_up, variation_at
@@ -82,12 +83,15 @@ def rays(views: Views) -> tuple[Tensor, Tensor]:
     Directions are sums of a row's and a column's vector: a seventh of the time of a product with all pixels in float64.
     """
     R, t = views.w2c[:, :3, :3], views.w2c[:, :3, 3]
+    center = -(R.mT @ t[..., None])[..., 0]
+    if views.lenses is not None:
+        return center, R.mT.float() @ lens_rays(views.K, views.lenses, views.width, views.height)
     back = (R.mT @ torch.linalg.inv(views.K.to(R)))[:, :, None, None]  # [V, 3, 1, 1, 3] pixel to ray
     down, across = (torch.arange(n, device=R.device) + 0.5 for n in (views.height, views.width))
     rows = back[..., 1] * down[:, None] + back[..., 2]  # [V, 3, H, 1]
     direction = rows.float() + (back[..., 0] * across).float()
     direction = direction * direction.square().sum(1, keepdim=True).rsqrt()
-    return -(R.mT @ t[..., None])[..., 0], direction.flatten(2)
+    return center, direction.flatten(2)
 
 
 VIEWS, TIMES = 2, 5
@@ -127,7 +131,7 @@ def guide(
 
 
 def _one(views: Views, view: int) -> Views:
-    return Views(views.w2c[[view]], views.K[[view]], views.width, views.height)
+    return views.some([view])
 
 
 def _render(

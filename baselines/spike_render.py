@@ -26,7 +26,6 @@ from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
 from spike4dgs.method.supervision.spike_cameras import fire, random_charge, recorded
-from spike4dgs.method.training_views.pinholes import AtSensors
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class SpikeRender(Supervision):
 
     def __init__(self, settings: SpikeRenderSettings, scene: TrainingScene) -> None:
         super().__init__()
-        self.settings, self.scene, self.at_sensors = settings, scene, AtSensors(scene)
+        self.settings, self.scene = settings, scene
         first = scene.streams[0]
         self.noise = nn.Parameter(torch.zeros(len(scene.streams), 2, first.height, first.width))  # a and b
 
@@ -55,9 +54,8 @@ class SpikeRender(Supervision):
         """Return the loss of one rendered sample."""
         s, gain = self.settings, self.scene.radiance_gain
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
-        image = self.at_sensors(render(sample.t), sample.views)
         noise = self.noise[list(sample.views)]
-        rate = gain * (image * noise[:, 0].exp() + noise[:, 1])
+        rate = gain * (render(sample.t) * noise[:, 0].exp() + noise[:, 1])
         unit = ticks * gain
         fired = fire(rate, random_charge(rate, sample.step), ticks)
         loss = difference(fired / unit, counts.to(rate) / unit, s.ssim_weight)

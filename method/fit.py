@@ -153,9 +153,9 @@ class RecipeMethod(Shown):
         if isinstance(self.images, RecordedImages):
             scene = without_spikes(scene)
             recorded = self.images.read(scene, choose_ticks(scene.n_ticks, settings["images"]))
-        scene = as_pinholes(in_todays_dark(scene))
-        own = settings["initialization"]
-        start = self.initialization.start(StartRequest(scene, request.seed, own, request.device, recorded))
+        straight, own = as_pinholes(scene := in_todays_dark(scene)), settings["initialization"]
+        start = self.initialization.start(StartRequest(straight, request.seed, own, request.device, recorded))
+        start = replace(start, cameras=with_lenses(straight, start.cameras))
         return self._fit(scene, start, settings, request, recorded)
 
     def warm_up(self, request: FitRequest) -> None:
@@ -285,7 +285,7 @@ def fit_gaussians(
         duration_us=job.scene.duration_us,
         device=request.device,
         spec=spec,
-        cameras=with_lenses(job.scene, trainer.poses.cameras(start.cameras)),
+        cameras=trainer.poses.cameras(start.cameras),
         pixel_filter=settings.pixel_filter,
         estimates=trainer.supervision.estimates(),
         light=None if job.light is None else torch.tensor(job.light.factors, dtype=torch.float32),

@@ -20,10 +20,8 @@ from torch import Tensor, nn
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.lens import nearest, resample
 from spike4dgs.method.splat import Views
 from spike4dgs.method.torch_state import one_torch_thread
-from spike4dgs.method.training_views.pinholes import make_lenses
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,8 @@ class Poses(nn.Module):
         start, index = self._start, list(chosen)
         units = torch.tensor([1.0] * 3 + [self._depth_m] * 3, dtype=self.xi.dtype, device=self.xi.device)
         moved = nn.functional.pad(self.xi * units, (0, 0, 1, 0))[index]
-        return Views(rigid_motion(moved) @ start.w2c[index], start.K[index], start.width, start.height)
+        some = start.some(index)
+        return replace(some, w2c=rigid_motion(moved) @ some.w2c)
 
     @torch.no_grad()
     def cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -86,20 +85,14 @@ def refine_pose(
     """Return the camera near `camera` that makes mean |rendered - image| over the mask `background` [H, W] smallest.
 
     The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
-    included, so that refinement never ends worse than it began. A lens is taken out of image and mask first.
-    `render_view` renders one view [1, H, W], differentiable in `views.w2c`. Raises UserError where the mask is empty.
+    included, so that refinement never ends worse than it began. `render_view` renders one view [1, H, W],
+    differentiable in `views.w2c`. Raises UserError where the mask is empty.
     """
     shape = (camera.height, camera.width)
     if image.shape != shape or background.shape != shape or not background.any():
         found = f"{image.shape}, {background.shape}, {int(background.sum())} background pixels"
         expected = f"an image and a mask of shape {shape} with background pixels"
         raise problem("pose refinement", expected, found, "check it")
-    given = camera
-    if camera.distortion:
-        (lens,) = make_lenses([camera])
-        straight = resample(np.where(background, image, np.nan).astype(np.float32), lens.to_camera)
-        background = nearest(background, lens.to_camera) & lens.seen & np.isfinite(straight)
-        camera, image = lens.pinhole, np.nan_to_num(straight)
     start = Views.from_cameras([camera], device=device)
     target = torch.as_tensor(image, device=device)[None]
     weight = torch.as_tensor(background, dtype=target.dtype, device=device)[None] / float(background.sum())
@@ -110,7 +103,7 @@ def refine_pose(
     with one_torch_thread():
         for step in range(settings.steps + 1):
             w2c = rigid_motion(xi * units).to(device) @ start.w2c
-            loss = ((render_view(Views(w2c, start.K, camera.width, camera.height)) - target).abs() * weight).sum()
+            loss = ((render_view(replace(start, w2c=w2c)) - target).abs() * weight).sum()
             if (value := loss.item()) < best_loss:
                 best, best_loss = w2c[0].detach().cpu().numpy(), value
             share = 0.5 * (1 + math.cos(math.pi * step / max(settings.steps, 1)))
@@ -118,4 +111,4 @@ def refine_pose(
             adam.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()
-    return replace(given, R=best[:3, :3], t=best[:3, 3])
+    return replace(camera, R=best[:3, :3], t=best[:3, 3])

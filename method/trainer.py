@@ -153,7 +153,7 @@ class Trainer:
             self._correct_by(self.gaussians.detached())
         sample = self.sample()
         chosen = list(sample.views)
-        views = self.poses.views(chosen) if self.settings.refine_poses else self._views(chosen)
+        views = self.poses.views(chosen) if self.settings.refine_poses else self.training_images.views.some(chosen)
         outputs: list[RenderOutput] = []
 
         def render_at(t: float) -> Tensor:
@@ -195,7 +195,7 @@ class Trainer:
 
         def around(index: int) -> RenderViews:
             def render_views(ticks: float, chosen: Sequence[int]) -> Tensor:
-                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), fit._views(chosen)
+                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), training.views.some(chosen)
                 return fit.motion.image(fit._image(fit.motion.splats(snapshot, t), chosen, views).image, views)
 
             return render_views
@@ -215,11 +215,6 @@ class Trainer:
         if self.projected:
             return self.projected.render(splats, chosen)
         return render(splats, views, self.settings.pixel_filter)
-
-    def _views(self, chosen: Sequence[int]) -> Views:
-        v = self.training_images.views  # not v.w2c[list(chosen)]: that list would be copied to a device, which waits
-        w2c, K = (torch.stack([matrices[view] for view in chosen]) for matrices in (v.w2c, v.K))
-        return Views(w2c, K, v.width, v.height)
 
     def _adapt_density(self, stage: Stage) -> None:
         s, done, views = self.density, self.step - stage.first, self.training_images.views

@@ -34,7 +34,6 @@ from spike4dgs.method.motion.paths import Paths
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.rig import Cloud, CloudSettings, cells_of, filled
-from spike4dgs.method.training_views.pinholes import as_pinholes
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.studies.oracle_truth import Surfaces, Truth
 
@@ -105,7 +104,6 @@ class OracleMethod:
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views and the truth of this scene and revision, which must be in the folder."""
         truth = Truth.of(self.root, scene.id, scene.revision, self.samples)
-        scene = as_pinholes(scene)
         if "calibration" in self.oracle:
             scene = with_calibrations(scene, truth.calibrations(scene.radiance_gain))
         recipe, parts = self._recipe, PARTS

@@ -17,7 +17,7 @@ from spike4dgs.baselines.radiance_field.march import Rays, camera_rays, resample
 from spike4dgs.baselines.radiance_field.occupancy import Occupancy
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.runs.provenance import Provenance
-from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.cameras import Camera, border
 from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, positive, whole
 from spike4dgs.method.models.fitted_model import count_bytes
@@ -165,9 +165,8 @@ def bounds_of(cameras: Iterable[Camera], points: Float32, low: Tensor, high: Ten
     a, b = np.quantile(np.concatenate(depths), [0.005, 0.995])
     near, far = max(a - 0.05 * (b - a), 0.5 * a), b + 0.05 * (b - a) + 1e-3 * scale
     for camera in cameras:
-        w, h = camera.width, camera.height
-        uv = np.array([[u, v] for u in (0, w) for v in (0, h)], np.float64)
-        corners += [camera.unproject(uv, np.full(4, z)) for z in (near, far)]
+        uv = border(camera)  # not its corners alone: a lens may see farthest between them
+        corners += [camera.unproject(uv, np.full(len(uv), z)) for z in (near, far)]
     box = np.concatenate(corners)
 
     def tensor(a: NDArray[np.float64]) -> Tensor:

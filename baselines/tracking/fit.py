@@ -48,7 +48,7 @@ from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.motion.table import Static
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.settings import Settings
-from spike4dgs.method.splat import Splats, Views, render
+from spike4dgs.method.splat import Splats, render
 from spike4dgs.method.supervision.base import difference
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.torch_state import one_torch_thread, seeded
@@ -267,8 +267,7 @@ class Tracker:
             means, quats = leaves["means"], leaves["quats"]
             everything = torch.cat([means, local.means[free:]]), torch.cat([quats, local.quats[free:]])
             splats = Splats(*everything, scales, opacities, torch.cat([leaves["colors"], self.flag], 1))
-            views = Views(every.w2c[chosen], every.K[chosen], every.width, every.height)
-            image, silhouette = render(splats, views).image.unbind(-1)
+            image, silhouette = render(splats, every.some(chosen)).image.unbind(-1)
             total = s.image_weight * difference(image, self.images[index][chosen], pixel.ssim_weight, pixel.huber_delta)
             total = total + s.silhouette_weight * (silhouette * self.quiet[chosen]).mean()
             # A mean over whole images, as published: outside of the window nothing changes.

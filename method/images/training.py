@@ -19,7 +19,6 @@ from spike4dgs.method.images.light import Light
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
-from spike4dgs.method.training_views.pinholes import nearest_pixels, undistorted
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages, bad_pixels, missing_images
 
 
@@ -54,14 +53,14 @@ def make_training_images(
     device: str,
     light: Light | None = None,
 ) -> TrainingImages:
-    """Return images of all training views at the chosen times, as `cameras` see them; `cameras` are pinholes.
+    """Return images of all training views at the chosen times, at the streams' pixels; `cameras` have the fit's poses.
 
     `light` is what changes in the whole scene's light, if anything: makers that know of it show mean light.
     """
     ticks, made, measured = _make(scene, make, settings, device, light)
-    images = torch.from_numpy(undistorted(scene, made)).to(device)
+    images = torch.from_numpy(made).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
-    masks = None if bad is None else torch.from_numpy(np.stack(nearest_pixels(scene, bad))).to(device)
+    masks = None if bad is None else torch.from_numpy(np.stack(bad)).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
     spans = None if measured is None else _spans(scene, measured, device)
     return TrainingImages(
@@ -72,8 +71,8 @@ def make_training_images(
 def recorded_training_images(
     scene: TrainingScene, cameras: Sequence[Camera], recorded: Recorded, device: str
 ) -> TrainingImages:
-    """Return images of other sensors as `cameras` see them; `cameras` are pinholes."""
-    images = torch.from_numpy(undistorted(scene, recorded.images)).to(device)
+    """Return images of other sensors, at the poses of `cameras`."""
+    images = torch.from_numpy(recorded.images).to(device)
     views = Views.from_cameras(cameras, device=device)
     return TrainingImages(views, recorded.ticks, images, scene.n_ticks, exposure_ticks=recorded.exposure_ticks)
 
@@ -113,7 +112,7 @@ def _make(
 
 def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:
     """Return the spans of time that the training images [T, C] are means over."""
-    ends = np.stack(nearest_pixels(scene, measured), axis=1)
+    ends = np.stack(measured, axis=1)
     half = float(np.median((ends[:, :, 1] - ends[:, :, 0]).astype(np.float32))) / 2
     return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
 

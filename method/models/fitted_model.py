@@ -38,7 +38,6 @@ from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Repeated, join
 from spike4dgs.method.splat.types import PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
-from spike4dgs.method.training_views.pinholes import through_lens
 
 _MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
 
@@ -96,7 +95,6 @@ class GaussianModel(Shown):
         """Return gray radiance [V, H, W] of what `splats` returns, through the model's pixel filter."""
         return self.image(render(splats, views, self.pixel_filter).image, views)
 
-    @through_lens
     @torch.no_grad()
     def render(self, camera: Camera, t_us: float) -> Float32:
         """Return gray linear radiance [H, W] float32 of `camera` at `t_us`; times outside the clip take its ends."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.cameras import Camera, border, check_lens
-from spike4dgs.benchmark.scene.lens import Distortion, bend, fold_radius, slopes
+from spike4dgs.benchmark.scene.lens import Distortion, bend, fold_radius, make_distortion, slopes
 
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
 
@@ -61,3 +61,21 @@ def bent_slopes(xy: Tensor, lenses: Tensor) -> Tensor:
     """Return the derivatives [..., 2, 2] of the lens's coordinates in the pinhole's, which are symmetric."""
     xx, both, yy = slopes(*xy.unbind(-1), lenses[..., :5].unbind(-1))
     return torch.stack([xx, both, both, yy], -1).unflatten(-1, (2, 2))
+
+
+def lens_rays(K: Tensor, lenses: Tensor, width: int, height: int) -> Tensor:
+    """Return the float32 unit directions [C, 3, H * W] of the pixels' rays in the cameras' coordinates.
+
+    K is [C, 3, 3], lenses are [C, 10]; the directions are on their device.
+    """
+    rows = zip(K.tolist(), lenses[:, :5].tolist(), strict=True)
+    rays = [_rays(width, height, k[0][0], k[1][1], k[0][2], k[1][2], make_distortion(row)) for k, row in rows]
+    return torch.stack(rays).to(lenses.device)
+
+
+@lru_cache(maxsize=64)  # a fit asks for those of its cameras at each step
+def _rays(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Distortion) -> Tensor:
+    v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5
+    xy = Camera("", width, height, fx, fy, cx, cy, np.eye(3), np.zeros(3), lens).normalized(np.stack([u, v], axis=-1))
+    directions = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    return torch.from_numpy((directions / np.linalg.norm(directions, axis=1, keepdims=True)).T.astype(np.float32))

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from spike4dgs.benchmark.scene.camera_state import local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.supervision.base import Sample
-from spike4dgs.method.training_views.pinholes import AtSensors
 from spike4dgs.method.training_views.training_images import bad_pixels, missing_images
 
 
@@ -31,7 +30,6 @@ class SpikeCameras(nn.Module):
 
     def __init__(self, scene: TrainingScene) -> None:
         super().__init__()
-        self.at_sensors = AtSensors(scene)
         first = scene.streams[0]
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
@@ -47,7 +45,7 @@ class SpikeCameras(nn.Module):
     def rate(self, image: Tensor, views: tuple[int, ...]) -> Tensor:
         """Return the charge per tick [V, H, W] of the cameras `views` whose renders are the radiance `image`."""
         chosen = list(views)
-        return self.at_sensors(image, views) * self.white[chosen] + self.dark[chosen]
+        return image * self.white[chosen] + self.dark[chosen]
 
 
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:

@@ -7,7 +7,7 @@ not known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -120,4 +120,4 @@ def moving_window(views: Views, masks: Tensor, margin: int) -> Window:
     )
     K = views.K.clone()
     K[:, :2, 2] -= torch.tensor(corner, dtype=K.dtype, device=K.device)
-    return Window(corner, Views(views.w2c, K, width, height))
+    return Window(corner, replace(views, K=K, width=width, height=height))

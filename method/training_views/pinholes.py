@@ -1,11 +1,12 @@
 """Pinholes in the place of cameras whose lenses distort.
 
-A fit sees pinholes alone: `as_pinholes` exchanges a scene's cameras, and everything that is made from their streams
-goes through the lens (`undistorted`, `nearest_pixels`). A pinhole has its camera's pose, focal lengths and distance
-between pixels; its image is larger, so that the camera's whole field of view is in it, and NaN where the camera sees
-nothing. A loss on spikes compares pixels of the stream: `AtSensors` takes the rendered image to them.
+Gaussians are rendered through the lens itself, and a fit compares them with the pixels of the streams. What only knows
+straight lines sees pinholes: the first points and poses of a fit, and clocks. `as_pinholes` exchanges a scene's
+cameras, and everything that is made from their streams goes through the lens (`undistorted`, `nearest_pixels`). A
+pinhole has its camera's pose, focal lengths and distance between pixels; its image is larger, so that the camera's
+whole field of view is in it, and NaN where the camera sees nothing. `with_lenses` gives the cameras back.
 
-A model is fitted to pinholes, and `through_lens` lets it render any camera.
+`through_lens` lets another's model, which knows pinholes alone, render any camera.
 """
 
 from __future__ import annotations
@@ -17,10 +18,7 @@ from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn import functional
 
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.cameras import Camera, border, check_lens
@@ -162,24 +160,6 @@ def with_lenses(scene: TrainingScene, cameras: Sequence[Camera]) -> tuple[Camera
         )
         for c, lens in zip(cameras, lenses, strict=True)
     )
-
-
-class AtSensors(nn.Module):
-    """Takes images rendered for a scene's views to the pixels of their streams, bilinear and differentiable."""
-
-    grid: Tensor | None  # [C, H, W, 2], as `grid_sample` takes it
-
-    def __init__(self, scene: TrainingScene) -> None:
-        super().__init__()
-        grids = [2 * lens.to_pinhole / (lens.pinhole.width, lens.pinhole.height) - 1.0 for lens in lenses_of(scene)]
-        grid = torch.from_numpy(np.stack(grids).astype(np.float32)) if grids else None
-        self.register_buffer("grid", grid, persistent=False)
-
-    def forward(self, image: Tensor, views: tuple[int, ...]) -> Tensor:
-        """Return the images [V, H, W] that the sensors of `views` get from renders [V, h, w]."""
-        if self.grid is None:
-            return image
-        return functional.grid_sample(image[:, None], self.grid[list(views)].to(image), align_corners=False)[:, 0]
 
 
 def through_lens(render: Callable[[M, Camera, float], Float32]) -> Callable[[M, Camera, float], Float32]:

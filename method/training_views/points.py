@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.method.splat import Views
+from spike4dgs.method.splat.lens import bent
 from spike4dgs.method.training_views.changes import POINTS, variation
 from spike4dgs.method.training_views.training_images import TrainingImages
 
@@ -21,6 +22,9 @@ def project(points: Tensor, views: Views) -> tuple[Tensor, Tensor]:
     w2c, K = views.w2c.to(dtype), views.K.to(dtype)
     p = points.to(w2c) @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]  # [C, N, 3]
     in_front = p[..., 2] > 0
+    if views.lenses is not None:
+        xy, shown = bent(p[..., :2] / torch.where(in_front, p[..., 2], 1.0)[..., None], views.lenses[:, None].to(dtype))
+        p, in_front = torch.cat([xy, torch.ones_like(xy[..., :1])], -1), in_front & shown
     uv = (p @ K.mT)[..., :2] / torch.where(in_front, p[..., 2], 1.0)[..., None]
     size = uv.new_tensor([views.width, views.height])
     inside = in_front & (uv >= 0).all(-1) & (uv < size).all(-1)

@@ -160,8 +160,10 @@ def test_relocated_gaussians_keep_their_hosts_times() -> None:
     )
 
 
-def test_rays_project_to_their_pixels() -> None:
-    cameras = array_cameras(2)
+@pytest.mark.parametrize("lens", [(), (-0.3, 0.05, 0.01, -0.02, 0.0)])
+def test_rays_project_to_their_pixels(lens: tuple[float, ...]) -> None:
+    first, second = array_cameras(2)
+    cameras = [first, replace(second, distortion=lens)]
     origin, direction = rays(Views.from_cameras(cameras))
     for i, camera in enumerate(cameras):
         np.testing.assert_allclose(origin[i].numpy(), camera.center, atol=1e-12)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -74,11 +76,14 @@ def test_single_pixels_are_specks() -> None:
 WORLD = ToyWorld(width=64, height=40)
 
 
-def test_pixels_are_those_of_the_cameras() -> None:
+@pytest.mark.parametrize("lens", [(), (-0.4, 0.0, 0.01, -0.02, 0.0)])
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
+def test_pixels_are_those_of_the_cameras(lens: tuple[float, ...]) -> None:
     points = np.random.default_rng(0).normal(0, 2, (400, 3))
-    pixels, inside = project(torch.from_numpy(points), Views.from_cameras(WORLD.cameras))
+    cameras = [WORLD.cameras[0], *(replace(c, distortion=lens) for c in WORLD.cameras[1:])]
+    pixels, inside = project(torch.from_numpy(points), Views.from_cameras(cameras))
     assert inside.any() and not inside.all()
-    for camera, pixel, seen in zip(WORLD.cameras, pixels.numpy(), inside.numpy(), strict=True):
+    for camera, pixel, seen in zip(cameras, pixels.numpy(), inside.numpy(), strict=True):
         uv, z = camera.project(points)
         expected = (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
         u, v = uv[expected].astype(int).T

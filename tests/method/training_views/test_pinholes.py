@@ -12,13 +12,14 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Model, Recipe
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.images.adaptive import ADAPTIVE
+from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
-from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.pinholes import (
-    AtSensors,
     as_pinholes,
     lenses_of,
     make_lenses,
@@ -88,23 +89,6 @@ def test_images_go_to_the_pinhole_and_back(lens: tuple[float, ...]) -> None:
     assert np.sqrt(np.mean((back - images[0]) ** 2)) < 5e-4
 
 
-def test_renders_reach_the_sensors_bilinear_and_with_their_gradient() -> None:
-    cameras = [replace(c, distortion=BARREL) for c in CURVED.cameras[:3]]
-    scene = as_pinholes(scene_of(*cameras))
-    rendered = torch.from_numpy(np.stack([wave(scene.cameras[k]) for k in (2, 0)])).requires_grad_(True)
-    at = AtSensors(scene)(rendered, (2, 0))
-    expected = np.stack([wave(cameras[k]) for k in (2, 0)])
-    assert (at.detach().numpy() - expected).std() < 0.01
-    at.sum().backward()
-    lens = lenses_of(scene)[2]
-    weight = np.zeros((lens.pinhole.height, lens.pinhole.width))  # the float64 twin: bilinear weights, pixel by pixel
-    for u, v in lens.to_pinhole.reshape(-1, 2) - 0.5:
-        i, j = int(np.floor(v)), int(np.floor(u))
-        b, a = v - i, u - j
-        weight[i : i + 2, j : j + 2] += np.outer([1 - b, b], [1 - a, a])
-    np.testing.assert_allclose(rendered.grad[0], weight, atol=1e-4)
-
-
 def test_spikes_and_masks_keep_their_values() -> None:
     scene = as_pinholes(scene_of(*[replace(c, distortion=BARREL) for c in CURVED.cameras[:2]]))
     spikes = [s.window(0, 3) for s in scene.streams]
@@ -121,8 +105,6 @@ def test_a_scene_of_pinholes_stays_as_it_is() -> None:
     images = np.zeros((2, 8, 40, 64), np.float32)
     assert undistorted(scene, images) is images
     assert with_lenses(scene, scene.cameras) == scene.cameras
-    rendered = torch.zeros(2, 40, 64)
-    assert AtSensors(scene)(rendered, (0, 1)) is rendered
 
 
 def test_fitted_pinholes_become_cameras_with_their_lens() -> None:
@@ -135,11 +117,21 @@ def test_fitted_pinholes_become_cameras_with_their_lens() -> None:
         assert found.distortion == BARREL and (found.width, found.height) == (given.width, given.height)
 
 
-def test_a_renderer_of_pinholes_refuses_a_lens() -> None:
-    with pytest.raises(UserError, match="cameras: expected pinholes, found lens distortion of cam_00"):
-        Views.from_cameras(CURVED.cameras[:1])
+def test_a_lens_that_folds_within_the_image_is_refused() -> None:
     with pytest.raises(UserError, match="a lens of cam_00 whose model holds up to the image's corners"):
         make_lenses([replace(CURVED.cameras[0], distortion=(-5.0, 0.0, 0.0, 0.0, 0.0))])
+
+
+def test_training_images_are_at_the_pixels_of_the_streams() -> None:
+    """What a loss compares was never resampled: a lens changes the views alone."""
+    bad = np.zeros((CURVED.height, CURVED.width), bool)
+    bad[3, 5] = True
+    curved = replace(CURVED.training, states={c.id: CameraState(bad=bad) for c in CURVED.cameras})
+    ignored = replace(curved, cameras=tuple(replace(c, distortion=()) for c in curved.cameras))
+    settings = ImageSettings(time_spacing_ticks=40)
+    seen, same = (make_training_images(s, s.cameras, ADAPTIVE, settings, "cpu") for s in (curved, ignored))
+    assert torch.equal(seen.images, same.images) and torch.equal(seen.bad, same.bad)
+    assert seen.views.lenses is not None and same.views.lenses is None
 
 
 @pytest.mark.parametrize("supervision", ["pixel", "spike"])
