@@ -138,7 +138,7 @@ def _newton_step(xy: Float64, missing: Float64, lens: Distortion) -> Float64:
     """Return J^-1 missing [..., 2] with the derivatives J of `distort`, which are symmetric."""
     xx, xy_, yy = slopes(xy[..., 0], xy[..., 1], lens)
     a, b = missing[..., 0], missing[..., 1]
-    return np.stack([yy * a - xy_ * b, xx * b - xy_ * a], axis=-1) / (xx * yy - xy_ * xy_)[..., None]
+    return np.asarray(np.stack([yy * a - xy_ * b, xx * b - xy_ * a], axis=-1) / (xx * yy - xy_ * xy_)[..., None])
 
 
 def inside(at: Float64, width: int, height: int) -> Mask:

@@ -59,8 +59,9 @@ def bent(xy: Tensor, lenses: Tensor) -> tuple[Tensor, Tensor]:
 
 def bent_slopes(xy: Tensor, lenses: Tensor) -> Tensor:
     """Return the derivatives [..., 2, 2] of the lens's coordinates in the pinhole's, which are symmetric."""
-    xx, both, yy = slopes(*xy.unbind(-1), lenses[..., :5].unbind(-1))
-    return torch.stack([xx, both, both, yy], -1).unflatten(-1, (2, 2))
+    x, y = xy.unbind(-1)
+    xx, both, yy = slopes(x, y, lenses[..., :5].unbind(-1))
+    return torch.stack([xx, both, both, yy], -1).reshape(*xx.shape, 2, 2)
 
 
 def lens_rays(K: Tensor, lenses: Tensor, width: int, height: int) -> Tensor:

@@ -129,7 +129,7 @@ def test_means_over_time_are_corrected_by_snapshots_of_the_stage() -> None:
 
     def light(ticks: float) -> torch.Tensor:
         splats = fit.motion.splats(fit.snapshot, (tick + ticks) / fit.training_images.n_ticks)
-        return render(splats, fit._views(views)).image[..., 0]
+        return render(splats, fit.training_images.views.some(views)).image[..., 0]
 
     expected = correction(light(-far), light(0.0), light(far), spans)
     torch.testing.assert_close(fit.corrections.at(index, views), expected, atol=1e-3, rtol=0)
