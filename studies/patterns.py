@@ -14,7 +14,6 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
@@ -73,7 +72,7 @@ def patterns(
     Where the scene has recordings of uniform light and of darkness, the table and OUT/errors.json list the errors.
 
     Args:
-        scene: Scene folder; lenses without distortion.
+        scene: Scene folder.
         budget: Steps of the fit: quick, standard, or a multiple of quick.
         seed: Seed of everything random.
         device: cpu, or a CUDA device.
@@ -81,9 +80,6 @@ def patterns(
         allow_gaps: Accept a recording with gaps.
     """
     training = open_scene(scene, allow_gaps).training
-    if any(camera.distortion for camera in training.cameras):
-        fix = "undistorted pixels have no map of their own"
-        raise problem(scene, "lenses without distortion", "distorted ones", fix)
     with RunDisplay(make_console(), 1) as display, display.cell(f"patterns of {training.id}") as shown:
         request = FitRequest(make_budget(budget), device, seed, shown.progress)
         method = METHODS[SELF_CALIBRATED.name]

@@ -31,7 +31,7 @@ def render(
 
     Args:
         splats: the Gaussians; float64 tensors are projected in float64, which a world far from its origin needs.
-        views: the cameras.
+        views: the cameras, with their lenses.
         pixel_filter: what is added to every projection.
         depth: also accumulate the camera-space z with the colours' weights.
         backend: "reference" (float64, tiny scenes), "cpu" (numba), "cuda" (numba-cuda); "auto" chooses by
