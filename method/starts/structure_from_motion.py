@@ -117,7 +117,7 @@ def _extract(
     camera, enlarge = cameras[0], settings.enlarge
     size = (camera.width * enlarge / 2, camera.height * enlarge / 2)
     intrinsics = [[float(x) * enlarge for x in (c.fx, c.fy, c.cx, c.cy)] for c in cameras]
-    alike = focal_prior is not None or all(own == intrinsics[0] for own in intrinsics)
+    alike = focal_prior is not None or all(values == intrinsics[0] for values in intrinsics)
     if focal_prior is None:
         reader.camera_model = "PINHOLE"
         reader.camera_params = ",".join(map(repr, intrinsics[0]))
@@ -138,9 +138,10 @@ def _extract(
     if alike:
         return
     with pycolmap.Database.open(database) as written:
-        for name, own in zip(names, intrinsics, strict=True):
-            view = written.read_camera(written.read_image_with_name(name).camera_id)
-            view.params = own
+        own = dict(zip(names, intrinsics, strict=True))
+        for image in written.read_all_images():
+            view = written.read_camera(image.camera_id)
+            view.params = own[image.name]
             written.update_camera(view)
 
 

@@ -125,7 +125,7 @@ def see(burst: Burst, file: BurstFile, light: float, ticks: int, rng: np.random.
         np.stack([tfi_image(s, under.instant) for s in streams]),
     )
     gain, dark = burst.gain[:VIEWS], burst.dark[:VIEWS]
-    means, intervals = (np.maximum(image - dark, 0) / np.maximum(gain, 1e-3) for image in made)
+    means, intervals = (np.asarray(np.maximum(image - dark, 0) / np.maximum(gain, 1e-3), np.float32) for image in made)
     size = file.facts.width, file.facts.height
     cameras = tuple(
         Camera(f"cam_{v:02d}", *size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], w2c[:3, :3], w2c[:3, 3])

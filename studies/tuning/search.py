@@ -258,8 +258,8 @@ def publish(out: Path, root: Path) -> None:
     here = [line for block in pattern("searches").finditer(text) for line in block[0].splitlines() if line[:3] == "| `"]
     head, rule, *new = (out / "tuning.md").read_text(encoding="utf-8").splitlines()
     lines = {tuple(line.split(" | ")[:2]): line for line in [*here, *new]}
-    rows = [lines[key] for key in sorted(lines)]
-    block = "\n".join(["<!-- searches -->", head, rule, *rows, "<!-- end searches -->"])
+    shown = [lines[key] for key in sorted(lines)]
+    block = "\n".join(["<!-- searches -->", head, rule, *shown, "<!-- end searches -->"])
     write_text(page, pattern("searches").sub(lambda _: block, text))
     for path in sorted(out.glob("*.csv")):
         write_text(root / "docs" / "results" / "tables" / "tuning" / path.name, path.read_text(encoding="utf-8"))
