@@ -119,7 +119,7 @@ def guide(
     for _, view, index in sorted(found)[:VIEWS]:
         t = images.ticks[index] / images.n_ticks
         out, image = _render(motion, gaussians, images, view, t)
-        target, camera = known(images.images[index, view], image), _one(images.views, view)
+        target, camera = known(images.images[index, view], image), images.views.some([view])
         pixels = bad_pixels(image, target)
         if len(pixels) >= 2:  # four points at least
             points = along_rays(camera, pixels, out, rng)
@@ -130,15 +130,11 @@ def guide(
     return new
 
 
-def _one(views: Views, view: int) -> Views:
-    return views.some([view])
-
-
 def _render(
     motion: Motion, gaussians: Gaussians, images: TrainingImages, view: int, t: float
 ) -> tuple[RenderOutput, Tensor]:
     """Return the render of one view at t, and its gray image [H, W]."""
-    camera = _one(images.views, view)
+    camera = images.views.some([view])
     out = render(motion.splats(gaussians, t), camera, depth=True)
     return out, motion.image(out.image, camera)[0]
 

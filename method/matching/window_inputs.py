@@ -49,6 +49,11 @@ def window_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None) ->
     return np.stack([roots[0], np.log2(length) / 8, roots[1], roots[2]]).astype(np.float32)
 
 
+def light_of(roots: Float32) -> Float32:
+    """Return the light in means of the image from channel 0, 2 or 3."""
+    return np.asarray((roots + 1) ** 2, np.float32)
+
+
 def _upright(stream: SpikeStream, image: Float32) -> Float32:
     image = image.reshape(stream.height, stream.width)
     return image[::-1] if stream.rows_bottom_up else image

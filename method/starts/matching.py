@@ -21,7 +21,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.matching.matches import learned_matches
 from spike4dgs.method.matching.poses import Solved, solve, solve_unknown
 from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
-from spike4dgs.method.matching.window_inputs import window_inputs
+from spike4dgs.method.matching.window_inputs import light_of, window_inputs
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.matched_poses import MatchSettings, bundle
@@ -94,4 +94,4 @@ def in_scene(scene: TrainingScene, found: Solved, inputs: Float32) -> Mapping:
         mine = anchor == view
         world[mine] = camera.unproject(at[mine], 1 / found.adjusted.inverse_depth[kept][mine])
     u, v = at.astype(np.int64).T
-    return Mapping(tuple(move.camera(c) for c in posed), move(world), (inputs[anchor, 0, v, u] + 1) ** 2)
+    return Mapping(tuple(move.camera(c) for c in posed), move(world), light_of(inputs[anchor, 0, v, u]))

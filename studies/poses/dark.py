@@ -32,6 +32,7 @@ from spike4dgs.method.matching.poses import solve
 from spike4dgs.method.matching.tracks import Matches
 from spike4dgs.method.matching.training.data import at_light, record, seen_by_network
 from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
+from spike4dgs.method.matching.window_inputs import light_of
 from spike4dgs.method.starts.structure_from_motion import map_views
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
 
@@ -161,7 +162,7 @@ def _colmap(images: Callable[[Sight], Float32]) -> Callable[[Sight, int], tuple[
 ESTIMATORS: Mapping[str, Callable[[Sight, int], tuple[Camera, ...]]] = {
     "matching network": _network,
     "SIFT, same geometry": _sift,
-    "COLMAP on adaptive": _colmap(lambda sight: (sight.inputs[:, 0] + 1) ** 2),
+    "COLMAP on adaptive": _colmap(lambda sight: light_of(sight.inputs[:, 0])),
     "COLMAP on TFP": _colmap(lambda sight: sight.means),
     "COLMAP on TFI": _colmap(lambda sight: sight.intervals),
 }

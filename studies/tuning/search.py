@@ -223,12 +223,11 @@ def write_results(out: Path) -> None:
         done = record["trials"]
         first, best = done[0], best_of(done, len(record["scenes"]))
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
-        cells = (f"{record['budget']:g}", _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
+        steps = _short(record["budget"])
+        cells = (steps, _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
         rows.append((f"`{record['row']}`", *cells))
         heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
-        write_csv(
-            out / f"{record['row']}@{record['budget']:g}.csv", heads, [_line(trial, record["scenes"]) for trial in done]
-        )
+        write_csv(out / f"{record['row']}@{steps}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
     write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
 
 

@@ -137,7 +137,7 @@ def test_an_interruption_is_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert capsys.readouterr().err == "interrupted\n"
 
 
-@pytest.mark.parametrize("command", ["leaderboard", "--help"])
+@pytest.mark.parametrize("command", ["methods", "--help"])
 def test_a_reader_that_goes_away_is_no_traceback(command: str) -> None:
     reader, writer = os.pipe()
     os.close(reader)

@@ -1,5 +1,6 @@
 """`report tuning`: knobs that leave a recipe's work and knowledge alone, and a search that resumes and finds."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -150,6 +151,13 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert text.index("| `tfp+stg` | 0.25 |") < text.index(kept) and text.count("\n| ") == 4
     assert (page.parent / "tables" / "tuning" / "tfp+stg@0.25.csv").read_text().count("\n") == TRIALS + 1
+
+
+def test_a_search_at_the_papers_steps_is_listed_too(whole, tmp_path):
+    (tmp_path / "tfp+stg.json").write_text(json.dumps({**whole[0], "budget": "paper"}))
+    write_results(tmp_path)
+    assert "| `tfp+stg` | paper |" in (tmp_path / "tuning.md").read_text()
+    assert (tmp_path / "tfp+stg@paper.csv").is_file()
 
 
 def test_scenes_of_tables_are_refused(small_scene):

@@ -100,10 +100,11 @@ class MatchTraining:
         """Write everything needed to go on."""
         save_training(path, self.step, self.networks, self.adam, key)
 
-    def resume(self, path: Path, key: str) -> None:
-        """Go on from a checkpoint if there is one. Raises UserError for a damaged or foreign one."""
-        if path.is_file():
+    def resume(self, path: Path, key: str) -> bool:
+        """Go on from a checkpoint; return whether there is one. Raises UserError for a damaged or foreign one."""
+        if there := path.is_file():
             self.step = resume_training(path, self.networks, self.adam, key)
+        return there
 
 
 def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int, start: str | None = None) -> str:
@@ -122,9 +123,8 @@ def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: 
 
 def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float) -> None:
     checkpoint, losses = out / "checkpoint.safetensors", out / "losses.csv"
-    begins = not checkpoint.is_file()
-    training.resume(checkpoint, key)
-    seen = note_shards(out / "trained_on.json", training.files, training.shards, fresh=begins)
+    resumed = training.resume(checkpoint, key)
+    seen = note_shards(out / "trained_on.json", training.files, training.shards, fresh=not resumed)
     curve = Curve(losses, training.step)
     recent: list[MatchLosses] = []
     saved = start = time.perf_counter()
