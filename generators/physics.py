@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,8 @@ class Physics:
         flicker_duty: share of a period in which an LED is on; 0 is a sine.
         warming_k: temperature of the sensors in the clip above that at calibration.
         reset_noise, read_noise, dead_ticks: see `sensor.model.Sensor`.
+        light: share of the light that reaches the sensors, in the clip and at calibration, as of a stopped-down lens.
+        lost_ticks: share of a clip's ticks that each camera loses; the scene lists them as gaps.
         noisy_others: frame and event cameras have noise, see `other_sensors`; spikes and truth stay the same.
     """
 
@@ -65,6 +68,8 @@ class Physics:
     reset_noise: float = 0.0
     read_noise: float = 0.0
     dead_ticks: float = 0.0
+    light: float = 1.0
+    lost_ticks: float = 0.0
     noisy_others: bool = False
 
     @property
@@ -79,7 +84,13 @@ class Physics:
         for name, camera in CAMERAS.items():
             if self == camera:
                 return "" if name == IDEAL else f"-{name}"
-        return "".join(f"-{word}" for name, word in _WORDS.items() if getattr(self, name))
+        changed = self.settings
+        words = (
+            f"{word}{_fraction(self.light)}" if name == "light" else word
+            for name, word in _WORDS.items()
+            if name in changed
+        )
+        return "".join(f"-{word}" for word in words)
 
     @property
     def dark_factor(self) -> float:
@@ -103,8 +114,18 @@ _WORDS = {
     "reset_noise": "reset",
     "read_noise": "read",
     "dead_ticks": "dead",
+    "light": "light",
+    "lost_ticks": "lost",
     "noisy_others": "others",
 }
+
+
+def _fraction(share: float) -> str:
+    """Return a share as a word: 1of4, or 2."""
+    found = Fraction(share).limit_denominator(1024)
+    return f"{found.numerator}of{found.denominator}" if found.denominator > 1 else str(found.numerator)
+
+
 IDEAL, REALISTIC = "ideal", "realistic"
 CAMERAS = {
     IDEAL: Physics(),
@@ -136,6 +157,10 @@ class PhysicsOptions:
         reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
         dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
+        light: Share of the light that reaches the sensors, in the clip and at calibration, such as 0.25; above 1
+            highlights saturate. The scene's id says how much: -light1of4.
+        lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:
+            commands that read it need --allow-gaps.
         noisy_others: Give the frame cameras shot and read noise, and the event cameras unequal thresholds, shot events
             and a refractory period, as published; spikes and truth do not change.
     """
@@ -154,6 +179,8 @@ class PhysicsOptions:
     reset_noise: float | None = None
     read_noise: float | None = None
     dead_ticks: float | None = None
+    light: float | None = None
+    lost_ticks: float | None = None
     noisy_others: bool = False
 
     def physics(self) -> Physics:
@@ -190,6 +217,8 @@ _RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
     "reset_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "read_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "dead_ticks": ("ticks from 0 to 100", 0, 100),
+    "light": ("a share from 1/1024 to 16", 1 / 1024, 16),
+    "lost_ticks": ("a share from 0 to 0.5", 0, 0.5),
 }
 
 

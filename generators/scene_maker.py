@@ -30,7 +30,6 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
-from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import render_tasks, streams
 from spike4dgs.generators.physics import given_cameras
@@ -235,7 +234,7 @@ class Maker:
                 splits=splits,
                 rate_hz=float(RATE_HZ),
                 n_ticks=job.n_ticks,
-                radiance_gain=SENSOR.radiance_gain,
+                radiance_gain=streams.radiance_gain(job),
                 targets=tuple(t for t in self.targets if t.camera in scored),
                 sensor=streams.sensor_facts(job),
                 source={
@@ -245,10 +244,14 @@ class Maker:
                     "versions": self._versions,
                 },
                 points=self._points,
+                gaps=tuple(gap.record for c in cameras for gap in streams.gaps_of(job, c)),
                 extras=streams.extras(job) | {"instances": self._object_names},
             ),
         )
-        clip, scene = self.store.instants(render_tasks.held_out_view(job), self.plan), open_scene(self._scene)
+        clip, scene = (
+            self.store.instants(render_tasks.held_out_view(job), self.plan),
+            open_scene(self._scene, allow_gaps=True),
+        )
         preview(clip.keys, clip.ticks, scene.stream(held_out), scene.radiance_gain, self._scene / "preview.webp")
         contact_sheet(scene, self._scene / "sheet.png")
         write_manifest(self._scene)

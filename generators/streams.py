@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.other_sensors import write_events
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import stream_name
+from spike4dgs.benchmark.spikes.gaps import Gap, present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
 from spike4dgs.generators.other_sensors import (
@@ -53,17 +54,31 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
     write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
     instants, clip = _lit(job, store, view, plan)
-    noisy, rng = job.physics.noisy_others, np.random.default_rng([*entropy, *b"others"])
+    noisy, light, rng = (
+        job.physics.noisy_others,
+        np.float32(job.physics.light),
+        np.random.default_rng([*entropy, *b"others"]),
+    )
     for tick, image in exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
-        shown = noisy_frame(image, FrameNoise(), rng) if noisy else image
+        shown = noisy_frame(image * light, FrameNoise(), rng) / light if noisy else image
         write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(shown))
     noise, again = EventNoise() if noisy else None, _lit(job, store, view, plan)[0]
     found = events(again.keys, again.ticks, job.n_ticks, RATE_HZ, noise=noise, rng=rng)
     write_events(scene / f"events/{camera.id}.npz", found)
-    charge = random_charge(*size, entropy)
+    charge, there, start = random_charge(*size, entropy), present(gaps_of(job, camera), job.n_ticks), 0
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:
         for packed in simulate(clip.keys, clip.ticks, job.n_ticks, warm, charge, means=clip.means):
+            packed[~there[start : start + len(packed)]] = 0
             writer.write(packed)
+            start += len(packed)
+
+
+def gaps_of(job: Job, camera: Camera) -> list[Gap]:
+    """Return the runs of ticks that a camera loses: a function of the seed, the world and the camera."""
+    rng = np.random.default_rng([job.seed, job.variant, *f"{job.world} {camera.id} lost".encode()])
+    lost = rng.random(job.n_ticks) < job.physics.lost_ticks
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).tolist()
+    return [Gap(camera.id, a, b - a, "lost") for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _lit(job: Job, store: KeyStore, view: int, plan: KeyPlan) -> tuple[Clip, Clip]:
@@ -77,6 +92,11 @@ def _lit(job: Job, store: KeyStore, view: int, plan: KeyPlan) -> tuple[Clip, Cli
     return Clip(dense, every), Clip(FlickeringMeans(store.at(view, plan), n, light, means), every[:-1], True)
 
 
+def radiance_gain(job: Job) -> float:
+    """Return the spikes per tick of a pixel that sees radiance 1."""
+    return SENSOR.radiance_gain * job.physics.light
+
+
 def sensor_of(job: Job, camera: Camera) -> Sensor:
     """Return a camera's sensor as it is calibrated; its maps belong to the camera, not to the world."""
     pixels = camera.height, camera.width, job.seed, camera.id
@@ -84,6 +104,7 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
         gain=gain_map(*pixels) if job.gain_map else None,
         dark=dark_map(*pixels) if job.dark_map else None,
         photons=SENSOR.photons_per_spike if job.shot_noise else None,
+        radiance_gain=radiance_gain(job),
         noise_seed=(job.seed, job.variant, *f"{job.world} {camera.id} photons".encode()),
         reset_noise=job.physics.reset_noise,
         read_noise=job.physics.read_noise,

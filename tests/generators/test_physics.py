@@ -12,6 +12,7 @@ from fake_renderer import render_fakes
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import from_nerfstudio
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.physics import CAMERAS, Physics, PhysicsOptions, from_settings, given_cameras, true_cameras
 from spike4dgs.generators.profiles import PROFILES, Job
@@ -33,6 +34,7 @@ def plain(stage, steps, total):
 def test_what_is_off_is_neither_in_the_id_nor_in_the_settings():
     assert JOB.id == "car-0-tiny" and "physics" not in JOB.settings
     assert job(psf_px=0.5, dead_ticks=1).id == "car-0-tiny-psf-dead"
+    assert [job(light=x).id for x in (1 / 16, 2)] == ["car-0-tiny-light1of16", "car-0-tiny-light2"]
     assert replace(JOB, physics=CAMERAS["realistic"]).id == "car-0-tiny-realistic"
     assert PhysicsOptions().physics() == CAMERAS["ideal"] == Physics()
 
@@ -64,6 +66,8 @@ def test_an_option_replaces_that_of_the_named_camera():
         ({"pose_noise_deg": -1.0}, "--pose-noise-deg"),
         ({"dead_ticks": -1}, "--dead-ticks"),
         ({"read_noise": 1.0}, "--read-noise"),
+        ({"light": 0.0}, "--light: expected a share from 1/1024 to 16"),
+        ({"lost_ticks": 1.0}, "--lost-ticks"),
     ],
 )
 def test_numbers_that_no_camera_has_are_one_line(options, words):
@@ -144,6 +148,34 @@ def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibrat
     counts = [open_stream(f / "spikes/cam_00.dat", 64, 40, 2e4, rows_bottom_up=True).counts(0, 80) for f in folders]
     added = np.mean(counts[1].astype(int) - counts[0]) / 80
     assert added == pytest.approx(sensor_of(JOB, cameras_of(JOB)[0]).dark.mean(), rel=0.1)
+
+
+def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    full, dim = (open_scene(Maker(job(light=x), tmp_path / str(x), plain).make()) for x in (1.0, 0.25))
+    assert dim.radiance_gain == full.radiance_gain / 4
+    for name in (f"images/{full.targets[0].name}.exr", "calibration/dark/cam_00.dat"):
+        assert (full.root / name).read_bytes() == (dim.root / name).read_bytes()
+    dark = sensor_of(JOB, cameras_of(JOB)[0]).dark
+    clips = [s.stream("cam_00").counts(0, 80) / 80 for s in (full, dim)]
+    flats = [s.recordings("cam_00").flat.counts(0, 500) / 500 for s in (full, dim)]
+    for of_full, of_dim in (clips, flats):
+        assert (of_dim - dark).mean() == pytest.approx((of_full - dark).mean() / 4, rel=0.02)
+
+
+def test_lost_ticks_are_zeros_that_the_scene_lists(tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    whole, holed = (Maker(job(lost_ticks=x), tmp_path / str(x), plain).make() for x in (0.0, 0.2))
+    with pytest.raises(UserError, match="--allow-gaps"):
+        open_scene(holed)
+    whole, holed = open_scene(whole), open_scene(holed, allow_gaps=True)
+    lost = []
+    for camera in whole.cameras:
+        there = present([g for g in holed.gaps if g.camera == camera], 80)
+        packed = [s.stream(camera).packed for s in (whole, holed)]
+        assert np.array_equal(packed[0][there], packed[1][there]) and not packed[1][~there].any()
+        lost.append(~there)
+    assert np.mean(lost) == pytest.approx(0.2, abs=0.08) and not np.array_equal(lost[0], lost[1])
 
 
 def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(tmp_path, monkeypatch):
