@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
@@ -81,17 +81,6 @@ def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
         for knowledge, rows, rivals in _leaders(group, own)
     ]
     return lines or [NO_LEAD if own else NOTHING]
-
-
-BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
-    "headline": lambda records: headline_block(NINE, records),
-    "lead": lambda records: lead_block(NINE, records),
-    "nine-scenes": lambda records: table_block(NINE, records),
-    "table1": lambda records: table_block(TABLE1, records),
-    "table1-scenes": lambda records: scenes_block(TABLE1, records),
-    "table2": lambda records: table_block(TABLE2, records),
-    "table2-scenes": lambda records: scenes_block(TABLE2, records),
-}
 
 
 def of_group(group: Group, records: Iterable[Record]) -> list[Record]:

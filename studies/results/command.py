@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.studies.results import conditions
 from spike4dgs.studies.results.code_state import check_clean, code_state, find_root
 from spike4dgs.studies.results.loose_figures import counts, loose_figures, read_ratchet, risen, tighten
 from spike4dgs.studies.results.pages import outdated, pages_of, write_pages
@@ -18,13 +19,15 @@ from spike4dgs.studies.results.plan import PLAN, TRIAL, Cell, cells_of
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
 
+_GROUPS = (*PLAN, conditions.GROUP)
+
 
 @dataclass(frozen=True)
 class Choice:
     """Which cells are measured, and how.
 
     Args:
-        only: Groups of the plan: table1, table2, or trial (two tiny scenes). All but trial if left out.
+        only: Groups of the plan: table1, table2, conditions, or trial (two tiny scenes). All but trial if left out.
         rows: Rows by name; all of the groups if left out.
         scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
         out: Folder for predictions and checkpoints.
@@ -83,10 +86,10 @@ def results(
 
 
 def _cells(choice: Choice) -> list[Cell]:
-    known = {group.name: group for group in (*PLAN, TRIAL)}
+    known = {group.name: group for group in (*_GROUPS, TRIAL)}
     if unknown := [name for name in choice.only if name not in known]:
         raise problem("--only", f"groups among {', '.join(known)}", ", ".join(unknown), "correct the names")
-    cells = cells_of([known[name] for name in choice.only] or PLAN)
+    cells = cells_of([known[name] for name in choice.only] or _GROUPS)
     rows = dict.fromkeys(cell.row for cell in cells)
     if unknown := [name for name in choice.rows if name not in rows]:
         raise problem("--rows", f"rows among {', '.join(rows)}", ", ".join(unknown), "correct the names")

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.studies.kit.blocks import pattern
-from spike4dgs.studies.results.blocks import BLOCKS
+from spike4dgs.studies.results.blocks import NINE, headline_block, lead_block, scenes_block, table_block
+from spike4dgs.studies.results.conditions import conditions_block
+from spike4dgs.studies.results.plan import TABLE1, TABLE2
 from spike4dgs.studies.results.records import Record
+
+BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
+    "conditions": conditions_block,
+    "headline": lambda records: headline_block(NINE, records),
+    "lead": lambda records: lead_block(NINE, records),
+    "nine-scenes": lambda records: table_block(NINE, records),
+    "table1": lambda records: table_block(TABLE1, records),
+    "table1-scenes": lambda records: scenes_block(TABLE1, records),
+    "table2": lambda records: table_block(TABLE2, records),
+    "table2-scenes": lambda records: scenes_block(TABLE2, records),
+}
 
 BLOCK = pattern("records")
 _MARKER = re.compile(r"^<!-- (?:records: .*|end records) -->$", re.MULTILINE)

@@ -122,7 +122,7 @@ def tuned_rows() -> tuple[Row, ...]:
 ALL_ROWS = (*tuned_rows(), *ROWS)
 TABLE1 = Group("table1", "Table 1: outdoor scenes", track_scenes("ideal", published(1).worlds), ALL_ROWS)
 TABLE2 = Group("table2", "Table 2: objects", track_scenes("ideal", published(2).worlds), ALL_ROWS)
-PLAN = (TABLE1, TABLE2)  # what pages show
+PLAN = (TABLE1, TABLE2)  # the tables of the paper; see also `conditions`
 
 # For trials of the machinery: seconds a cell. No page shows it.
 TRIAL = Group(

@@ -99,7 +99,7 @@ def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[str, Sc
     wanted = {cell.scene: cell.split for cell in cells}
     for name, split in wanted.items():
         if (folder / name).is_dir():
-            scenes[name] = open_scene(folder / name, split=split)
+            scenes[name] = open_scene(folder / name, allow_gaps=True, split=split)
             check_inputs(scenes[name])
     missing = [name for name in wanted if name not in scenes]
     if not scenes:

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import ttest_rel
 
 from spike4dgs.studies.results.blocks import (
-    BLOCKS,
     NINE,
     NO_LEAD,
     NOTHING,
@@ -19,6 +18,9 @@ from spike4dgs.studies.results.blocks import (
     table_block,
 )
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
+from spike4dgs.studies.results.conditions import CONDITIONS, WORLDS, conditions_block
+from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
+from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE2, Group, Row
 
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
@@ -182,7 +184,20 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
-    scenes = NINE.scenes if not name.startswith("table2") else TABLE2.scenes
+    scenes = {"conditions": ON_CONDITIONS, "table2": TABLE2}.get(name.removesuffix("-scenes"), NINE).scenes
     full = [record(row, s, 30 + k) for row in ("spike4dgs-x", "tfp+rig-flat+stg") for k, s in enumerate(scenes)]
     text = "\n".join(BLOCKS[name](full))
     assert "`spike4dgs-x`" in text and "`tfp+rig-flat+stg`" in text and "c0ffee000000" in text
+
+
+def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
+    assert len(set(ON_CONDITIONS.scenes)) == len(WORLDS) * len(CONDITIONS)
+    assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-1-small" in ON_CONDITIONS.scenes
+    first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
+    found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
+    found += [record(OURS, s, 29.0 - k) for k, s in enumerate(lens)]
+    found += [record(OURS, blur[0], 25.0)]
+    lines = conditions_block(found)
+    assert lines[2] == "| none |  | 32.50 / 30.50 |"
+    assert lines[3].endswith("| -2.00 / -2.00 |") and lines[4].endswith("| - |")
+    assert "5 of 156 planned cells" in lines[-1]

@@ -40,7 +40,7 @@ def test_blocks_are_replaced_and_nothing_else() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (PAGE.replace("table1", "table9"), "page.md: expected a block among headline, .*, found 'table9'"),
+        (PAGE.replace("table1", "table9"), "page.md: expected a block among conditions, .*, found 'table9'"),
         (PAGE.replace("<!-- end records -->\n", ""), "a marker `end records` below each"),
         (PAGE + "<!-- end records -->\n", "a marker `end records` below each"),
         (PAGE.replace("table1", "Table 1"), "a marker `end records` below each"),

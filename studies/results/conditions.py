@@ -1,0 +1,106 @@
+"""What each condition of camera and light costs a row: the same two worlds with and without it.
+
+Its cells are a group of the sweep's plan. The variant is one that no row was tuned on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from spike4dgs.generators.physics import PhysicsOptions
+from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance
+from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.records import Record
+
+WORLDS, VARIANT = ("car", "turntable"), 1
+_METRICS = ("psnr", "psnr_dynamic")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition, and the options of `make-dataset` that make it."""
+
+    name: str
+    options: str = ""
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The ids of its scenes, one for each world."""
+        physics = tyro.cli(PhysicsOptions, args=self.options.split()).physics()
+        return tuple(f"{world}-{VARIANT}-small{physics.suffix}" for world in WORLDS)
+
+
+CONDITIONS = (
+    Condition("none"),
+    Condition("lens, known", "--lens -0.2 0.03 --lens-spread 0.5"),
+    Condition("blur of 0.5 px", "--psf-px 0.5"),
+    Condition("poses 0.1 px off", "--pose-noise-deg 0.025"),
+    Condition("flicker of 8 %", "--flicker 0.08"),
+    Condition("dark rate doubled", "--warming-k 8"),
+    Condition("reset and read noise, dead tick", "--reset-noise 0.0009 --read-noise 0.006 --dead-ticks 1"),
+    Condition("5 % of ticks lost", "--lost-ticks 0.05"),
+    Condition("realistic camera", "--camera realistic"),
+    Condition("light 1/4", "--light 0.25"),
+    Condition("light 1/16", "--light 0.0625"),
+    Condition("light 1/64", "--light 0.015625"),
+    Condition("light times 2", "--light 2"),
+)
+GROUP = Group(
+    "conditions",
+    "Conditions of camera and light",
+    tuple(scene for condition in CONDITIONS for scene in condition.scenes),
+    (
+        Row("spike4dgs-x", 1, OUR_TRIALS, ours=True),
+        Row("tfp+rig-flat+stg"),
+        Row("spike4dgs", 1, OUR_TRIALS, ours=True),
+        Row("spk2img+stg"),
+        Row("tfp+stg"),
+        Row("tfp+4dgs"),
+    ),
+)
+
+
+def conditions_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of the table: PSNR without a condition, and what each one changes, in dB, by row."""
+    own = of_group(GROUP, records)
+    if not own:
+        return [NOTHING]
+    scores = {(r["row"], r["scene"], m): r["metrics"][m] for r in own if r["error"] is None for m in _METRICS}
+    rows = [row.name for row in GROUP.rows if any(row.name == r["row"] for r in own)]
+    first, *others = CONDITIONS
+    lines = [[first.name, "", *(_text(_means(scores, row, first), None) for row in rows)]]
+    lines += [
+        [c.name, f"`{c.options}`", *(_text(_means(scores, row, c), _means(scores, row, first)) for row in rows)]
+        for c in others
+    ]
+    heads = ("condition", "options of `make-dataset`", *(f"`{row}`" for row in rows))
+    legend = (
+        f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}, variant {VARIANT}. The first row lists "
+        "PSNR, the others its change."
+    )
+    return [*markdown(heads, lines), "", legend, "", provenance(GROUP, own)]
+
+
+Means = tuple[float, float] | None
+
+
+def _means(scores: dict[tuple[str, str, str], float], row: str, condition: Condition) -> Means:
+    """Return the means of the two metrics over a condition's scenes; None where one was not measured."""
+    found = [[scores.get((row, scene, m)) for scene in condition.scenes] for m in _METRICS]
+    if any(value is None for values in found for value in values):
+        return None
+    whole, moving = np.array(found, np.float64).mean(axis=1)
+    return float(whole), float(moving)
+
+
+def _text(found: Means, first: Means) -> str:
+    if found is None:
+        return "-"
+    if first is None:
+        return " / ".join(f"{x:.2f}" for x in found)
+    return " / ".join(f"{x - y:+.2f}" for x, y in zip(found, first, strict=True))
