@@ -22,7 +22,7 @@ from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.environment import command_line, cpu_name, harness
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -63,6 +63,8 @@ def dark_poses(
 ) -> int:
     """Estimate arrays' poses at three lights from clips of three lengths: OUT/poses.md, .csv, .json and .png.
 
+    OUT/arrays/ has the rows of each array, so a killed run resumes.
+
     Args:
         data: Folder of shards of `make-msdi-data --resting 16`; those of the hidden variants are taken.
         bursts: Arrays of each shard.
@@ -76,7 +78,7 @@ def dark_poses(
     rows: list[dict[str, Any]] = []
     start, arrays = time.perf_counter(), [(f, n) for f in files for n in _resting(f, bursts)]
     for done, (file, number) in enumerate(arrays, start=1):
-        rows += _measured(file, number, seed)
+        rows += _kept(file, number, seed, out / "arrays")
         passed = time.perf_counter() - start
         left = passed / done * (len(arrays) - done)
         print(f"{file.facts.id}: {done}/{len(arrays)} arrays, {passed:.0f} s, about {left:.0f} s left", flush=True)
@@ -91,6 +93,18 @@ def _resting(file: BurstFile, count: int) -> Sequence[int]:
     f = file.facts
     chosen = np.unique(np.linspace(0, f.resting - 1, min(count, f.resting)).round().astype(int))
     return [f.rigs * f.instants + int(k) for k in chosen]
+
+
+def _kept(file: BurstFile, number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
+    """Return an array's rows: those in `folder` where the same code, weights and conditions made them."""
+    path = folder / f"{file.facts.id}-{number}.json"
+    by = {"commit": harness()["commit"], "weights": WEIGHTS.in_use().sha256, "seed": seed}
+    by |= {"lights": list(LIGHTS), "ticks": list(TICKS)}
+    if path.is_file() and (found := read_json(path, "the poses of an array")).get("by") == by:
+        return list(found["rows"])
+    rows = _measured(file, number, seed)
+    write_json(path, {"by": by, "rows": rows})
+    return rows
 
 
 def _measured(file: BurstFile, number: int, seed: int) -> list[dict[str, Any]]:

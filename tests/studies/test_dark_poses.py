@@ -73,6 +73,11 @@ def test_the_table_has_shares_of_pairs_in_each_condition(
     assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(ESTIMATORS)
     assert (tmp_path / "out" / "poses.png").stat().st_size > 1000
     assert "1/1 arrays" in capsys.readouterr().out
+    monkeypatch.setattr(dark, "see", None)  # an array that is done is not measured again
+    assert dark_poses(tmp_path, bursts=1, out=tmp_path / "out") == 0
+    assert json.loads((tmp_path / "out" / "poses.json").read_text())["rows"] == rows
+    with pytest.raises(TypeError):  # with another seed it is
+        dark_poses(tmp_path, bursts=1, seed=1, out=tmp_path / "out")
 
 
 def test_a_folder_without_hidden_arrays_at_rest_is_refused(tmp_path: Path) -> None:
