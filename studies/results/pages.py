@@ -12,6 +12,7 @@ from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.results.blocks import NINE, headline_block, lead_block, scenes_block, table_block
 from spike4dgs.studies.results.conditions import conditions_block
 from spike4dgs.studies.results.plan import TABLE1, TABLE2
+from spike4dgs.studies.results.published import published_block
 from spike4dgs.studies.results.records import Record
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
@@ -19,6 +20,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "headline": lambda records: headline_block(NINE, records),
     "lead": lambda records: lead_block(NINE, records),
     "nine-scenes": lambda records: table_block(NINE, records),
+    "published": published_block,
     "table1": lambda records: table_block(TABLE1, records),
     "table1-scenes": lambda records: scenes_block(TABLE1, records),
     "table2": lambda records: table_block(TABLE2, records),

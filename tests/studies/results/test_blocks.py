@@ -21,7 +21,8 @@ from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.conditions import CONDITIONS, WORLDS, conditions_block
 from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.pages import BLOCKS
-from spike4dgs.studies.results.plan import TABLE2, Group, Row
+from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
+from spike4dgs.studies.results.published import published_block
 
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
 OURS = "spike4dgs-x"
@@ -185,9 +186,23 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
     scenes = {"conditions": ON_CONDITIONS, "table2": TABLE2}.get(name.removesuffix("-scenes"), NINE).scenes
-    full = [record(row, s, 30 + k) for row in ("spike4dgs-x", "tfp+rig-flat+stg") for k, s in enumerate(scenes)]
-    text = "\n".join(BLOCKS[name](full))
-    assert "`spike4dgs-x`" in text and "`tfp+rig-flat+stg`" in text and "c0ffee000000" in text
+    rows = ("spike4dgs", "tfp+stg") if name == "published" else ("spike4dgs-x", "tfp+rig-flat+stg")
+    text = "\n".join(BLOCKS[name]([record(row, s, 30 + k) for row in rows for k, s in enumerate(scenes)]))
+    assert all(f"`{row}`" in text for row in rows) and "c0ffee000000" in text
+
+
+def test_the_order_of_the_paper_stands_beside_ours_for_complete_rows_of_both():
+    """The paper's means have tfp+4dgs before tfp+stg before tfp+d3dgs: of three pairs, ours here agree in two."""
+    ours = {"tfp+4dgs": 34.0, "tfp+stg": 35.0, "tfp+d3dgs": 31.0, "spike4dgs-x": 40.0}
+    found = [record(row, s, value) for row, value in ours.items() for s in TABLE1.scenes]
+    found += [record("tfi+stg", TABLE1.scenes[0], 39.0)]
+    lines = published_block(found)
+    assert lines[2:5] == [
+        "| `tfp+stg` | 37.00 | 1 / 2 | 0.9700 | 1 / 2 |",
+        "| `tfp+4dgs` | 36.00 | 2 / 1 | 0.9700 | 1 / 1 |",
+        "| `tfp+d3dgs` | 33.00 | 3 / 3 | 0.9700 | 1 / 3 |",
+    ]
+    assert lines[6].startswith(f"Kendall's tau with the published order: PSNR {(2 - 1) / 3:.2f}")
 
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
