@@ -36,7 +36,7 @@ _MOST_NOISE = 0.2  # thresholds
 
 @dataclass(frozen=True)
 class Physics:
-    """Deviations of the cameras and the light from ideal ones; each is off by default.
+    """Deviations of the cameras, the light and the pace from ideal ones; each is off by default.
 
     Attributes:
         lens: distortion of every camera, or their mean.
@@ -52,6 +52,7 @@ class Physics:
         reset_noise, read_noise, dead_ticks: see `sensor.model.Sensor`.
         light: share of the light that reaches the sensors, in the clip and at calibration, as of a stopped-down lens.
         lost_ticks: share of a clip's ticks that each camera loses; the scene lists them as gaps.
+        speed: of all motion, in units of the world's own.
         noisy_others: frame and event cameras have noise, see `other_sensors`; spikes and truth stay the same.
     """
 
@@ -70,6 +71,7 @@ class Physics:
     dead_ticks: float = 0.0
     light: float = 1.0
     lost_ticks: float = 0.0
+    speed: float = 1.0
     noisy_others: bool = False
 
     @property
@@ -84,13 +86,9 @@ class Physics:
         for name, camera in CAMERAS.items():
             if self == camera:
                 return "" if name == IDEAL else f"-{name}"
-        changed = self.settings
-        words = (
-            f"{word}{_fraction(self.light)}" if name == "light" else word
-            for name, word in _WORDS.items()
-            if name in changed
-        )
-        return "".join(f"-{word}" for word in words)
+        on = [(name, word) for name, word in _WORDS.items() if name in self.settings]
+        sizes = {"light": _fraction(self.light), "speed": _fraction(self.speed)}
+        return "".join(f"-{word}{sizes.get(name, '')}" for name, word in on)
 
     @property
     def dark_factor(self) -> float:
@@ -116,6 +114,7 @@ _WORDS = {
     "dead_ticks": "dead",
     "light": "light",
     "lost_ticks": "lost",
+    "speed": "speed",
     "noisy_others": "others",
 }
 
@@ -161,6 +160,7 @@ class PhysicsOptions:
             highlights saturate. The scene's id says how much: -light1of4.
         lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:
             commands that read it need --allow-gaps.
+        speed: Speed of all motion in units of the world's own, such as 2. The scene's id says how much: -speed2.
         noisy_others: Give the frame cameras shot and read noise, and the event cameras unequal thresholds, shot events
             and a refractory period, as published; spikes and truth do not change.
     """
@@ -181,6 +181,7 @@ class PhysicsOptions:
     dead_ticks: float | None = None
     light: float | None = None
     lost_ticks: float | None = None
+    speed: float | None = None
     noisy_others: bool = False
 
     def physics(self) -> Physics:
@@ -219,6 +220,7 @@ _RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
     "dead_ticks": ("ticks from 0 to 100", 0, 100),
     "light": ("a share from 1/1024 to 16", 1 / 1024, 16),
     "lost_ticks": ("a share from 0 to 0.5", 0, 0.5),
+    "speed": ("a factor from 1/64 to 16", 1 / 64, 16),
 }
 
 

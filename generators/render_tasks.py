@@ -26,7 +26,7 @@ from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
 from spike4dgs.generators.rendering.like_surfaces import join_soft
 from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic, StaticViews, anchor_s
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS, WorldScene
+from spike4dgs.generators.worlds import WORLDS, WorldScene, build_at
 
 _POINTS_PER_VIEW = 250  # of the sparse model
 _PIXELS = 1 << 15  # of a range of the background, or more: a second of work or longer
@@ -64,7 +64,7 @@ def _recorded_profile(sampling: Mapping[str, Any]) -> Profile:
 @lru_cache(maxsize=1)
 def world_of(job: Job) -> WorldScene:
     """Return the world as a job builds it."""
-    return WORLDS[job.world].build(job.seed, job.variant, job.seconds)
+    return build_at(WORLDS[job.world], job.seed, job.variant, job.seconds, job.physics.speed)
 
 
 @lru_cache(maxsize=1)

@@ -12,9 +12,9 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
-from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene
+from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, build_at
 
-__all__ = ["OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene"]
+__all__ = ["OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene", "build_at"]
 
 GROUP = "spike4dgs.worlds"
 

@@ -49,6 +49,7 @@ CONDITIONS = (
     Condition("light 1/16", "--light 0.0625"),
     Condition("light 1/64", "--light 0.015625"),
     Condition("light times 2", "--light 2"),
+    Condition("twice as fast", "--speed 2"),
 )
 GROUP = Group(
     "conditions",

@@ -16,7 +16,7 @@ from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.physics import CAMERAS, Physics, PhysicsOptions, from_settings, given_cameras, true_cameras
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.render_tasks import cameras_of, recorded_job
+from spike4dgs.generators.render_tasks import cameras_of, recorded_job, world_of
 from spike4dgs.generators.scene_maker import Maker
 from spike4dgs.generators.streams import sensor_of
 
@@ -35,6 +35,7 @@ def test_what_is_off_is_neither_in_the_id_nor_in_the_settings():
     assert JOB.id == "car-0-tiny" and "physics" not in JOB.settings
     assert job(psf_px=0.5, dead_ticks=1).id == "car-0-tiny-psf-dead"
     assert [job(light=x).id for x in (1 / 16, 2)] == ["car-0-tiny-light1of16", "car-0-tiny-light2"]
+    assert job(speed=1.5, flicker=0.1).id == "car-0-tiny-flicker-speed3of2"
     assert replace(JOB, physics=CAMERAS["realistic"]).id == "car-0-tiny-realistic"
     assert PhysicsOptions().physics() == CAMERAS["ideal"] == Physics()
 
@@ -68,6 +69,7 @@ def test_an_option_replaces_that_of_the_named_camera():
         ({"read_noise": 1.0}, "--read-noise"),
         ({"light": 0.0}, "--light: expected a share from 1/1024 to 16"),
         ({"lost_ticks": 1.0}, "--lost-ticks"),
+        ({"speed": 0.0}, "--speed"),
     ],
 )
 def test_numbers_that_no_camera_has_are_one_line(options, words):
@@ -161,6 +163,16 @@ def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_trut
     flats = [s.recordings("cam_00").flat.counts(0, 500) / 500 for s in (full, dim)]
     for of_full, of_dim in (clips, flats):
         assert (of_dim - dark).mean() == pytest.approx((of_full - dark).mean() / 4, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["car", "bird"])  # rigid, and deforming
+def test_twice_the_speed_is_the_same_motion_in_half_the_time(name):
+    job = replace(JOB, world=name)
+    fast = world_of(replace(job, physics=Physics(speed=2)))
+    slow = world_of(replace(job, seconds=2 * job.seconds))  # the same motion
+    for t_s in (0.0, 0.0011, job.seconds):
+        assert np.array_equal(fast.moving_points(t_s), slow.moving_points(2 * t_s))
+    assert fast.duration_s == job.seconds and fast.object_names == slow.object_names
 
 
 def test_lost_ticks_are_zeros_that_the_scene_lists(tmp_path, monkeypatch):

@@ -215,4 +215,4 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     lines = conditions_block(found)
     assert lines[2] == "| none |  | 32.50 / 30.50 |"
     assert lines[3].endswith("| -2.00 / -2.00 |") and lines[4].endswith("| - |")
-    assert "5 of 156 planned cells" in lines[-1]
+    assert "5 of 168 planned cells" in lines[-1]
