@@ -30,7 +30,7 @@ from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
-from spike4dgs.method.self_calibration.dark_drift import in_todays_dark
+from spike4dgs.method.self_calibration.from_clip import as_in_clip
 from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, measure
 from spike4dgs.method.supervision.base import Supervision
@@ -142,10 +142,7 @@ class RecipeMethod(Shown):
         return changed
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
-        """Fit the training views; see `benchmark.method.Method`.
-
-        Raises UserError for a foreign checkpoint, or a device that is not there.
-        """
+        """Fit the training views, see `benchmark.method.Method`. Raises UserError: a foreign checkpoint, no device."""
         check_device(request.device)
         settings: dict[str, Any] = self._for(request)
         request.progress(0, 1, "initialisation")
@@ -153,7 +150,8 @@ class RecipeMethod(Shown):
         if isinstance(self.images, RecordedImages):
             scene = without_spikes(scene)
             recorded = self.images.read(scene, choose_ticks(scene.n_ticks, settings["images"]))
-        straight, own = as_pinholes(scene := in_todays_dark(scene)), settings["initialization"]
+        scene = as_in_clip(scene, request.seed, poses=not self.initialization.estimates_poses)
+        straight, own = as_pinholes(scene), settings["initialization"]
         start = self.initialization.start(StartRequest(straight, request.seed, own, request.device, recorded))
         start = replace(start, cameras=with_lenses(straight, start.cameras))
         return self._fit(scene, start, settings, request, recorded)

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.arrays import Float32, Float64, Int64
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.starts.matched_poses import Seen, read_matches
 from spike4dgs.method.starts.plane_sweep import widest_baseline
-from spike4dgs.method.starts.structure_from_motion import FeatureSettings, find_features
+from spike4dgs.method.starts.structure_from_motion import FEATURES, FeatureSettings, find_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,10 @@ class Tracks:
         return int(self.point.max()) + 1 if len(self.point) else 0
 
 
-def find_tracks(cameras: Sequence[Camera], images: Float32, seed: int) -> Tracks:
+def find_tracks(cameras: Sequence[Camera], images: Float32, seed: int, features: FeatureSettings = FEATURES) -> Tracks:
     """Return the tracks through images of all views [C, H, W], linear radiance. The same seed gives the same tracks."""
-    with find_features(cameras, images, seed, FeatureSettings()) as found:
-        return joined(read_matches(found, FeatureSettings().enlarge))
+    with find_features(cameras, images, seed, features) as found:
+        return joined(read_matches(found, features.enlarge))
 
 
 def joined(seen: Seen) -> Tracks:

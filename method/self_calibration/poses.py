@@ -44,7 +44,7 @@ class PoseCheck:
 def check_poses(scene: TrainingScene, seed: int = 0, s: AdjustSettings = DEFAULTS) -> PoseCheck:
     """Return how well the given poses explain what does not move, and poses near them that explain it best."""
     seen = as_pinholes(scene)
-    tracks = find_tracks(seen.cameras, _means(seen), seed)
+    tracks = find_tracks(seen.cameras, mean_images(seen), seed)
     if tracks.points < LEAST_POINTS:
         return PoseCheck(tracks.points, np.nan, np.nan, {}, scene.cameras)
     given = adjust(seen.cameras, tracks, s, free=[False] * len(seen.cameras))
@@ -67,14 +67,14 @@ def pose_of_another(
     repaired frame. With too few features in common it is the given one.
     """
     wider = as_pinholes(with_camera(scene, camera, stream, recordings))
-    tracks = find_tracks(wider.cameras, _means(wider), seed)
+    tracks = find_tracks(wider.cameras, mean_images(wider), seed)
     if int((tracks.camera == len(scene.cameras)).sum()) < LEAST_POINTS:
         return camera
     found: Adjusted = adjust(wider.cameras, tracks, s, free=[False] * len(scene.cameras) + [True])
     return with_lenses(wider, found.cameras)[-1]
 
 
-def _means(scene: TrainingScene) -> Float32:
+def mean_images(scene: TrainingScene) -> Float32:
     """Return the mean image of each view over the clip [C, H, W]: what moves is a blur."""
     return window_means(scene, 0, scene.n_ticks, flat_field=bool(scene.calibrations))
 

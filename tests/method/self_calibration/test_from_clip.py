@@ -1,0 +1,45 @@
+"""What a clip tells of its cameras before a fit: right poses stay as they are, those a little off are mended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from clock_world import ClockWorld
+from scipy.spatial.transform import Rotation
+
+from spike4dgs.generators.physics import Physics, given_cameras
+from spike4dgs.method.self_calibration.from_clip import as_in_clip, at_mended_poses
+
+SCENE = ClockWorld(width=240, height=152, n_ticks=96, travel=0.1).training
+
+
+def turns_px(cameras) -> float:
+    """RMS distance by which the cameras' turns move pixels, less the turn that all have in common."""
+    turns = np.stack(
+        [Rotation.from_matrix(c.R.T @ t.R).as_rotvec() for c, t in zip(cameras, SCENE.cameras, strict=True)]
+    )
+    turns -= turns.mean(axis=0)
+    return float(np.sqrt(np.mean(turns[:, :2] ** 2)) * SCENE.cameras[0].fx)
+
+
+def test_right_poses_stay_and_poses_a_little_off_are_mended(capsys: pytest.CaptureFixture[str]) -> None:
+    assert at_mended_poses(SCENE, 0) is SCENE and as_in_clip(SCENE, 0, poses=True) is SCENE
+    for seed in range(3):
+        given = given_cameras(SCENE.cameras, "none", Physics(pose_noise_deg=0.03), [seed])
+        off = replace(SCENE, cameras=given)
+        found = as_in_clip(off, 0, poses=True).cameras
+        assert turns_px(found) < 0.5 * turns_px(given)
+        assert "the given poses are off" in capsys.readouterr().err
+        assert as_in_clip(off, 0, poses=False) is off
+    again = as_in_clip(off, 0, poses=True).cameras
+    assert all(np.array_equal(a.R, b.R) and np.array_equal(a.t, b.t) for a, b in zip(again, found, strict=True))
+
+
+def test_a_clip_that_shows_too_little_changes_nothing() -> None:
+    off = replace(SCENE, cameras=given_cameras(SCENE.cameras, "none", Physics(pose_noise_deg=0.03), [0]))
+    one = replace(off, cameras=off.cameras[:1], streams=off.streams[:1], recordings=off.recordings[:1])
+    black = replace(off, streams=tuple(replace(s, packed=np.zeros_like(s.packed)) for s in off.streams))
+    for scene in (one, black):
+        assert at_mended_poses(scene, 0) is scene
