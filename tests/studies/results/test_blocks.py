@@ -207,7 +207,7 @@ def test_the_order_of_the_paper_stands_beside_ours_for_complete_rows_of_both():
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
     assert len(set(ON_CONDITIONS.scenes)) == len(WORLDS) * len(CONDITIONS)
-    assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-1-small" in ON_CONDITIONS.scenes
+    assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-2-small" in ON_CONDITIONS.scenes
     first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
     found += [record(OURS, s, 29.0 - k) for k, s in enumerate(lens)]
