@@ -22,6 +22,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import open_stream
 
 
@@ -48,13 +49,15 @@ def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size:
     if not {"flat_radiance", "flat_ticks", "dark_ticks"} <= set(facts):
         return None
     order, found = bool(meta["sensor"]["rows_bottom_up"]), list[Recording]()
+    dead = float(meta["sensor"].get("dead_ticks", 0))
     for name in ("flat", "dark"):
         path, ticks = f"calibration/{name}/{camera}", int(facts[f"{name}_ticks"])
         if f"{path}.npz" in files.files and f"{path}.dat" not in files.files:
-            found.append(open_counted(files.path(f"{path}.npz"), *size, ticks))
+            found.append(replace(open_counted(files.path(f"{path}.npz"), *size, ticks), dead_ticks=dead))
             continue
         raw = files.path(f"{path}.dat")
-        found.append(open_stream(raw, *size, float(meta["rate_hz"]), rows_bottom_up=order, n_ticks=ticks))
+        stream = open_stream(raw, *size, float(meta["rate_hz"]), rows_bottom_up=order, n_ticks=ticks)
+        found.append(replace(stream, dead_ticks=dead))
     return Recordings(found[0], found[1], float(facts["flat_radiance"]))
 
 
@@ -98,7 +101,11 @@ def estimate(recordings: Recordings) -> Calibration:
 
 
 def rates(recording: Recording) -> Float64:
-    """Return spikes per tick [H, W] under steady light; a pixel without spikes counts as having half of one."""
+    """Return the charge per tick [H, W] under steady light: spikes per tick, while pixels collect light.
+
+    A pixel without spikes counts as having half of one.
+    """
     first, last, total = first_last_total(recording)
     span = np.maximum(last - first, 1)
-    return np.asarray(np.where(total > 1, (total - 1) / span, np.maximum(total, 0.5) / recording.n_ticks))
+    fired = np.where(total > 1, (total - 1) / span, np.maximum(total, 0.5) / recording.n_ticks)
+    return np.asarray(gathered(fired, recording.dead_ticks))

@@ -36,6 +36,7 @@ class CountedRecording:
     windows: UInt8  # [N, H, W] its spikes in each whole window of WINDOW_TICKS, from tick 0 on
     n_ticks: int
     source: str = "memory"  # the file, for messages
+    dead_ticks: float = 0.0  # how long a pixel collects no light after a spike
 
     @property
     def width(self) -> int:

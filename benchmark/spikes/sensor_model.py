@@ -51,6 +51,26 @@ class SensorModel:
 SENSOR = SensorModel()
 
 
+LEAST_LIVE = 1 / 16  # of the time: a pixel that fires in every tick has seen at most 16 thresholds a tick
+
+
+def gathered(rate: Any, dead_ticks: float) -> Any:
+    """Return the charge per tick behind rates in spikes per tick: `rate` itself where no tick is dead.
+
+    A pixel that collects no light for N ticks after each spike fires at r = x / (1 + N x) in light that gives it the
+    charge x a tick. So x = r / (1 - N r): light is proportional to 1 / (interval - N).
+
+    >>> gathered(np.array([0.0, 1 / 3]), 1.0).round(6)
+    array([0. , 0.5])
+    """
+    return rate / np.maximum(1 - dead_ticks * rate, LEAST_LIVE) if dead_ticks else rate
+
+
+def fired(charge: Any, dead_ticks: float) -> Any:
+    """Return the spikes per tick of pixels that gather `charge` a tick: the inverse of `gathered`."""
+    return charge / (1 + dead_ticks * charge) if dead_ticks else charge
+
+
 # The next two functions take scalars and arrays: NumPy runs them as they are, and numba compiles them for scalars.
 
 

@@ -15,6 +15,7 @@ from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.screen.shown import Shown
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
 from spike4dgs.method.settings import Settings
@@ -109,7 +110,7 @@ class ImageMaker(Shown):
                 image[:] = self.corrected(stream, tick, camera)
             else:
                 image[:] = self.rate(stream, tick, self.settings)
-        return self._radiance(images, gain, camera)
+        return self._radiance(gathered(images, stream.dead_ticks), gain, camera)
 
     def with_spans(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
@@ -123,7 +124,8 @@ class ImageMaker(Shown):
         for tick in ticks:
             _require_tick(stream, tick)
         found = [self.rate_over(stream, tick, self.settings) for tick in ticks]
-        return self._radiance(np.stack([rate for rate, _ in found]), gain, camera), np.stack([s for _, s in found])
+        rates = gathered(np.stack([rate for rate, _ in found]), stream.dead_ticks)
+        return self._radiance(rates, gain, camera), np.stack([s for _, s in found])
 
     def _radiance(self, images: Float32, gain: float, camera: Calibration | None) -> Float32:
         """Return radiance from rates [n, H, W], which may be overwritten."""

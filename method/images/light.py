@@ -21,6 +21,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 _BLOCK = 16  # px
@@ -90,7 +91,7 @@ def _block_counts(stream: SpikeStream, clock: Clock, starts: Sequence[int]) -> F
     found = np.empty((rows * columns, len(starts)))
     for k, start in enumerate(starts):
         counts = stream.counts(*local_window(clock, start, start + _WINDOW, stream.n_ticks))
-        whole = counts[: rows * _BLOCK, : columns * _BLOCK].astype(np.float64)
+        whole = gathered(counts[: rows * _BLOCK, : columns * _BLOCK].astype(np.float64), stream.dead_ticks / _WINDOW)
         found[:, k] = whole.reshape(rows, _BLOCK, columns, _BLOCK).sum(axis=(1, 3)).ravel()
     stream.release()
     return found

@@ -26,6 +26,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.lens import resample
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.training_views.pinholes import Lens, lenses_of
 
@@ -58,7 +59,7 @@ def window_image(viewer: Viewer, tick: int, half: int, blur_px: float) -> Float6
     start, stop = tick - half, tick + half
     if start < 0 or stop > stream.n_ticks or not _whole(stream, start, stop):
         return None
-    rate = (stream.counts(start, stop) / (stop - start)).astype(np.float32)
+    rate = gathered(stream.counts(start, stop) / (stop - start), stream.dead_ticks).astype(np.float32)
     found = viewer.calibration
     image = found.radiance(rate) if found else rate / np.float32(viewer.radiance_gain * viewer.state.gain)
     image = image.astype(np.float64)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float32, Mask
 from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.training_views.changes import COUNTS, RECORDED, ChangeSettings, changing, without_specks
@@ -112,11 +113,11 @@ def _clocks(scene: TrainingScene) -> list[Clock]:
 
 
 def _rate(stream: SpikeStream, start: int, stop: int) -> Float32:
-    """Return mean spikes per tick [H, W]; clips of any length are counted in parts."""
+    """Return the mean charge per tick [H, W]; clips of any length are counted in parts."""
     parts = range(start, stop, 65535)
     total = np.sum([stream.counts(a, min(a + 65535, stop)) for a in parts], axis=0, dtype=np.float64)
     stream.release()
-    return np.asarray(total / (stop - start), np.float32)
+    return np.asarray(gathered(total / (stop - start), stream.dead_ticks), np.float32)
 
 
 def _seen(scene: TrainingScene, moving: Sequence[Mask]) -> list[Mask]:

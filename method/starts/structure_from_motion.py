@@ -25,6 +25,7 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.training_views.pinholes import undistorted
 
@@ -200,8 +201,8 @@ def _at(image: Float32, xy: NDArray[np.float64]) -> float:
 def clip_means(scene: TrainingScene) -> Float32:
     """Return the mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
     ticks = min(scene.n_ticks, 65535)
-    counts = np.stack([s.counts(0, ticks) for s in scene.streams]).astype(np.float32)
-    return undistorted(scene, counts / np.float32(ticks * scene.radiance_gain), unseen=None)
+    counts = [gathered(s.counts(0, ticks).astype(np.float32), s.dead_ticks / ticks) for s in scene.streams]
+    return undistorted(scene, np.stack(counts) / np.float32(ticks * scene.radiance_gain), unseen=None)
 
 
 def map_views(

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.camera_state import local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import fired
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.training_views.training_images import bad_pixels, missing_images
 
@@ -31,6 +32,7 @@ class SpikeCameras(nn.Module):
     def __init__(self, scene: TrainingScene) -> None:
         super().__init__()
         first = scene.streams[0]
+        self.dead_ticks = first.dead_ticks
         white = np.full((len(scene.streams), first.height, first.width), scene.radiance_gain, np.float32)
         dark = np.zeros_like(white)
         white *= np.array([scene.state(c.id).gain for c in scene.cameras], np.float32)[:, None, None]
@@ -43,9 +45,13 @@ class SpikeCameras(nn.Module):
         self.register_buffer("dark", torch.from_numpy(dark), persistent=False)
 
     def rate(self, image: Tensor, views: tuple[int, ...]) -> Tensor:
-        """Return the charge per tick [V, H, W] of the cameras `views` whose renders are the radiance `image`."""
+        """Return the spikes per tick [V, H, W] of the cameras `views` whose renders are the radiance `image`.
+
+        They are the charge per tick, where no tick is dead.
+        """
         chosen = list(views)
-        return image * self.white[chosen] + self.dark[chosen]
+        found: Tensor = fired(image * self.white[chosen] + self.dark[chosen], self.dead_ticks)
+        return found
 
 
 def recorded(scene: TrainingScene, sample: Sample, ticks: int) -> tuple[Tensor, int]:

@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from small_scenes import array_cameras
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import fired, gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.starts.rig import RigSettings, rig
+from spike4dgs.method.supervision.spike_cameras import SpikeCameras
 
 GAIN, TICKS = 0.6, 200
 
@@ -23,16 +26,20 @@ GAIN, TICKS = 0.6, 200
 def record(camera, sensor, light, n_ticks, seed):
     keys = [np.broadcast_to(np.float32(light), (camera.height, camera.width))] * 2
     packed = np.concatenate(list(simulate(keys, [0, n_ticks], n_ticks, sensor, random_charge(*keys[0].shape, [seed]))))
-    return SpikeStream(packed, camera.width, camera.height, 2e4, True)
+    return SpikeStream(packed, camera.width, camera.height, 2e4, True, dead_ticks=sensor.dead_ticks)
 
 
 @pytest.fixture(scope="module")
 def scene() -> TrainingScene:
+    return uneven_scene()
+
+
+def uneven_scene(dead_ticks: float = 0.0) -> TrainingScene:
     """Cameras of uneven pixels in front of a soft gradient of light."""
     cameras, streams, recordings = array_cameras(), [], []
     for i, camera in enumerate(cameras):
         pixels = camera.height, camera.width, 0, camera.id
-        sensor = Sensor(GAIN, 1.1 * gain_map(*pixels), 4 * dark_map(*pixels))
+        sensor = Sensor(GAIN, 1.1 * gain_map(*pixels), 4 * dark_map(*pixels), dead_ticks=dead_ticks)
         streams.append(record(camera, sensor, light(camera), TICKS, i))
         flat, dark = record(camera, sensor, 0.7, 500, i), record(camera, sensor, 0.0, 2000, i)
         recordings.append(Recordings(flat, dark, 0.7))
@@ -66,3 +73,24 @@ def test_first_points_take_the_corrected_gray(scene):
     plain, flat = rig(scene).values, rig(scene, RigSettings(flat_field=True)).values
     assert plain.max() > 0.85 and flat.max() < 0.82
     np.testing.assert_array_equal(rig(replace(scene, recordings=()), RigSettings(flat_field=True)).values, plain)
+
+
+def test_dead_ticks_bend_the_response_and_are_known():
+    """A pixel that rests for a tick after each spike fires at x / (1 + x): 0.3 in place of 0.43 spikes a tick."""
+    scene = uneven_scene(dead_ticks=1.0)
+    unknown = replace(scene, streams=tuple(replace(s, dead_ticks=0.0) for s in scene.streams))
+    assert error(scene, flat_field=True) < 0.012 and error(unknown, flat_field=True) > 0.1
+    assert rig(scene, RigSettings(flat_field=True)).values.max() < 0.83
+    cameras = SpikeCameras(scene)
+    truth = torch.from_numpy(np.stack([light(c) for c in scene.cameras]))
+    seen = np.stack([s.counts(0, TICKS) / TICKS for s in scene.streams])
+    expected = cameras.rate(truth, tuple(range(len(scene.cameras)))).numpy()
+    assert np.abs(expected - seen).mean() < 0.004 and expected.max() < 0.4
+
+
+@pytest.mark.parametrize("dead_ticks", [0.0, 0.5, 1.0, 3.0])
+def test_charge_and_spikes_are_each_others_inverse(dead_ticks):
+    charge = np.linspace(0, 2, 50)
+    np.testing.assert_allclose(gathered(fired(charge, dead_ticks), dead_ticks), charge, atol=1e-12)
+    assert np.isfinite(gathered(np.array([0.0, 0.5, 1.0]), dead_ticks)).all(), "a tick with a spike in each is no error"
+    assert dead_ticks or gathered(charge, 0.0) is charge
