@@ -4,75 +4,88 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 CHILD = r"""
-import builtins, importlib, io, os, pathlib, sys
+import builtins, importlib, io, os, pathlib, sys, traceback
 
-system = sys.argv[1]
 # Libraries look at the system while they load; ours are loaded after it has changed.
 import distributed, drjit, fsspec, jsonschema, matplotlib.pyplot, mitsuba, mujoco, numba, psutil, pycolmap, rich.console
 import safetensors.torch, scipy.optimize, scipy.spatial, skimage.metrics, torch, tyro, usb.core, usb1, yaml, filelock
 import concurrent.futures.process, multiprocessing.popen_fork, multiprocessing.popen_spawn_posix, platformdirs
 import numba.cuda.nvvmutils
 
-only_linux = {"fcntl"} if system == "win32" else set()
-if system == "win32":
-    only_linux |= {"resource", "termios", "pwd", "grp"}
-for name in only_linux:
-    sys.modules[name] = None  # an import of it is an ImportError
-for name in dir(os):
-    if name.startswith(("sched_", "posix_")) or name in ("O_DIRECT", "fdatasync", "memfd_create"):
-        delattr(os, name)
-    elif system == "win32" and name in ("fork", "geteuid", "getuid", "pwrite", "pread", "mkfifo", "statvfs"):
-        delattr(os, name)
-psutil.Process.__dict__.get("cpu_affinity") and delattr(psutil.Process, "cpu_affinity")
-if system == "win32":
-    psutil.Process.cpu_affinity = lambda self, cpus=None: [0, 1]
-real_open = io.open
+def use(system):
+    only_linux = {"fcntl"} if system == "win32" else set()
+    if system == "win32":
+        only_linux |= {"resource", "termios", "pwd", "grp"}
+    for name in only_linux:
+        sys.modules[name] = None  # an import of it is an ImportError
+    for name in dir(os):
+        if name.startswith(("sched_", "posix_")) or name in ("O_DIRECT", "fdatasync", "memfd_create"):
+            delattr(os, name)
+        elif system == "win32" and name in ("fork", "geteuid", "getuid", "pwrite", "pread", "mkfifo", "statvfs"):
+            delattr(os, name)
+    psutil.Process.__dict__.get("cpu_affinity") and delattr(psutil.Process, "cpu_affinity")
+    if system == "win32":
+        psutil.Process.cpu_affinity = lambda self, cpus=None: [0, 1]
+    real_open = io.open
 
-def without_proc(file, *args, **kwargs):
-    ours = "psutil" not in sys._getframe(1).f_code.co_filename  # which has other sources on other systems
-    if ours and str(file).startswith(("/proc", "/sys")):
-        raise FileNotFoundError(2, "No such file or directory", str(file))
-    return real_open(file, *args, **kwargs)
+    def without_proc(file, *args, **kwargs):
+        ours = "psutil" not in sys._getframe(1).f_code.co_filename  # which has other sources on other systems
+        if ours and str(file).startswith(("/proc", "/sys")):
+            raise FileNotFoundError(2, "No such file or directory", str(file))
+        return real_open(file, *args, **kwargs)
 
-io.open = builtins.open = without_proc
-sys.platform = system
+    io.open = builtins.open = without_proc
+    sys.platform = system
 
-root = pathlib.Path(sys.argv[2])
-for room in ("benchmark", "method", "baselines", "generators", "leaderboard", "studies", "cli"):
-    for path in sorted((root / room).rglob("*.py")):
-        name = ".".join(("spike4dgs", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
-        # Mitsuba's variant comes first there; Blender's interpreter runs its script; `__main__` runs.
-        skipped = "rendering.wavefront", "rendering.soft_map", "rendering.split_tracer", "blender_script", "__main__"
-        if not name.endswith(skipped):
-            importlib.import_module(name)
+    root = pathlib.Path(sys.argv[1])
+    for room in ("benchmark", "method", "baselines", "generators", "leaderboard", "studies", "cli"):
+        for path in sorted((root / room).rglob("*.py")):
+            name = ".".join(("spike4dgs", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
+            # Mitsuba's variant comes first there; Blender's interpreter runs its script; `__main__` runs.
+            tracers = "rendering.wavefront", "rendering.soft_map", "rendering.split_tracer"
+            if not name.endswith((*tracers, "blender_script", "__main__")):
+                importlib.import_module(name)
 
-import numpy as np
-from spike4dgs.baselines import make_image
-from spike4dgs.benchmark.environment import available_cores, cpu_name, environment, peak_memory_mb
-from spike4dgs.benchmark.files import locked
-from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
-from spike4dgs.method.splat.kernels.threads import get_threads
+    import numpy as np
+    from spike4dgs.baselines import make_image
+    from spike4dgs.benchmark.environment import available_cores, cpu_name, environment, peak_memory_mb
+    from spike4dgs.benchmark.files import locked
+    from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+    from spike4dgs.method.splat.kernels.threads import get_threads
 
-folder = pathlib.Path(sys.argv[3])
-spikes = np.random.default_rng(0).random((60, 20, 24)) < 0.3
-stream = SpikeStream(pack(spikes), 24, 20, 20_000.0)
-assert (stream.window(0, 60) == spikes).all()
-assert np.isfinite(make_image("tfp", stream, 30, 0.3)).all()
-with locked(folder / "x.lock", "x", "free"):
-    pass
-assert available_cores() >= 1 and get_threads() >= 1 and cpu_name() and environment("cpu")["cpu"]
-peak_memory_mb("cpu")
-print("imported and used")
+    folder = pathlib.Path(sys.argv[2])
+    spikes = np.random.default_rng(0).random((60, 20, 24)) < 0.3
+    stream = SpikeStream(pack(spikes), 24, 20, 20_000.0)
+    assert (stream.window(0, 60) == spikes).all()
+    assert np.isfinite(make_image("tfp", stream, 30, 0.3)).all()
+    with locked(folder / "x.lock", "x", "free"):
+        pass
+    assert available_cores() >= 1 and get_threads() >= 1 and cpu_name() and environment("cpu")["cpu"]
+    peak_memory_mb("cpu")
+    print("imported and used", system, flush=True)
+
+# One process for each system, after the libraries, which take most of the time. Their threads are not in a copy of the
+# process: it must not wait for them at its end.
+for system in ("darwin", "win32"):
+    if (copy := os.fork()) == 0:
+        try:
+            use(system)
+        except BaseException:
+            traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(0)
+    os.waitpid(copy, 0)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("system", ["darwin", "win32"])
-def test_without_what_only_linux_has(system: str, tmp_path, pytestconfig: pytest.Config) -> None:  # type: ignore[no-untyped-def]
-    command = [sys.executable, "-W", "ignore", "-c", CHILD, system, str(pytestconfig.rootpath), str(tmp_path)]
+def test_without_what_only_linux_has(tmp_path: Path, pytestconfig: pytest.Config) -> None:
+    command = [sys.executable, "-W", "ignore", "-c", CHILD, str(pytestconfig.rootpath), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "imported and used", done.stderr[-3000:]
+    used = [f"imported and used {system}" for system in ("darwin", "win32")]
+    assert done.stdout.splitlines() == used, done.stderr[-3000:]
