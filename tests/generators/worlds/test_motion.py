@@ -7,24 +7,29 @@ import pytest
 from built_worlds import built
 
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS, bicycle, bricks, jaywalk, motor
+from spike4dgs.generators.worlds import WORLDS, WorldScene, bicycle, bricks, jaywalk, motor
 from spike4dgs.generators.worlds.parts import bird_body, cycles, figure, van_body
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, STEP_S, Body, owners, simulate
 
 STREET = ["jaywalk", "bicycle", "motor", "car", "van"]
 
 
-@pytest.mark.parametrize("name", sorted(WORLDS))
-@pytest.mark.parametrize("variant", [0, 1, 5])
-def test_a_slow_camera_would_smear_it_over_a_quarter_of_its_length(name, variant):
-    notes = built(name, variant).notes
-    assert notes["speed_m_s"] / 30 >= notes["length_m"] / 4
+def is_fast(world: WorldScene) -> bool:
+    """Return whether a camera of 30 images a second would smear it over a quarter of its length."""
+    return world.notes["speed_m_s"] / 30 >= world.notes["length_m"] / 4
+
+
+@pytest.mark.parametrize("name", sorted(set(WORLDS) - set(STREET)))
+@pytest.mark.parametrize("variant", [1, 5])
+def test_variants_are_fast(name, variant):
+    assert is_fast(built(name, variant))
 
 
 @pytest.mark.parametrize("name", STREET)
 @pytest.mark.parametrize("variant", [0, 3])
 def test_street_objects_cross_from_left_to_right_at_their_speed(name, variant):
     world = built(name, variant, 0.5)
+    assert is_fast(world)
     middle = np.array([world.moving_points(t)[:, 0].mean() for t in np.linspace(0, 0.5, 6)])
     assert np.polyfit(np.linspace(0, 0.5, 6), middle, 1)[0] == pytest.approx(world.notes["speed_m_s"], rel=0.03)
     (camera,) = cameras(world, 400, 250, (4,))
@@ -35,6 +40,7 @@ def test_street_objects_cross_from_left_to_right_at_their_speed(name, variant):
 @pytest.mark.parametrize("name", sorted(WORLDS))
 def test_nothing_sinks_into_the_ground(name):
     world = built(name, 0, 0.1)
+    assert is_fast(world)
     for t in np.linspace(0, 0.1, 7):
         assert world.moving_points(t)[:, 2].min() > (-0.03 if name in STREET else -0.004)
 
