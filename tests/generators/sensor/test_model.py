@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -17,6 +18,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_maps
+from spike4dgs.generators.sensor.kernels import integrate
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import fire, simulate_reference, tick_means
 
@@ -326,7 +328,6 @@ def test_tick_means_are_taken_as_they_are():
 _SCRIPT = """
 import hashlib
 import numpy as np
-from spike4dgs.generators.sensor.kernels import integrate
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
 rng = np.random.default_rng(5)
@@ -342,38 +343,40 @@ for sensor in (Sensor(), Sensor(gain=gain, dark=dark, photons=50000.0, noise_see
     for ticks, means in (([0, 10, 20, 37, 40, 60, 80, 81, 200], False), (range(9), True)):
         spikes = np.concatenate([*simulate(keys, list(ticks), 9 if means else 200, sensor, charge, means=means)])
         print(hashlib.sha256(spikes).hexdigest())
-code = "".join(integrate.inspect_asm().values())
-print("wide" if "zmm" in code or "ymm" in code else "narrow", "fused" if "vfmadd" in code else "separate")
+"""
+_CODE = """
+from spike4dgs.generators.sensor.kernels import integrate
+print("".join(integrate.inspect_asm().values()))
 """
 
 
-def simulated(cache: Path, **environment: str) -> list[str]:
-    """The hashes of the spikes in a process of its own, and the kind of instructions that made them."""
-    done = subprocess.run(
-        [sys.executable, "-c", _SCRIPT],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment},
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+def instructions(assembly: str) -> str:
+    kind = "wide" if "zmm" in assembly or "ymm" in assembly else "narrow"
+    return f"{kind} {'fused' if 'vfmadd' in assembly else 'separate'}"
 
 
-def test_an_old_processor_gives_the_same_spikes(tmp_path: Path) -> None:
+def test_an_old_processor_gives_the_same_spikes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     umath = np._core._multiarray_umath  # type: ignore[attr-defined]
     there = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
-    here = simulated(tmp_path)
-    old = simulated(
-        tmp_path,
-        NUMBA_CPU_NAME="generic",
-        NUMBA_CPU_FEATURES="",
-        NPY_DISABLE_CPU_FEATURES=" ".join(there),
-        OPENBLAS_CORETYPE="Nehalem",
-    )
-    assert len(here) == 5 and here[:4] == old[:4] and len(set(here[:4])) == 4
-    assert "separate" in here[4] and old[4] == "narrow separate"
-    if not here[4].startswith("wide"):
+    environment = {
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "NPY_DISABLE_CPU_FEATURES": " ".join(there),
+        "OPENBLAS_CORETYPE": "Nehalem",
+    }
+    command = [sys.executable, "-c", _SCRIPT + _CODE]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    *old, assembly = done.stdout.split("\n", 4)
+    exec(_SCRIPT, {})
+    here = capsys.readouterr().out.split()
+    assert len(here) == 4 and here == old and len(set(here)) == 4
+    anew = numba.jit(**integrate.targetoptions)(integrate.py_func)  # code that comes from the cache cannot be read
+    anew.compile(integrate.signatures[0])
+    mine = instructions("".join(anew.inspect_asm().values()))
+    assert "separate" in mine and instructions(assembly) == "narrow separate"
+    if not mine.startswith("wide"):
         pytest.skip("this processor has no wide registers: both runs used the same instructions")
 
 
