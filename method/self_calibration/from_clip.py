@@ -23,6 +23,7 @@ from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 # knowledge lets turns and shifts of a narrow array explain one another, and adds 0.07 px to poses that were right.
 PRIOR = AdjustSettings(turn_deg=0.05, shift=0.0005)
 FEW = FeatureSettings(enlarge=1)
+LEAST_PX = 64  # of a side: smaller images have too few features, at a price that a fit of them feels
 # Of the features' median error with the given poses, in that with mended ones, from which poses are off. Right ones
 # give 1.00 on development scenes, those 0.08 px off 1.3 to 1.4.
 OFF = 1.15
@@ -39,7 +40,7 @@ def at_mended_poses(scene: TrainingScene, seed: int) -> TrainingScene:
 
     The given ones are a prior with the standard deviations of `PRIOR`, which holds the frame and the scale.
     """
-    if len(scene.streams) < 2:
+    if len(scene.streams) < 2 or min(scene.cameras[0].width, scene.cameras[0].height) < LEAST_PX:
         return scene
     seen = as_pinholes(scene)
     images, fixed = mean_images(seen), [False] * len(seen.cameras)
