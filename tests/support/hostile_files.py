@@ -513,9 +513,13 @@ def damage(folder: Path, case: Case, rng: m.Rng) -> list[str]:
 
 def listing(root: Path) -> dict[str, int]:
     """Everything in a folder that no reader has to do with, with its time of change."""
-    return {
-        str(p): p.stat().st_mtime_ns for p in sorted(root.rglob("*")) if "work" not in p.relative_to(root).parts[:1]
-    }
+    found, folders = {}, [str(root)]
+    while folders:
+        for entry in os.scandir(folders.pop()):
+            if entry.path != str(root / "work"):
+                found[entry.path] = entry.stat().st_mtime_ns
+                folders += [entry.path] if entry.is_dir(follow_symlinks=False) else []
+    return found
 
 
 def run(root: Path, inputs: int, seed: int, only: str = "") -> dict[str, Outcome]:
@@ -545,7 +549,7 @@ def run(root: Path, inputs: int, seed: int, only: str = "") -> dict[str, Outcome
         (root / "work/now").write_text(f"{name} {seed} {i}")
         outcome, rng = outcomes[name], np.random.default_rng([seed, i])
         trial, out = work / "trial", work / "out"
-        shutil.copytree(root / "valid" / name, trial), out.mkdir()
+        shutil.copytree(root / "valid" / name, trial, copy_function=shutil.copyfile), out.mkdir()
         outcome.inputs += 1
         done = damage(trial, CASES[name], rng)
         begun = time.process_time()

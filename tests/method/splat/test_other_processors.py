@@ -25,21 +25,20 @@ llvm.initialize_all_targets()
 llvm.initialize_all_asmprinters()
 TRIPLES = ("aarch64-unknown-linux-gnu", "arm64-apple-macosx")
 machines = {t: llvm.Target.from_triple(t).create_target_machine(opt=2) for t in TRIPLES}
-made, add = [], CPUCodeLibrary.add_ir_module
+made, add = [], CPUCodeLibrary.add_llvm_module
 
 def add_and_compile_for_arm(library, module):
-    text = str(module)
+    x86 = re.findall(r"llvm\.x86\.[\w.]+", str(module))
     for triple, machine in machines.items():
-        ours = re.sub(r'target triple = ".*"', f'target triple = "{triple}"', text)
-        ours = re.sub(r'target datalayout = ".*"', f'target datalayout = "{machine.target_data}"', ours)
-        parsed = llvm.parse_assembly(ours)
-        parsed.verify()
-        assembly = machine.emit_assembly(parsed)
+        ours = module.clone()
+        ours.triple, ours.data_layout = triple, str(machine.target_data)
+        ours.verify()
+        assembly = machine.emit_assembly(ours)
         vectors = len(re.findall(r"fm(?:la|ul|ls)(?:\.4s|\s+v\d+\.4s)", assembly))
-        made.append((library.name, triple, re.findall(r"llvm\.x86\.[\w.]+", text), assembly.count("\n"), vectors))
+        made.append((library.name, triple, x86, assembly.count("\n"), vectors))
     add(library, module)
 
-CPUCodeLibrary.add_ir_module = add_and_compile_for_arm
+CPUCodeLibrary.add_llvm_module = add_and_compile_for_arm
 
 from splat_parity import differentiate
 from splat_scenes import random_splats, views
