@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,9 +23,20 @@ from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
 
+# No file of a test must outlive a loss of power, and the disk takes milliseconds for each of many thousands. A file that
+# is closed is still an error.
+os.fsync = os.fdatasync = lambda fd: os.fstat(fd) and None
+
+
+@pytest.fixture(scope="session")
+def one_small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_small_scene(tmp_path_factory.mktemp("small") / "scene")
+
+
 @pytest.fixture
-def small_scene(tmp_path: Path) -> Path:
-    return write_small_scene(tmp_path / "scene")
+def small_scene(one_small_scene: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(one_small_scene, tmp_path / "scene"))
 
 
 @pytest.fixture
