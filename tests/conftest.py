@@ -22,9 +22,8 @@ from filelock import FileLock
 from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
-
-# No file of a test must outlive a loss of power, and the disk takes milliseconds for each of many thousands. A file that
-# is closed is still an error.
+# No file of a test must outlive a loss of power, and the disk takes milliseconds for each of many thousands. A closed
+# file is still an error.
 os.fsync = os.fdatasync = lambda fd: os.fstat(fd) and None
 
 

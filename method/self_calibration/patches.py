@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spike4dgs.benchmark.arrays import Float64, Int64
+from spike4dgs.benchmark.arrays import Float32, Float64, Int64
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -59,7 +59,7 @@ def window_image(viewer: Viewer, tick: int, half: int, blur_px: float) -> Float6
     start, stop = tick - half, tick + half
     if start < 0 or stop > stream.n_ticks or not _whole(stream, start, stop):
         return None
-    rate = gathered(stream.counts(start, stop) / (stop - start), stream.dead_ticks).astype(np.float32)
+    rate: Float32 = gathered(stream.counts(start, stop) / (stop - start), stream.dead_ticks).astype(np.float32)
     found = viewer.calibration
     image = found.radiance(rate) if found else rate / np.float32(viewer.radiance_gain * viewer.state.gain)
     image = image.astype(np.float64)

@@ -202,7 +202,8 @@ def clip_means(scene: TrainingScene) -> Float32:
     """Return the mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
     ticks = min(scene.n_ticks, 65535)
     counts = [gathered(s.counts(0, ticks).astype(np.float32), s.dead_ticks / ticks) for s in scene.streams]
-    return undistorted(scene, np.stack(counts) / np.float32(ticks * scene.radiance_gain), unseen=None)
+    means = np.asarray(np.stack(counts) / np.float32(ticks * scene.radiance_gain), np.float32)
+    return undistorted(scene, means, unseen=None)
 
 
 def map_views(
