@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 # Workers share the cores. OpenMP's threads must sleep while they wait, or they take the cores from other workers; and
@@ -9,6 +10,7 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    gc.disable()  # until the tests are collected
 
 import shutil
 import subprocess
@@ -22,9 +24,15 @@ from filelock import FileLock
 from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
-# No file of a test must outlive a loss of power, and the disk takes milliseconds for each of many thousands. A closed
-# file is still an error.
+# A loss of power is no test's matter, and the disk takes milliseconds for each of many thousand files. A file that is
+# closed is still an error.
 os.fsync = os.fdatasync = lambda fd: os.fstat(fd) and None
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests stay: the collector of garbage, which takes half a second to look through them, need not."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
