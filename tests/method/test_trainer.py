@@ -153,6 +153,7 @@ def test_corrections_made_ahead_change_no_bit(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_fit_is_freed_at_its_end() -> None:
     """Without the garbage collector, which may not come round for many fits."""
+    trainer(40, motion="paths", spans=wide_spans).run(silent)  # what the first of a process loads keeps some of it
     gc.collect()
     gc.disable()
     try:
